@@ -1,0 +1,377 @@
+use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
+use thiserror::Error;
+
+use crate::filter::{dilate, gaussian, is_window_maximum};
+use crate::{Grasp, Volume};
+
+/// A network's output over a volume of N³ voxels, each array indexed `[channel][x][y][z]`, z fastest.
+#[derive(Clone, Copy, Debug)]
+pub struct Maps<'a> {
+    /// Probability that a grasp here succeeds, `[N, N, N]`, in [0, 1].
+    pub quality: &'a [f32],
+    /// Orientation of the grasp, `[4, N, N, N]`, unit quaternion x, y, z, w in the volume's axes.
+    pub rotation: &'a [f32],
+    /// Opening, `[N, N, N]`, in voxels.
+    pub width: &'a [f32],
+}
+
+/// Where in its voxel a network's grasp stands.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum VoxelOrigin {
+    /// At index · voxel size, the convention of VGN's data and weights.
+    #[default]
+    Corner,
+    /// At (index + 0.5) · voxel size, where the TSDF is sampled: mirror images and turns of a volume stay exact.
+    Center,
+}
+
+impl VoxelOrigin {
+    /// The offset from a voxel's index to its grasp's position, in voxels.
+    #[must_use]
+    pub fn offset(self) -> f64 {
+        match self {
+            Self::Corner => 0.0,
+            Self::Center => 0.5,
+        }
+    }
+}
+
+/// Every step and constant between a network's maps and a list of grasps.
+///
+/// The defaults are those of VGN's released code; [`DecodeParams::benchmark`] gives those of GIGA's evaluation, under
+/// which the paper's numbers were measured. Lengths in voxels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DecodeParams {
+    /// σ of the Gaussian that smooths the quality (VGN `process`: 1). 0 switches it off.
+    pub sigma: f32,
+    /// Where that Gaussian is cut off (scipy: 4 σ).
+    pub radius: usize,
+    /// Values above this are in front of a surface (`out_th`: VGN 0.5, GIGA's evaluation 0.1).
+    pub outside_above: f32,
+    /// Values above this and below `outside_above` are inside an object (VGN: 1e-3).
+    pub inside_above: f32,
+    /// How many voxels the space in front of surfaces is grown, never into an object (VGN: 2).
+    pub dilations: usize,
+    /// Narrowest width that is believed (VGN: 1.33).
+    pub min_width: f32,
+    /// Widest width that is believed (VGN: 9.33).
+    pub max_width: f32,
+    /// Voxels at the border where nothing is believed (GIGA), if any.
+    pub border: Option<Border>,
+    /// ε: smallest smoothed quality of a grasp (0.9 in all three papers).
+    pub threshold: f32,
+    /// GIGA's `force`: when nothing reaches `threshold`, the single best voxel, if it reaches this.
+    pub force: Option<f32>,
+    /// Edge of the cube in which only the best voxel is kept (VGN: 4).
+    pub nms_size: usize,
+    /// Where in its voxel a grasp stands.
+    pub origin: VoxelOrigin,
+}
+
+/// Voxels at the faces of the cube whose grasps are dropped.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Border {
+    /// At each of the four vertical faces.
+    pub sides: usize,
+    /// At the bottom.
+    pub bottom: usize,
+}
+
+impl Default for DecodeParams {
+    fn default() -> Self {
+        Self {
+            sigma: 1.0,
+            radius: 4,
+            outside_above: 0.5,
+            inside_above: 1e-3,
+            dilations: 2,
+            min_width: 1.33,
+            max_width: 9.33,
+            border: None,
+            threshold: 0.9,
+            force: None,
+            nms_size: 4,
+            origin: VoxelOrigin::Corner,
+        }
+    }
+}
+
+impl DecodeParams {
+    /// The parameters of GIGA's evaluation: `out_th` 0.1, borders cut, `force` down to 0.5.
+    #[must_use]
+    pub fn benchmark() -> Self {
+        Self { outside_above: 0.1, border: Some(Border { sides: 2, bottom: 7 }), force: Some(0.5), ..Self::default() }
+    }
+}
+
+/// How many voxels were dropped, each counted once, under the first reason that applied in this order.
+///
+/// Together with the grasps they make up every voxel of the volume.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Dropped {
+    /// The smoothed quality is below the threshold.
+    pub below_threshold: usize,
+    /// Inside an object, or too far from any observed surface.
+    pub mask: usize,
+    /// The width is not one that is believed.
+    pub width: usize,
+    /// At the border of the cube.
+    pub border: usize,
+    /// A better grasp is near.
+    pub suppressed: usize,
+}
+
+/// What [`decode`] found.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Decoded {
+    /// In the volume's frame, best first.
+    pub grasps: Vec<Grasp>,
+    /// Why the other voxels hold none.
+    pub dropped: Dropped,
+}
+
+/// Why maps could not be decoded: the network is not what it should be.
+#[derive(Clone, Debug, Error, PartialEq)]
+pub enum DecodeError {
+    /// A map has the wrong size.
+    #[error("the map `{map}` holds {got} values, {expected} needed")]
+    Length {
+        /// Which map.
+        map: &'static str,
+        /// Values that came.
+        got: usize,
+        /// Values needed.
+        expected: usize,
+    },
+    /// A map holds NaN or infinity.
+    #[error("the map `{map}` holds {value} at {index}")]
+    NotFinite {
+        /// Which map.
+        map: &'static str,
+        /// Flat index.
+        index: usize,
+        /// The value.
+        value: f32,
+    },
+}
+
+/// Turns a network's maps over `volume` into grasps, best first (VGN's `process` and `select`, with GIGA's additions).
+///
+/// # Errors
+/// [`DecodeError`] when a map has the wrong size, or is not finite where it is used.
+pub fn decode(volume: &Volume, maps: &Maps, params: &DecodeParams) -> Result<Decoded, DecodeError> {
+    let n = volume.resolution();
+    check(maps, n)?;
+
+    let smooth = gaussian(maps.quality, n, params.sigma, params.radius);
+    let near_surface = near_surface(volume, params);
+
+    // The threshold falls to the floor only when forced; which voxels pass it then is the best one alone.
+    let mut dropped = Dropped::default();
+    let mut quality = vec![0.0; smooth.len()];
+    let floor = params.force.map_or(params.threshold, |force| force.min(params.threshold));
+    for (index, &q) in smooth.iter().enumerate() {
+        let width = maps.width[index];
+        if q < floor {
+            dropped.below_threshold += 1;
+        } else if !near_surface[index] {
+            dropped.mask += 1;
+        } else if !(width >= params.min_width && width <= params.max_width) {
+            dropped.width += 1;
+        } else if params.border.is_some_and(|border| border.holds(index, n)) {
+            dropped.border += 1;
+        } else {
+            quality[index] = q;
+        }
+    }
+    let best = quality.iter().copied().fold(0.0, f32::max);
+    let forced = best < params.threshold;
+    if !forced {
+        for q in &mut quality {
+            if *q > 0.0 && *q < params.threshold {
+                *q = 0.0;
+                dropped.below_threshold += 1;
+            }
+        }
+    }
+
+    let mut cells: Vec<usize> = Vec::new();
+    for index in 0..quality.len() {
+        if quality[index] > 0.0 {
+            if is_window_maximum(&quality, n, index, params.nms_size) {
+                cells.push(index);
+            } else {
+                dropped.suppressed += 1;
+            }
+        }
+    }
+    cells.sort_by(|&a, &b| quality[b].total_cmp(&quality[a]).then(a.cmp(&b)));
+    if forced && cells.len() > 1 {
+        dropped.below_threshold += cells.len() - 1;
+        cells.truncate(1);
+    }
+
+    let grasps = cells
+        .iter()
+        .map(|&index| grasp_at(volume, maps, index, quality[index], params.origin))
+        .collect::<Result<_, _>>()?;
+    Ok(Decoded { grasps, dropped })
+}
+
+fn check(maps: &Maps, n: usize) -> Result<(), DecodeError> {
+    let voxels = n.pow(3);
+    for (map, values, expected) in
+        [("quality", maps.quality, voxels), ("rotation", maps.rotation, 4 * voxels), ("width", maps.width, voxels)]
+    {
+        if values.len() != expected {
+            return Err(DecodeError::Length { map, got: values.len(), expected });
+        }
+    }
+    // One NaN would spread through the smoothing and silently empty a region.
+    if let Some(index) = maps.quality.iter().position(|q| !q.is_finite()) {
+        return Err(DecodeError::NotFinite { map: "quality", index, value: maps.quality[index] });
+    }
+    Ok(())
+}
+
+/// The voxels in front of surfaces, grown a little, but not into objects.
+fn near_surface(volume: &Volume, params: &DecodeParams) -> Vec<bool> {
+    let values = volume.values();
+    let outside = values.iter().map(|&v| v > params.outside_above).collect();
+    let not_inside: Vec<bool> =
+        values.iter().map(|&v| !(v > params.inside_above && v < params.outside_above)).collect();
+    dilate(outside, &not_inside, volume.resolution(), params.dilations)
+}
+
+impl Border {
+    fn holds(self, index: usize, n: usize) -> bool {
+        let side = |c: usize| c < self.sides || c + self.sides >= n;
+        side(index / (n * n)) || side(index / n % n) || index % n < self.bottom
+    }
+}
+
+fn grasp_at(
+    volume: &Volume,
+    maps: &Maps,
+    index: usize,
+    quality: f32,
+    origin: VoxelOrigin,
+) -> Result<Grasp, DecodeError> {
+    let n = volume.resolution();
+    let voxels = n.pow(3);
+    let [x, y, z, w] = [0, 1, 2, 3].map(|channel| f64::from(maps.rotation[channel * voxels + index]));
+    let rotation = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-6)
+        .filter(|q| q.coords.iter().all(|c| c.is_finite()))
+        .ok_or(DecodeError::NotFinite { map: "rotation", index, value: maps.rotation[index] })?;
+    let cell = Vector3::new(index / (n * n), index / n % n, index % n);
+    let position = cell.map(|c| c as f64 + origin.offset()) * volume.voxel_size();
+    Ok(Grasp {
+        pose: volume.pose() * Isometry3::from_parts(Translation3::from(position), rotation),
+        width: f64::from(maps.width[index]) * volume.voxel_size(),
+        quality,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const N: usize = 16;
+
+    /// A slab whose surface lies at z = 8: free above, inside below, observed over ±4 voxels.
+    fn slab() -> Volume {
+        let values = (0..N.pow(3)).map(|i| ((i % N) as f32 - 4.0).clamp(0.0, 8.0) / 8.0 * f32::from(i % N <= 12));
+        Volume::new(N, 0.0075, Isometry3::translation(1.0, 2.0, 3.0), values.collect()).unwrap()
+    }
+
+    struct Arrays {
+        quality: Vec<f32>,
+        rotation: Vec<f32>,
+        width: Vec<f32>,
+    }
+
+    impl Arrays {
+        fn new() -> Self {
+            let voxels = N.pow(3);
+            let mut rotation = vec![0.0; 4 * voxels];
+            rotation[3 * voxels..].fill(1.0);
+            Self { quality: vec![0.0; voxels], rotation, width: vec![5.0; voxels] }
+        }
+
+        fn decode(&self, params: &DecodeParams) -> Decoded {
+            let maps = Maps { quality: &self.quality, rotation: &self.rotation, width: &self.width };
+            let decoded = decode(&slab(), &maps, params).unwrap();
+            let d = decoded.dropped;
+            let all = d.below_threshold + d.mask + d.width + d.border + d.suppressed + decoded.grasps.len();
+            assert_eq!(all, N.pow(3), "every voxel is accounted for once");
+            decoded
+        }
+    }
+
+    fn index(x: usize, y: usize, z: usize) -> usize {
+        (x * N + y) * N + z
+    }
+
+    fn sharp() -> DecodeParams {
+        DecodeParams { sigma: 0.0, ..DecodeParams::default() }
+    }
+
+    #[test]
+    fn a_peak_becomes_a_grasp_in_the_volumes_frame() {
+        let mut arrays = Arrays::new();
+        arrays.quality[index(3, 5, 9)] = 0.95;
+        let corner = arrays.decode(&sharp()).grasps;
+        assert_eq!(corner.len(), 1);
+        let expected = nalgebra::Vector3::new(1.0 + 3.0 * 0.0075, 2.0 + 5.0 * 0.0075, 3.0 + 9.0 * 0.0075);
+        assert!((corner[0].pose.translation.vector - expected).norm() < 1e-9);
+        assert!((corner[0].width - 5.0 * 0.0075).abs() < 1e-9);
+        let center = arrays.decode(&DecodeParams { origin: VoxelOrigin::Center, ..sharp() }).grasps;
+        let half = nalgebra::Vector3::repeat(0.5 * 0.0075);
+        assert!((center[0].pose.translation.vector - expected - half).norm() < 1e-9);
+    }
+
+    #[test]
+    fn each_reason_drops_what_it_should() {
+        let mut arrays = Arrays::new();
+        arrays.quality[index(8, 8, 9)] = 0.99; // stays
+        arrays.quality[index(8, 8, 10)] = 0.95; // suppressed by it
+        arrays.quality[index(8, 3, 9)] = 0.89; // below the threshold
+        arrays.quality[index(3, 3, 6)] = 0.99; // inside the slab
+        arrays.quality[index(3, 12, 9)] = 0.99; // width
+        arrays.width[index(3, 12, 9)] = 1.0;
+        arrays.quality[index(1, 8, 9)] = 0.99; // border
+        let decoded = arrays.decode(&DecodeParams { border: Some(Border { sides: 2, bottom: 7 }), ..sharp() });
+        assert_eq!(decoded.grasps.len(), 1);
+        let expected = Dropped { below_threshold: N.pow(3) - 5, mask: 1, width: 1, border: 1, suppressed: 1 };
+        assert_eq!(decoded.dropped, expected);
+    }
+
+    #[test]
+    fn force_gives_the_single_best_only_when_nothing_passes() {
+        let mut arrays = Arrays::new();
+        arrays.quality[index(8, 8, 9)] = 0.7;
+        arrays.quality[index(2, 2, 9)] = 0.8;
+        assert_eq!(arrays.decode(&sharp()).grasps.len(), 0);
+        let forced = DecodeParams { force: Some(0.5), ..sharp() };
+        let grasps = arrays.decode(&forced).grasps;
+        assert_eq!(grasps.len(), 1);
+        assert_eq!(grasps[0].quality, 0.8);
+        arrays.quality[index(8, 8, 9)] = 0.91;
+        let grasps = arrays.decode(&forced).grasps;
+        assert_eq!(grasps.len(), 1);
+        assert_eq!(grasps[0].quality, 0.91);
+    }
+
+    #[test]
+    fn a_broken_network_is_told_and_not_hidden() {
+        let mut arrays = Arrays::new();
+        arrays.quality[7] = f32::NAN;
+        let maps = Maps { quality: &arrays.quality, rotation: &arrays.rotation, width: &arrays.width };
+        assert!(matches!(
+            decode(&slab(), &maps, &sharp()),
+            Err(DecodeError::NotFinite { map: "quality", index: 7, .. })
+        ));
+        let short = Maps { width: &arrays.width[1..], ..maps };
+        assert!(matches!(decode(&slab(), &short, &sharp()), Err(DecodeError::Length { map: "width", .. })));
+    }
+}

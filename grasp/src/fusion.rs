@@ -1,0 +1,198 @@
+use nalgebra::{Isometry3, Point3, Vector3};
+
+use crate::{DepthImage, Volume, VolumeError};
+
+/// Depth beyond this many metres is ignored, as in VGN's perception code.
+pub const DEPTH_MAX: f32 = 2.0;
+
+/// The truncation distance in voxels (VGN: 4 voxels = 0.03 m at 40³).
+pub const TRUNCATION_VOXELS: f64 = 4.0;
+
+/// Truncated values at or beyond this count as free or unobserved when a volume is read out (Open3D's constant).
+const NEAR_SURFACE: f32 = 0.98;
+
+/// Fuses depth images into a truncated signed distance field over a cube, one weight per view.
+///
+/// The convention is that of Open3D's `UniformTSDFVolume`, with which VGN's and GIGA's data were made: a voxel is
+/// sampled at its centre, its pixel is `floor(u + 0.5)`, and the distance is taken along that pixel's ray.
+#[derive(Clone, Debug)]
+pub struct Fusion {
+    resolution: usize,
+    voxel_size: f64,
+    truncation: f32,
+    voxels: Vec<Voxel>,
+}
+
+/// Distance in truncations, in [-1, 1], and the number of views that saw it.
+#[derive(Clone, Copy, Debug, Default)]
+struct Voxel {
+    distance: f32,
+    weight: f32,
+}
+
+impl Fusion {
+    /// An empty field of `resolution`³ voxels over a cube with an edge of `size` metres.
+    #[must_use]
+    pub fn new(resolution: usize, size: f64) -> Self {
+        let voxel_size = size / resolution as f64;
+        Self {
+            resolution,
+            voxel_size,
+            truncation: (TRUNCATION_VOXELS * voxel_size) as f32,
+            voxels: vec![Voxel::default(); resolution.pow(3)],
+        }
+    }
+
+    /// Sets the truncation distance in metres, for a field that must agree with one of another resolution.
+    #[must_use]
+    pub fn with_truncation(mut self, truncation: f64) -> Self {
+        self.truncation = truncation as f32;
+        self
+    }
+
+    /// Adds one view. `camera_from_task` (`T_camera_task`) maps points of the cube's frame into the camera.
+    pub fn integrate(&mut self, image: &DepthImage, camera_from_task: &Isometry3<f64>) {
+        let camera = image.intrinsics();
+        let (fx, fy) = (camera.fx as f32, camera.fy as f32);
+        // The half pixel turns truncation into rounding.
+        let (cx, cy) = (camera.cx as f32 + 0.5, camera.cy as f32 + 0.5);
+        let (width, height) = (camera.width, camera.height);
+        let (u_end, v_end) = (width as f32 - 1e-4, height as f32 - 1e-4);
+        let (inv_fx, inv_fy) = (1.0 / fx, 1.0 / fy);
+        let (principal_u, principal_v) = (camera.cx as f32, camera.cy as f32);
+        let depth = image.depth();
+        let inv_truncation = 1.0 / self.truncation;
+
+        let step = (camera_from_task.rotation * Vector3::new(0.0, 0.0, self.voxel_size)).cast::<f32>();
+        let n = self.resolution;
+        for (row, voxels) in self.voxels.chunks_exact_mut(n).enumerate() {
+            let (x, y) = (row / n, row % n);
+            let centre = Point3::new(x as f64 + 0.5, y as f64 + 0.5, 0.5) * self.voxel_size;
+            let start = (camera_from_task * centre).cast::<f32>();
+            for (z, voxel) in voxels.iter_mut().enumerate() {
+                let point = start + step * z as f32;
+                if point.z <= 0.0 {
+                    continue;
+                }
+                let inv_z = 1.0 / point.z;
+                let u = point.x * fx * inv_z + cx;
+                let v = point.y * fy * inv_z + cy;
+                if !(u >= 1e-4 && u < u_end && v >= 1e-4 && v < v_end) {
+                    continue;
+                }
+                let (u, v) = (u as usize, v as usize);
+                let d = depth[v * width + u];
+                // Written so that NaN fails.
+                if !(d > 0.0 && d <= DEPTH_MAX) {
+                    continue;
+                }
+                let (ray_x, ray_y) = ((u as f32 - principal_u) * inv_fx, (v as f32 - principal_v) * inv_fy);
+                let distance = (d - point.z) * (ray_x * ray_x + ray_y * ray_y + 1.0).sqrt();
+                if distance > -self.truncation {
+                    let sample = (distance * inv_truncation).min(1.0);
+                    voxel.distance = (voxel.distance * voxel.weight + sample) / (voxel.weight + 1.0);
+                    voxel.weight += 1.0;
+                }
+            }
+        }
+    }
+
+    /// Forgets every view, keeping the memory.
+    pub fn clear(&mut self) {
+        self.voxels.fill(Voxel::default());
+    }
+
+    /// The values a network reads: `(tsdf + 1) / 2` near a surface that was seen, else 0. Indexed `[x][y][z]`.
+    #[must_use]
+    pub fn values(&self) -> Vec<f32> {
+        self.voxels
+            .iter()
+            .map(|voxel| if voxel.is_near_surface() { (voxel.distance + 1.0) * 0.5 } else { 0.0 })
+            .collect()
+    }
+
+    /// The fused field as a checked volume at `pose` (`T_frame_task`).
+    ///
+    /// # Errors
+    /// [`VolumeError::Empty`] when no surface was seen.
+    pub fn volume(&self, pose: Isometry3<f64>) -> Result<Volume, VolumeError> {
+        Volume::new(self.resolution, self.voxel_size, pose, self.values())
+    }
+
+    /// Voxels along an edge.
+    #[must_use]
+    pub fn resolution(&self) -> usize {
+        self.resolution
+    }
+
+    /// Edge of a voxel, metres.
+    #[must_use]
+    pub fn voxel_size(&self) -> f64 {
+        self.voxel_size
+    }
+
+    /// The distance at a voxel in truncations, if a surface near it was seen.
+    pub(crate) fn near_surface(&self, index: usize) -> Option<f32> {
+        let voxel = self.voxels[index];
+        voxel.is_near_surface().then_some(voxel.distance)
+    }
+
+    /// Distance in truncations by trilinear interpolation at `point` (cube frame), unseen voxels counting as 0.
+    pub(crate) fn interpolate(&self, point: &Point3<f64>) -> f64 {
+        let n = self.resolution;
+        let p = point.coords / self.voxel_size - Vector3::repeat(0.5);
+        let base = p.map(|c| c.floor().clamp(0.0, (n - 2) as f64));
+        let r = p - base;
+        let [x, y, z] = [base.x as usize, base.y as usize, base.z as usize];
+        let mut sum = 0.0;
+        for corner in 0..8 {
+            let (dx, dy, dz) = (corner >> 2, corner >> 1 & 1, corner & 1);
+            let weight = [1.0 - r.x, r.x][dx] * [1.0 - r.y, r.y][dy] * [1.0 - r.z, r.z][dz];
+            sum += weight * f64::from(self.voxels[((x + dx) * n + y + dy) * n + z + dz].distance);
+        }
+        sum
+    }
+}
+
+impl Voxel {
+    fn is_near_surface(self) -> bool {
+        self.weight > 0.0 && self.distance < NEAR_SURFACE && self.distance >= -NEAR_SURFACE
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Intrinsics, RESOLUTION, WORKSPACE_SIZE};
+
+    /// A camera at the origin of its frame looking along +z of the task frame from 0.5 m below the cube.
+    fn facing() -> Isometry3<f64> {
+        Isometry3::translation(-0.15, -0.15, 0.5)
+    }
+
+    #[test]
+    fn a_wall_is_found_where_it_stands() {
+        let camera = Intrinsics::BENCHMARK;
+        let depth = vec![0.65; camera.width * camera.height];
+        let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
+        fusion.integrate(&DepthImage::new(camera, &depth).unwrap(), &facing());
+        let values = fusion.values();
+        // The wall is at z = 0.15 = voxel boundary 20: centre 19 lies half a voxel in front, centre 20 behind.
+        let at = |z: usize| values[(20 * 40 + 20) * 40 + z];
+        assert!((at(19) - (0.5 + 0.5 / 8.0)).abs() < 1e-3, "{}", at(19));
+        assert!((at(20) - (0.5 - 0.5 / 8.0)).abs() < 1e-3, "{}", at(20));
+        assert_eq!(at(5), 0.0, "free space past the truncation reads 0");
+        assert_eq!(at(35), 0.0, "what is hidden reads 0");
+    }
+
+    #[test]
+    fn invalid_depth_is_no_reading() {
+        let camera = Intrinsics::BENCHMARK;
+        for invalid in [0.0, -1.0, f32::NAN, f32::INFINITY, 2.5] {
+            let depth = vec![invalid; camera.width * camera.height];
+            let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
+            fusion.integrate(&DepthImage::new(camera, &depth).unwrap(), &facing());
+            assert_eq!(fusion.volume(Isometry3::identity()), Err(VolumeError::Empty), "{invalid}");
+        }
+    }
+}

@@ -1,0 +1,28 @@
+//! The domain of graspd: volumes, depth fusion, grasps, and the decoding of a network's output into grasps.
+//!
+//! Data flows one way: [`DepthImage`] + [`Intrinsics`] → [`Fusion`] → [`Volume`] → a network → [`Maps`] →
+//! [`decode`] → [`Grasp`]s. Nothing here does I/O, spawns a thread or knows where a volume came from.
+//!
+//! Conventions, unless a name says otherwise: metres, radians, unit quaternions as x, y, z, w; a pose or transform
+//! `T_a_b` maps points of frame b into frame a; voxel arrays are indexed `[x][y][z]` with z running fastest.
+
+mod camera;
+mod decode;
+mod filter;
+mod fusion;
+mod grasp;
+mod surface;
+mod volume;
+
+pub use camera::{CameraError, DepthImage, Intrinsics};
+pub use decode::{Border, DecodeError, DecodeParams, Decoded, Dropped, Maps, VoxelOrigin, decode};
+pub use fusion::{DEPTH_MAX, Fusion, TRUNCATION_VOXELS};
+pub use grasp::{FINGER_DEPTH, Grasp, MAX_OPENING};
+pub use surface::SurfacePoint;
+pub use volume::{Volume, VolumeError};
+
+/// Edge of the workspace cube, metres (the paper, section "Problem formulation").
+pub const WORKSPACE_SIZE: f64 = 0.3;
+
+/// Voxels along one edge of the volume the paper's networks read.
+pub const RESOLUTION: usize = 40;

@@ -1,0 +1,161 @@
+use nalgebra::Isometry3;
+use thiserror::Error;
+
+/// A cubic truncated signed distance volume, checked: what a network reads.
+///
+/// Values are in [0, 1]: 0.5 on the surface, above it in front, below it behind, and exactly 0 where nothing was
+/// observed or the surface is further than the truncation (`(tsdf + 1) / 2`, the convention of VGN's released code).
+#[derive(Clone, Debug, PartialEq)]
+pub struct Volume {
+    resolution: usize,
+    voxel_size: f64,
+    pose: Isometry3<f64>,
+    values: Vec<f32>,
+}
+
+/// Why an array is not a [`Volume`].
+#[derive(Clone, Debug, Error, PartialEq)]
+pub enum VolumeError {
+    /// The resolution is outside what is supported.
+    #[error("resolution is {0}, must be from 1 to {max}", max = Volume::MAX_RESOLUTION)]
+    Resolution(usize),
+    /// The voxel size is not a positive, finite length.
+    #[error("voxel_size is {0}, must be a positive number of metres")]
+    VoxelSize(f64),
+    /// The number of values does not fit the resolution.
+    #[error("data holds {got} values, a resolution of {resolution} needs {resolution}³ = {expected}")]
+    Length {
+        /// Number of values that came.
+        got: usize,
+        /// Number of values needed.
+        expected: usize,
+        /// Voxels along an edge.
+        resolution: usize,
+    },
+    /// A value is NaN or infinite.
+    #[error("data[{index}] is {value}, every value must be finite")]
+    NotFinite {
+        /// Flat index, z fastest.
+        index: usize,
+        /// The offending value.
+        value: f32,
+    },
+    /// A value is outside [0, 1].
+    #[error("data[{index}] is {value}, every value must lie in [0, 1] (0.5 = surface, 0 = unobserved)")]
+    OutOfRange {
+        /// Flat index, z fastest.
+        index: usize,
+        /// The offending value.
+        value: f32,
+    },
+    /// Nothing was observed.
+    #[error("data is all zero: nothing was observed; check the camera's extrinsics and the workspace pose")]
+    Empty,
+}
+
+impl VolumeError {
+    /// The field the error is about, as clients name it.
+    #[must_use]
+    pub fn field(&self) -> &'static str {
+        match self {
+            Self::Resolution(_) => "resolution",
+            Self::VoxelSize(_) => "voxel_size",
+            Self::Length { .. } | Self::NotFinite { .. } | Self::OutOfRange { .. } | Self::Empty => "data",
+        }
+    }
+}
+
+impl Volume {
+    /// Largest resolution accepted: 256³ f32 values are 64 MiB.
+    pub const MAX_RESOLUTION: usize = 256;
+
+    /// Checks and wraps an array of `resolution`³ values indexed `[x][y][z]`, z fastest.
+    ///
+    /// `voxel_size` is in metres; `pose` (`T_frame_volume`) places the volume's corner in the frame its user thinks in.
+    ///
+    /// # Errors
+    /// [`VolumeError`] names the first thing that is wrong, with its value.
+    pub fn new(
+        resolution: usize,
+        voxel_size: f64,
+        pose: Isometry3<f64>,
+        values: Vec<f32>,
+    ) -> Result<Self, VolumeError> {
+        if resolution == 0 || resolution > Self::MAX_RESOLUTION {
+            return Err(VolumeError::Resolution(resolution));
+        }
+        if !(voxel_size.is_finite() && voxel_size > 0.0) {
+            return Err(VolumeError::VoxelSize(voxel_size));
+        }
+        let expected = resolution.pow(3);
+        if values.len() != expected {
+            return Err(VolumeError::Length { got: values.len(), expected, resolution });
+        }
+        if !values.iter().fold(true, |ok, v| ok & (0.0..=1.0).contains(v)) {
+            return Err(first_bad_value(&values));
+        }
+        if values.iter().fold(true, |zero, &v| zero & (v == 0.0)) {
+            return Err(VolumeError::Empty);
+        }
+        Ok(Self { resolution, voxel_size, pose, values })
+    }
+
+    /// Voxels along an edge.
+    #[must_use]
+    pub fn resolution(&self) -> usize {
+        self.resolution
+    }
+
+    /// Edge of a voxel, metres.
+    #[must_use]
+    pub fn voxel_size(&self) -> f64 {
+        self.voxel_size
+    }
+
+    /// `T_frame_volume`: the volume's corner in its frame.
+    #[must_use]
+    pub fn pose(&self) -> &Isometry3<f64> {
+        &self.pose
+    }
+
+    /// The values, indexed `[x][y][z]`, z fastest.
+    #[must_use]
+    pub fn values(&self) -> &[f32] {
+        &self.values
+    }
+}
+
+/// The slow, exact search, run only once the fast check has failed.
+fn first_bad_value(values: &[f32]) -> VolumeError {
+    for (index, &value) in values.iter().enumerate() {
+        if !value.is_finite() {
+            return VolumeError::NotFinite { index, value };
+        }
+        if !(0.0..=1.0).contains(&value) {
+            return VolumeError::OutOfRange { index, value };
+        }
+    }
+    VolumeError::Empty
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn volume(resolution: usize, voxel_size: f64, values: Vec<f32>) -> Result<Volume, VolumeError> {
+        Volume::new(resolution, voxel_size, Isometry3::identity(), values)
+    }
+
+    #[test]
+    fn each_fault_is_named_with_its_value() {
+        assert_eq!(volume(0, 0.1, vec![]), Err(VolumeError::Resolution(0)));
+        assert_eq!(volume(257, 0.1, vec![]), Err(VolumeError::Resolution(257)));
+        assert_eq!(volume(2, -0.1, vec![0.5; 8]), Err(VolumeError::VoxelSize(-0.1)));
+        assert_eq!(volume(2, 0.1, vec![0.5; 7]), Err(VolumeError::Length { got: 7, expected: 8, resolution: 2 }));
+        assert_eq!(volume(1, 0.1, vec![1.5]), Err(VolumeError::OutOfRange { index: 0, value: 1.5 }));
+        assert_eq!(volume(1, 0.1, vec![-0.5]), Err(VolumeError::OutOfRange { index: 0, value: -0.5 }));
+        assert!(matches!(volume(1, 0.1, vec![f32::NAN]), Err(VolumeError::NotFinite { index: 0, .. })));
+        assert_eq!(volume(2, 0.1, vec![0.0; 8]), Err(VolumeError::Empty));
+        assert!(volume(2, 0.1, vec![0.5; 8]).is_ok());
+    }
+}

@@ -1,0 +1,249 @@
+//! Objects from URDF files with OBJ meshes, of the kind the public grasping sets use.
+//!
+//! One link per file. Every group (`o` or `g`) of a collision OBJ stands for one convex part.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
+use rayon::prelude::*;
+use roxmltree::{Document, Node};
+use thiserror::Error;
+
+use super::Object;
+use crate::mesh::Mesh;
+
+/// PyBullet's friction for a link that states none.
+const DEFAULT_FRICTION: f64 = 0.5;
+/// Sides of the prisms and spheres that stand for URDF cylinders and spheres.
+const SIDES: u32 = 32;
+
+/// Why objects could not be read.
+#[derive(Debug, Error)]
+pub enum ObjectError {
+    /// A file or folder could not be read.
+    #[error("cannot read {}: {source}; check the path and its permissions", path.display())]
+    Read {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// A folder without objects.
+    #[error("{} holds no .urdf file; name a folder with one URDF per object", path.display())]
+    Empty {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// A URDF that is not well-formed XML.
+    #[error("{} is not well-formed XML: {source}; mend or remove the file", path.display())]
+    Xml {
+        /// The URDF.
+        path: PathBuf,
+        /// Where and why.
+        source: roxmltree::Error,
+    },
+    /// A URDF that lacks something, or states what an object cannot have.
+    #[error("{}: {what}", path.display())]
+    Urdf {
+        /// The URDF.
+        path: PathBuf,
+        /// What is wrong, with the value, and what is expected.
+        what: String,
+    },
+    /// A mesh file that could not be read.
+    #[error("cannot read the mesh {}: {source}; check the file and the name in its URDF", path.display())]
+    Mesh {
+        /// The OBJ.
+        path: PathBuf,
+        /// Why.
+        source: tobj::LoadError,
+    },
+    /// A mesh file without faces, or whose faces enclose nothing.
+    #[error("the mesh {} has no solid: it needs faces that enclose a volume", path.display())]
+    NoSolid {
+        /// The OBJ.
+        path: PathBuf,
+    },
+}
+
+/// Reads every URDF of a folder, in the order of their names.
+pub(super) fn load_folder(dir: &Path) -> Result<Vec<Object>, ObjectError> {
+    let unreadable = |source| ObjectError::Read { path: dir.into(), source };
+    let entries: Vec<_> = fs::read_dir(dir).and_then(Iterator::collect).map_err(unreadable)?;
+    let mut paths: Vec<PathBuf> = entries.into_iter().map(|entry: fs::DirEntry| entry.path()).collect();
+    paths.retain(|path| path.extension().is_some_and(|extension| extension == "urdf"));
+    paths.sort();
+    if paths.is_empty() {
+        return Err(ObjectError::Empty { path: dir.into() });
+    }
+    paths.par_iter().map(|path| load(path)).collect()
+}
+
+/// Reads one URDF.
+pub(super) fn load(path: &Path) -> Result<Object, ObjectError> {
+    let text = fs::read_to_string(path).map_err(|source| ObjectError::Read { path: path.into(), source })?;
+    let document = Document::parse(&text).map_err(|source| ObjectError::Xml { path: path.into(), source })?;
+    let urdf = Urdf { path };
+
+    let links: Vec<_> = children(document.root_element(), "link").collect();
+    let &[link] = links.as_slice() else {
+        return Err(urdf.wrong(format!("has {} links; an object must have exactly one", links.len())));
+    };
+    let mass = descend(link, &["inertial", "mass"]).ok_or_else(|| urdf.wrong("lacks <inertial><mass value=…/>"))?;
+    let mass = urdf.number(mass, "value")?;
+    if mass <= 0.0 {
+        return Err(urdf.wrong(format!("<mass value=\"{mass}\"/> must be more than 0 kg")));
+    }
+    let friction = match descend(link, &["contact", "lateral_friction"]) {
+        Some(node) => urdf.number(node, "value")?,
+        None => DEFAULT_FRICTION,
+    };
+    if friction < 0.0 {
+        return Err(urdf.wrong(format!("<lateral_friction value=\"{friction}\"/> must be at least 0")));
+    }
+
+    let mut parts = Vec::new();
+    for collision in children(link, "collision") {
+        for (mesh, file) in urdf.geometry(collision)? {
+            match (Mesh::convex_hull(&mesh.vertices), file) {
+                (Some(hull), _) => parts.push(hull),
+                // Decompositions leave slivers without volume; they hold nothing up.
+                (None, Some(_)) => {}
+                (None, None) => return Err(urdf.wrong("has a <collision> shape without volume")),
+            }
+        }
+    }
+    if parts.is_empty() {
+        return Err(urdf.wrong("has no <collision> shape that encloses a volume"));
+    }
+    let mut visual = Mesh::default();
+    for node in children(link, "visual") {
+        urdf.geometry(node)?.iter().for_each(|(mesh, _)| visual.append(mesh));
+    }
+    if visual.triangles.is_empty() {
+        visual = Mesh::union(&parts);
+    }
+    let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    Ok(Object { name, parts, visual, mass, friction })
+}
+
+/// The file being read, for its errors and for the meshes beside it.
+struct Urdf<'a> {
+    path: &'a Path,
+}
+
+impl Urdf<'_> {
+    fn wrong(&self, what: impl Into<String>) -> ObjectError {
+        ObjectError::Urdf { path: self.path.into(), what: what.into() }
+    }
+
+    /// The shapes of a `<visual>` or `<collision>`, in the link's frame, each with the file it
+    /// came from, if any.
+    fn geometry(&self, node: Node) -> Result<Vec<(Mesh, Option<PathBuf>)>, ObjectError> {
+        let pose = match descend(node, &["origin"]) {
+            Some(origin) => self.origin(origin)?,
+            None => Isometry3::identity(),
+        };
+        let shape = descend(node, &["geometry"])
+            .and_then(|geometry| geometry.children().find(Node::is_element))
+            .ok_or_else(|| self.wrong(format!("has a <{}> without <geometry>", node.tag_name().name())))?;
+        let meshes = match shape.tag_name().name() {
+            "mesh" => self.mesh(shape)?,
+            "box" => vec![(Mesh::cuboid(self.lengths(shape, "size")?), None)],
+            "cylinder" => {
+                let (radius, length) = (self.length(shape, "radius")?, self.length(shape, "length")?);
+                vec![(Mesh::cylinder(radius, length, SIDES), None)]
+            }
+            "sphere" => vec![(Mesh::sphere(self.length(shape, "radius")?, SIDES), None)],
+            other => return Err(self.wrong(format!("has a <{other}>; use mesh, box, cylinder or sphere"))),
+        };
+        Ok(meshes.into_iter().map(|(mesh, file)| (mesh.transformed(&pose), file)).collect())
+    }
+
+    /// The groups of an OBJ, scaled.
+    fn mesh(&self, node: Node) -> Result<Vec<(Mesh, Option<PathBuf>)>, ObjectError> {
+        let name = node.attribute("filename").ok_or_else(|| self.wrong("has a <mesh> without filename"))?;
+        let scale = match node.attribute("scale") {
+            Some(_) => self.lengths(node, "scale")?,
+            None => Vector3::repeat(1.0),
+        };
+        let path = self.path.parent().unwrap_or(Path::new("")).join(name);
+        let groups = load_obj(&path)?;
+        let scaled = |mesh: Mesh| mesh.mapped(|p| p.coords.component_mul(&scale).into());
+        Ok(groups.into_iter().map(|mesh| (scaled(mesh), Some(path.clone()))).collect())
+    }
+
+    fn origin(&self, node: Node) -> Result<Isometry3<f64>, ObjectError> {
+        let vector = |name| node.attribute(name).map_or(Ok(Vector3::zeros()), |_| self.vector(node, name));
+        let rpy = vector("rpy")?;
+        let rotation = UnitQuaternion::from_euler_angles(rpy.x, rpy.y, rpy.z);
+        Ok(Isometry3::from_parts(Translation3::from(vector("xyz")?), rotation))
+    }
+
+    fn number(&self, node: Node, name: &str) -> Result<f64, ObjectError> {
+        let text = node.attribute(name).unwrap_or_default();
+        text.trim().parse().ok().filter(|value: &f64| value.is_finite()).ok_or_else(|| {
+            self.wrong(format!("<{} {name}=\"{text}\"/> must be a finite number", node.tag_name().name()))
+        })
+    }
+
+    fn length(&self, node: Node, name: &str) -> Result<f64, ObjectError> {
+        let value = self.number(node, name)?;
+        if value > 0.0 {
+            return Ok(value);
+        }
+        Err(self.wrong(format!("<{} {name}=\"{value}\"/> must be more than 0", node.tag_name().name())))
+    }
+
+    fn vector(&self, node: Node, name: &str) -> Result<Vector3<f64>, ObjectError> {
+        let text = node.attribute(name).unwrap_or_default();
+        let values: Option<Vec<f64>> = text.split_whitespace().map(|word| word.parse().ok()).collect();
+        match values.as_deref() {
+            Some(&[x, y, z]) if [x, y, z].iter().all(|v| v.is_finite()) => Ok(Vector3::new(x, y, z)),
+            _ => Err(self.wrong(format!(
+                "<{} {name}=\"{text}\"/> must be three finite numbers",
+                node.tag_name().name()
+            ))),
+        }
+    }
+
+    fn lengths(&self, node: Node, name: &str) -> Result<Vector3<f64>, ObjectError> {
+        let value = self.vector(node, name)?;
+        if value.min() > 0.0 {
+            return Ok(value);
+        }
+        let text = node.attribute(name).unwrap_or_default();
+        Err(self.wrong(format!("<{} {name}=\"{text}\"/> must be more than 0", node.tag_name().name())))
+    }
+}
+
+/// The groups of an OBJ that have faces.
+fn load_obj(path: &Path) -> Result<Vec<Mesh>, ObjectError> {
+    // One index for all attributes gives each group its own vertices.
+    let options = tobj::LoadOptions { single_index: true, triangulate: true, ..Default::default() };
+    let (models, _) = tobj::load_obj(path, &options).map_err(|source| ObjectError::Mesh { path: path.into(), source })?;
+    let groups: Vec<Mesh> = models
+        .into_iter()
+        .map(|model| {
+            let corner = |p: &[f32]| Point3::new(p[0], p[1], p[2]).cast();
+            let vertices = model.mesh.positions.chunks_exact(3).map(corner).collect();
+            let triangles = model.mesh.indices.chunks_exact(3).map(|t| [t[0], t[1], t[2]]).collect();
+            Mesh { vertices, triangles }
+        })
+        .filter(|mesh| !mesh.triangles.is_empty())
+        .collect();
+    if groups.is_empty() {
+        return Err(ObjectError::NoSolid { path: path.into() });
+    }
+    Ok(groups)
+}
+
+fn children<'a, 'input>(node: Node<'a, 'input>, name: &'a str) -> impl Iterator<Item = Node<'a, 'input>> {
+    node.children().filter(move |child| child.has_tag_name(name))
+}
+
+/// The first node down a path of tag names.
+fn descend<'a, 'input>(node: Node<'a, 'input>, path: &[&str]) -> Option<Node<'a, 'input>> {
+    path.iter().try_fold(node, |node, name| node.children().find(|child| child.has_tag_name(*name)))
+}
