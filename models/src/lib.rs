@@ -1,1 +1,19 @@
-//! x
+//! The networks of graspd: their definitions as ONNX graphs, the files they are kept in, and ONNX Runtime.
+//!
+//! [`build`] defines a network with random weights; its [`Metadata`] travels inside the file; a [`Store`] is a folder
+//! of such files; a [`Network`] runs one.
+
+mod graph;
+mod heads;
+mod metadata;
+mod networks;
+pub mod onnx;
+mod runtime;
+mod store;
+mod transformer;
+mod vgn;
+
+pub use metadata::{Metadata, MetadataError, ValueConvention};
+pub use networks::{Architecture, BuildError, UnknownArchitecture, UnsupportedResolution, build};
+pub use runtime::{LoadError, LoadReason, Network, Options, Output, RuntimeError, RuntimeInfo, init};
+pub use store::{Entry, Store, StoreError};

@@ -1,1 +1,21 @@
-//! x
+//! `grasp.v1` on the wire: the types generated from `proto/grasp/v1/grasp.proto`, and their conversions to and from
+//! the domain.
+//!
+//! [`pb::Volume`] → [`grasp::Volume`] is where a request is checked: a [`FieldError`] names the field and its value.
+
+mod error;
+mod grasps;
+mod pose;
+mod volume;
+
+/// The generated types, the client and the server of `grasp.v1`.
+#[allow(missing_docs, reason = "the .proto file documents them, and prost copies that only where there is a comment")]
+pub mod pb {
+    tonic::include_proto!("grasp.v1");
+}
+
+pub use error::FieldError;
+pub use volume::{encode, resolution};
+
+/// The descriptors of everything in `grasp.v1`, encoded: what reflection serves.
+pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));

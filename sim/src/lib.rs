@@ -1,1 +1,17 @@
-//! x
+//! Simulated clutter: objects, scenes, a depth camera, a hand that tries grasps, and what is made of them: labels to
+//! train on, and benchmarks. Nothing outside this crate knows physics; this crate knows nothing of libtorch.
+//!
+//! The task frame: origin at a corner of the 0.3 m workspace cube, z up, the table's top at [`TABLE_HEIGHT`].
+
+pub mod camera;
+pub mod label;
+pub mod mesh;
+pub mod objects;
+pub mod physics;
+pub mod picture;
+pub mod raster;
+pub mod scene;
+pub mod trial;
+
+/// Height of the table's top in the task frame, metres.
+pub const TABLE_HEIGHT: f64 = 0.05;

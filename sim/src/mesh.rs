@@ -74,8 +74,9 @@ impl Mesh {
     pub fn sphere(radius: f64, sides: u32) -> Mesh {
         let bands = (sides / 2).max(2);
         let profile: Vec<_> = (0..=bands)
-            .map(|i| (TAU / 2.0) * f64::from(i) / f64::from(bands))
-            .map(|angle| (radius * angle.sin().max(0.0), -radius * angle.cos()))
+            .map(|i| (TAU / 2.0 * f64::from(i) / f64::from(bands)).sin_cos())
+            // Sines a rounding error off zero are the poles.
+            .map(|(sin, cos)| (if sin < 1e-9 { 0.0 } else { radius * sin }, -radius * cos))
             .collect();
         Mesh::lathe(&profile, sides)
     }

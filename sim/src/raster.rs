@@ -84,12 +84,7 @@ pub(crate) struct View<'a> {
 }
 
 impl<'a> View<'a> {
-    pub(crate) fn new(
-        camera: &'a Intrinsics,
-        camera_from_task: &'a Isometry3<f64>,
-        near: f64,
-        far: f64,
-    ) -> View<'a> {
+    pub(crate) fn new(camera: &'a Intrinsics, camera_from_task: &'a Isometry3<f64>, near: f64, far: f64) -> View<'a> {
         let depth = vec![f32::INFINITY; camera.width * camera.height];
         View { camera, camera_from_task, near, depth, far, vertices: Vec::new() }
     }
@@ -181,7 +176,7 @@ impl<'a> View<'a> {
             let [a, b, c] = corners.map(|corner| corner[axis]);
             let first = (a.min(b).min(c) + SUBPIXELS as i64 - 1).div_euclid(SUBPIXELS as i64).max(0);
             let last = a.max(b).max(c).div_euclid(SUBPIXELS as i64).min(size as i64 - 1);
-            (first <= last).then_some(first as usize..last as usize + 1)
+            (first <= last).then(|| first as usize..last as usize + 1)
         };
         Some((span(0, self.camera.width)?, span(1, self.camera.height)?))
     }

@@ -1,1 +1,13 @@
-//! x
+//! What the end-to-end tests share: the programs under test, models whose answers are known, volumes, a running server.
+//!
+//! The tests are in `tests/`, one file for each behaviour. They need ONNX Runtime: run them by `make test`.
+
+mod binaries;
+mod models;
+mod server;
+mod volumes;
+
+pub use binaries::{grasp, graspd};
+pub use models::{RESOLUTION, TestModel, WIDTH};
+pub use server::Server;
+pub use volumes::{blobs, expected};

@@ -1,1 +1,129 @@
-fn main(){}
+//! Trains grasp networks, or writes one with random weights.
+
+mod run;
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use grasp_models::build;
+
+/// Trains the networks of graspd in libtorch by executing the very ONNX graph that is served.
+#[derive(Parser)]
+#[command(version)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Writes a network with random weights.
+    Init {
+        /// vgn, transformer or transformer-small.
+        #[arg(long)]
+        network: String,
+        /// Decides the weights.
+        #[arg(long, default_value_t = 0)]
+        seed: u64,
+        /// The file to write.
+        #[arg(long)]
+        out: PathBuf,
+    },
+    /// Trains a network on folders of scenes and grasps.
+    Train(Box<Training>),
+}
+
+/// How a network is trained. Where VGN's training and the paper's differ, the default follows the network.
+#[derive(Args)]
+struct Training {
+    /// vgn, transformer or transformer-small, from random weights.
+    #[arg(long, required_unless_present = "from")]
+    network: Option<String>,
+    /// Start from this model's weights instead (fine-tuning).
+    #[arg(long, conflicts_with = "network")]
+    from: Option<PathBuf>,
+    /// Folders in the processed format of VGN and GIGA (grasps.csv, scenes/ID.npz); several are mixed.
+    #[arg(long, required = true, num_args = 1..)]
+    data: Vec<PathBuf>,
+    /// The model to write. Beside it: .state to resume from, .jsonl with one object an epoch, .png with the curves.
+    #[arg(long)]
+    out: PathBuf,
+    /// Go on from the .state beside the model.
+    #[arg(long)]
+    resume: bool,
+    /// Times every scene is seen [default: 30 for vgn, 21 for the transformers].
+    #[arg(long)]
+    epochs: Option<u64>,
+    /// Scenes in a step [default: 32 for vgn, 64 for the transformers].
+    #[arg(long)]
+    batch: Option<usize>,
+    /// Adam's learning rate [default: 3e-4 for vgn, 1e-4 for the transformers].
+    #[arg(long)]
+    lr: Option<f64>,
+    /// Steps over which the learning rate rises from 0.
+    #[arg(long, default_value_t = 0)]
+    warmup: u64,
+    /// Let the learning rate fall to 0 along half a cosine.
+    #[arg(long)]
+    cosine: bool,
+    /// Decides the random weights, the order of the scenes and how they are changed.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Share of the scenes that are held out to validate on.
+    #[arg(long, default_value_t = 0.1)]
+    val: f64,
+    /// Which weights the model holds in the end: the last, as in the paper, or those of the smallest validation loss.
+    #[arg(long, value_enum, default_value_t = Keep::Last)]
+    keep: Keep,
+    /// Where in its voxel a grasp stands: corner as in VGN, or center, which keeps turned and mirrored scenes exact
+    /// [default: center, or what the model given by --from says].
+    #[arg(long, value_enum)]
+    voxel_origin: Option<Origin>,
+    /// How scenes are changed at random, separated by commas: turns about z, mirror images, shifts along z.
+    #[arg(long, value_enum, value_delimiter = ',')]
+    augment: Vec<Change>,
+    /// Largest shift along z, voxels.
+    #[arg(long, default_value_t = 2)]
+    max_shift: u32,
+    /// Weigh failures and successes the same, however many there are of each, instead of leaving it to the data.
+    #[arg(long)]
+    balance: bool,
+    /// Compute convolutions and matrix products in bf16.
+    #[arg(long)]
+    bf16: bool,
+    /// The model's name in its metadata [default: the file's].
+    #[arg(long)]
+    name: Option<String>,
+    /// The model's version in its metadata.
+    #[arg(long, default_value = "1")]
+    model_version: String,
+    /// Threads libtorch computes with [default: all].
+    #[arg(long)]
+    threads: Option<usize>,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Keep {
+    Last,
+    Best,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Origin {
+    Corner,
+    Center,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Change {
+    Turns,
+    Mirror,
+    Shift,
+}
+
+fn main() -> anyhow::Result<()> {
+    match Cli::parse().command {
+        Command::Init { network, seed, out } => Ok(build(&network, seed)?.write(&out)?),
+        Command::Train(training) => run::train(&training),
+    }
+}

@@ -1,35 +1,232 @@
-//! Household-like objects made from seeds.
+//! Household-like objects without end, each made from a seed.
+//!
+//! A kind — a bottle, a mug, a pair of pliers — draws its proportions at random; then the size is
+//! brought within a gripper's world and a material gives the mass.
 
-use nalgebra::Vector3;
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+mod dice;
+mod food;
+mod packaging;
+mod shape;
+mod tableware;
+mod tools;
+mod toys;
 
 use super::{Object, Split};
 use crate::mesh::Mesh;
+use dice::Dice;
+use shape::Shape;
+
+/// Friction of everything, that of the public grasping sets.
+const FRICTION: f64 = 1.0;
+/// What a gripper that opens 80 mm can just take, metres.
+const GRASPABLE: f64 = 0.072;
+/// The longest object, metres.
+const LONGEST: f64 = 0.22;
+/// The least length of the longest side, metres.
+const SMALLEST: f64 = 0.045;
+
+/// A kind of object.
+struct Kind {
+    name: &'static str,
+    make: fn(&mut Dice) -> Shape,
+    /// Least and greatest density of the solid, kg/m³; low for things that are hollow inside.
+    density: (f64, f64),
+    /// Whether it is one of the things a shelf holds upright.
+    upright: bool,
+}
+
+const fn kind(name: &'static str, make: fn(&mut Dice) -> Shape, low: f64, high: f64, upright: bool) -> Kind {
+    Kind { name, make, density: (low, high), upright }
+}
+
+/// Every kind; a seed's remainder picks one, so that any run of seeds is mixed.
+const KINDS: &[Kind] = &[
+    kind("carton", packaging::carton, 150.0, 700.0, true),
+    kind("screwdriver", tools::screwdriver, 900.0, 1800.0, false),
+    kind("bottle", packaging::bottle, 200.0, 1000.0, true),
+    kind("composite", toys::composite, 300.0, 1200.0, false),
+    kind("mug", tableware::mug, 1200.0, 2200.0, true),
+    kind("fruit", food::fruit, 500.0, 1000.0, false),
+    kind("can", packaging::can, 300.0, 1100.0, true),
+    kind("hammer", tools::hammer, 900.0, 2500.0, false),
+    kind("bowl", tableware::bowl, 900.0, 2200.0, false),
+    kind("wooden_block", toys::wooden_block, 450.0, 800.0, false),
+    kind("shampoo", packaging::shampoo, 200.0, 1000.0, true),
+    kind("banana", food::banana, 500.0, 950.0, false),
+    kind("animal", toys::animal, 300.0, 1100.0, false),
+    kind("wrench", tools::wrench, 1500.0, 4000.0, false),
+    kind("cup", tableware::cup, 500.0, 2200.0, true),
+    kind("slab", tools::slab, 500.0, 1500.0, false),
+    kind("jar", packaging::jar, 400.0, 1300.0, true),
+    kind("ring", food::ring, 300.0, 1100.0, false),
+    kind("car", toys::car, 300.0, 1200.0, false),
+    kind("pliers", tools::pliers, 1500.0, 3500.0, false),
+    kind("milk_carton", packaging::milk_carton, 150.0, 1000.0, true),
+    kind("dish", tableware::dish, 900.0, 2200.0, false),
+    kind("profile", toys::profile, 400.0, 1500.0, false),
+    kind("flashlight", tools::flashlight, 600.0, 1500.0, false),
+    kind("teapot", tableware::teapot, 400.0, 1200.0, true),
+    kind("stone", toys::stone, 400.0, 1800.0, false),
+    kind("spray", packaging::spray, 200.0, 900.0, true),
+    kind("scissors", tools::scissors, 1200.0, 3000.0, false),
+    kind("turned", tableware::turned, 400.0, 1200.0, true),
+    kind("pear", food::pear, 500.0, 1000.0, false),
+    kind("brick", toys::brick, 300.0, 900.0, false),
+    kind("bulb", tools::bulb, 150.0, 500.0, false),
+    kind("canister", packaging::canister, 200.0, 1000.0, true),
+    kind("spoon", tableware::spoon, 700.0, 2500.0, false),
+    kind("figure", toys::figure, 400.0, 1100.0, false),
+    kind("tray", packaging::tray, 400.0, 1100.0, false),
+    kind("drill", tools::drill, 500.0, 1300.0, false),
+    kind("roll", packaging::roll, 200.0, 800.0, true),
+    kind("goblet", tableware::goblet, 900.0, 2300.0, true),
+    kind("gear", toys::gear, 500.0, 2500.0, false),
+    kind("tube", packaging::tube, 300.0, 1000.0, false),
+    kind("mouse", tools::mouse, 300.0, 1100.0, false),
+    kind("plane", toys::plane, 300.0, 1000.0, false),
+    kind("pouch", packaging::pouch, 150.0, 700.0, true),
+    kind("padlock", tools::padlock, 1200.0, 3500.0, false),
+    kind("arch", toys::arch, 450.0, 900.0, false),
+    kind("receiver", toys::receiver, 300.0, 900.0, false),
+    kind("cone", food::cone, 300.0, 900.0, false),
+    kind("slice", food::slice, 400.0, 1000.0, false),
+    kind("brush", tableware::brush, 400.0, 1300.0, false),
+    kind("bolt", tools::bolt, 700.0, 4000.0, false),
+    kind("pen", tools::pen, 600.0, 2000.0, false),
+    kind("spool", toys::spool, 300.0, 1000.0, false),
+];
+
+/// The object of a seed: any seed gives one, and the same seed always the same.
+///
+/// Its origin is the centre of its bounding box; z points up as it stands or lies best.
+pub fn object(seed: u64) -> Object {
+    let kind = kind_of(seed);
+    let mut dice = Dice::new(seed);
+    let shape = (kind.make)(&mut dice);
+    let parts = fitted(shape, &mut dice).parts;
+    // Now and then one is full, or cast.
+    let filling = if dice.chance(0.25) { dice.between(1.5, 5.0) } else { 1.0 };
+    let density = dice.between(kind.density.0, kind.density.1) * filling;
+    let mass = density * parts.iter().map(Mesh::volume).sum::<f64>();
+    let name = format!("{}_{seed}", kind.name);
+    // What the camera sees is exactly what the fingers touch.
+    Object { name, visual: Mesh::union(&parts), parts, mass, friction: FRICTION }
+}
 
 /// The seeds of a split.
 pub(super) fn seeds(split: Split) -> Vec<u64> {
     match split {
         Split::Train => (0..303).collect(),
         Split::PileTest => (1_000_000..1_000_040).collect(),
-        Split::PackedTest => (2_000_000..2_000_016).collect(),
+        Split::PackedTest => (2_000_000..).filter(|&seed| is_upright(seed)).take(16).collect(),
     }
 }
 
-/// The object of a seed.
-pub fn object(seed: u64) -> Object {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let (w, d, h) = (rng.random_range(0.02..0.07), rng.random_range(0.02..0.07), rng.random_range(0.05..0.15));
-    let part = if seed % 2 == 0 {
-        Mesh::cuboid(Vector3::new(w, d, h))
-    } else {
-        Mesh::cylinder(w / 2.0, h, 24)
-    };
-    Object {
-        name: format!("block_{seed}"),
-        mass: part.volume() * 500.0,
-        visual: part.clone(),
-        parts: vec![part],
-        friction: 1.0,
+fn kind_of(seed: u64) -> &'static Kind {
+    &KINDS[(seed % KINDS.len() as u64) as usize]
+}
+
+/// Whether an object suits a packed test: of a kind that stands upright, and 5–16 cm high.
+fn is_upright(seed: u64) -> bool {
+    kind_of(seed).upright && (0.05..0.16).contains(&object(seed).visual.extents().z)
+}
+
+/// A shape centred on its bounding box and scaled to sizes that suit the gripper: of most, two
+/// sides fit between its fingers; some are too big for any grasp but one on a rim or handle.
+fn fitted(shape: Shape, dice: &mut Dice) -> Shape {
+    let (low, high) = shape.bounds();
+    let centre = nalgebra::center(&low, &high);
+    let mut sides: [f64; 3] = (high - low).into();
+    sides.sort_by(f64::total_cmp);
+    let [_, middle, longest] = sides;
+
+    let mut scale = 1.0;
+    if middle > GRASPABLE && dice.chance(0.85) || middle < 0.6 * GRASPABLE && dice.chance(0.5) {
+        scale = dice.between(0.75, 1.0) * GRASPABLE / middle;
+    }
+    scale = scale.min(LONGEST / longest).max(SMALLEST / longest);
+    shape.shifted(-centre.x, -centre.y, -centre.z).stretched(scale, scale, scale)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use super::*;
+    use crate::objects::ObjectSet;
+
+    fn all() -> Vec<Object> {
+        [Split::Train, Split::PileTest, Split::PackedTest].into_iter().flat_map(seeds).map(object).collect()
+    }
+
+    #[test]
+    fn sets_have_their_sizes_and_share_nothing() {
+        let sizes = [Split::Train, Split::PileTest, Split::PackedTest].map(|split| ObjectSet::procedural(split).len());
+        assert_eq!(sizes, [303, 40, 16]);
+        let names: HashSet<String> = all().into_iter().map(|object| object.name).collect();
+        assert_eq!(names.len(), 303 + 40 + 16);
+    }
+
+    #[test]
+    fn a_seed_always_gives_the_same_object_and_another_seed_another() {
+        let shapes: Vec<_> = (0..200).map(object).collect();
+        assert_eq!(shapes, (0..200).map(object).collect::<Vec<_>>());
+        let kinds = KINDS.len();
+        assert!(shapes.iter().zip(&shapes[kinds..]).all(|(a, b)| a.visual != b.visual));
+    }
+
+    #[test]
+    fn parts_are_convex_solids() {
+        for object in all() {
+            assert!((1..=32).contains(&object.parts.len()), "{}: {} parts", object.name, object.parts.len());
+            for part in &object.parts {
+                assert!(part.volume() > 1e-9, "{}: a part of {} m³", object.name, part.volume());
+                assert!((4..=64).contains(&part.vertices.len()), "{}: {} vertices", object.name, part.vertices.len());
+                for &triangle in &part.triangles {
+                    let normal = part.area_normal(triangle);
+                    if normal.norm() < 1e-9 {
+                        continue;
+                    }
+                    let corner = part.corners(triangle)[0];
+                    let out = part.vertices.iter().map(|p| normal.normalize().dot(&(p - corner))).fold(0.0, f64::max);
+                    assert!(out < 1e-5, "{}: a vertex lies {out} m outside a face", object.name);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn objects_are_centred_and_of_a_size_and_mass_to_lift() {
+        for object in all() {
+            let (low, high) = object.visual.bounds();
+            assert!((low + high.coords).coords.norm() < 1e-6, "{}: off centre", object.name);
+            let size = high - low;
+            assert!(size.min() > 0.003 && (0.044..0.23).contains(&size.max()), "{}: {size:?}", object.name);
+            assert!((0.002..5.0).contains(&object.mass), "{}: {} kg", object.name, object.mass);
+        }
+        let graspable = |object: &&Object| object.visual.extents().min() < 0.075;
+        let all = all();
+        assert!(all.iter().filter(graspable).count() * 100 > all.len() * 95);
+    }
+
+    #[test]
+    fn packed_objects_stand() {
+        for object in seeds(Split::PackedTest).into_iter().map(object) {
+            assert!(stands(&object, 0.005), "{} would fall over", object.name);
+        }
+    }
+
+    /// Whether the centre of mass is above the base, `margin` metres within its rim.
+    fn stands(object: &Object, margin: f64) -> bool {
+        let volume: f64 = object.parts.iter().map(Mesh::volume).sum();
+        let moment: nalgebra::Vector3<f64> =
+            object.parts.iter().map(|part| part.centroid().coords * part.volume()).sum();
+        let centre = moment / volume;
+        let floor = object.visual.bounds().0.z + 5e-4;
+        let base: Vec<_> = object.visual.vertices.iter().filter(|p| p.z < floor).collect();
+        (0..32).map(|i| (f64::from(i) * std::f64::consts::TAU / 32.0).sin_cos()).all(|(y, x)| {
+            let reach = |p: nalgebra::Vector3<f64>| p.x * x + p.y * y;
+            base.iter().any(|p| reach(p.coords) > reach(centre) + margin)
+        })
     }
 }

@@ -59,9 +59,9 @@ pub enum ObjectError {
         /// Why.
         source: tobj::LoadError,
     },
-    /// A mesh file without faces, or whose faces enclose nothing.
-    #[error("the mesh {} has no solid: it needs faces that enclose a volume", path.display())]
-    NoSolid {
+    /// A mesh file without faces.
+    #[error("the mesh {} has no faces; export it with its triangles", path.display())]
+    NoFaces {
         /// The OBJ.
         path: PathBuf,
     },
@@ -105,21 +105,15 @@ pub(super) fn load(path: &Path) -> Result<Object, ObjectError> {
 
     let mut parts = Vec::new();
     for collision in children(link, "collision") {
-        for (mesh, file) in urdf.geometry(collision)? {
-            match (Mesh::convex_hull(&mesh.vertices), file) {
-                (Some(hull), _) => parts.push(hull),
-                // Decompositions leave slivers without volume; they hold nothing up.
-                (None, Some(_)) => {}
-                (None, None) => return Err(urdf.wrong("has a <collision> shape without volume")),
-            }
-        }
+        // Decompositions leave slivers without volume; they hold nothing up.
+        parts.extend(urdf.geometry(collision)?.iter().filter_map(|mesh| Mesh::convex_hull(&mesh.vertices)));
     }
     if parts.is_empty() {
         return Err(urdf.wrong("has no <collision> shape that encloses a volume"));
     }
     let mut visual = Mesh::default();
     for node in children(link, "visual") {
-        urdf.geometry(node)?.iter().for_each(|(mesh, _)| visual.append(mesh));
+        urdf.geometry(node)?.iter().for_each(|mesh| visual.append(mesh));
     }
     if visual.triangles.is_empty() {
         visual = Mesh::union(&parts);
@@ -138,9 +132,8 @@ impl Urdf<'_> {
         ObjectError::Urdf { path: self.path.into(), what: what.into() }
     }
 
-    /// The shapes of a `<visual>` or `<collision>`, in the link's frame, each with the file it
-    /// came from, if any.
-    fn geometry(&self, node: Node) -> Result<Vec<(Mesh, Option<PathBuf>)>, ObjectError> {
+    /// The shapes of a `<visual>` or `<collision>`, in the link's frame.
+    fn geometry(&self, node: Node) -> Result<Vec<Mesh>, ObjectError> {
         let pose = match descend(node, &["origin"]) {
             Some(origin) => self.origin(origin)?,
             None => Isometry3::identity(),
@@ -150,28 +143,26 @@ impl Urdf<'_> {
             .ok_or_else(|| self.wrong(format!("has a <{}> without <geometry>", node.tag_name().name())))?;
         let meshes = match shape.tag_name().name() {
             "mesh" => self.mesh(shape)?,
-            "box" => vec![(Mesh::cuboid(self.lengths(shape, "size")?), None)],
+            "box" => vec![Mesh::cuboid(self.lengths(shape, "size")?)],
             "cylinder" => {
                 let (radius, length) = (self.length(shape, "radius")?, self.length(shape, "length")?);
-                vec![(Mesh::cylinder(radius, length, SIDES), None)]
+                vec![Mesh::cylinder(radius, length, SIDES)]
             }
-            "sphere" => vec![(Mesh::sphere(self.length(shape, "radius")?, SIDES), None)],
+            "sphere" => vec![Mesh::sphere(self.length(shape, "radius")?, SIDES)],
             other => return Err(self.wrong(format!("has a <{other}>; use mesh, box, cylinder or sphere"))),
         };
-        Ok(meshes.into_iter().map(|(mesh, file)| (mesh.transformed(&pose), file)).collect())
+        Ok(meshes.iter().map(|mesh| mesh.transformed(&pose)).collect())
     }
 
     /// The groups of an OBJ, scaled.
-    fn mesh(&self, node: Node) -> Result<Vec<(Mesh, Option<PathBuf>)>, ObjectError> {
+    fn mesh(&self, node: Node) -> Result<Vec<Mesh>, ObjectError> {
         let name = node.attribute("filename").ok_or_else(|| self.wrong("has a <mesh> without filename"))?;
         let scale = match node.attribute("scale") {
             Some(_) => self.lengths(node, "scale")?,
             None => Vector3::repeat(1.0),
         };
-        let path = self.path.parent().unwrap_or(Path::new("")).join(name);
-        let groups = load_obj(&path)?;
-        let scaled = |mesh: Mesh| mesh.mapped(|p| p.coords.component_mul(&scale).into());
-        Ok(groups.into_iter().map(|mesh| (scaled(mesh), Some(path.clone()))).collect())
+        let groups = load_obj(&self.path.with_file_name(name))?;
+        Ok(groups.iter().map(|mesh| mesh.mapped(|p| p.coords.component_mul(&scale).into())).collect())
     }
 
     fn origin(&self, node: Node) -> Result<Isometry3<f64>, ObjectError> {
@@ -201,10 +192,9 @@ impl Urdf<'_> {
         let values: Option<Vec<f64>> = text.split_whitespace().map(|word| word.parse().ok()).collect();
         match values.as_deref() {
             Some(&[x, y, z]) if [x, y, z].iter().all(|v| v.is_finite()) => Ok(Vector3::new(x, y, z)),
-            _ => Err(self.wrong(format!(
-                "<{} {name}=\"{text}\"/> must be three finite numbers",
-                node.tag_name().name()
-            ))),
+            _ => {
+                Err(self.wrong(format!("<{} {name}=\"{text}\"/> must be three finite numbers", node.tag_name().name())))
+            }
         }
     }
 
@@ -222,7 +212,8 @@ impl Urdf<'_> {
 fn load_obj(path: &Path) -> Result<Vec<Mesh>, ObjectError> {
     // One index for all attributes gives each group its own vertices.
     let options = tobj::LoadOptions { single_index: true, triangulate: true, ..Default::default() };
-    let (models, _) = tobj::load_obj(path, &options).map_err(|source| ObjectError::Mesh { path: path.into(), source })?;
+    let (models, _) =
+        tobj::load_obj(path, &options).map_err(|source| ObjectError::Mesh { path: path.into(), source })?;
     let groups: Vec<Mesh> = models
         .into_iter()
         .map(|model| {
@@ -234,7 +225,7 @@ fn load_obj(path: &Path) -> Result<Vec<Mesh>, ObjectError> {
         .filter(|mesh| !mesh.triangles.is_empty())
         .collect();
     if groups.is_empty() {
-        return Err(ObjectError::NoSolid { path: path.into() });
+        return Err(ObjectError::NoFaces { path: path.into() });
     }
     Ok(groups)
 }
@@ -246,4 +237,91 @@ fn children<'a, 'input>(node: Node<'a, 'input>, name: &'a str) -> impl Iterator<
 /// The first node down a path of tag names.
 fn descend<'a, 'input>(node: Node<'a, 'input>, path: &[&str]) -> Option<Node<'a, 'input>> {
     path.iter().try_fold(node, |node, name| node.children().find(|child| child.has_tag_name(*name)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TWO_BOXES: &str = "\
+o low
+v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1
+f 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4
+g high
+v 0 0 2\nv 1 0 2\nv 0 1 2\nv 0 0 3
+f 5 7 6\nf 5 6 8\nf 6 7 8\nf 7 5 8
+";
+
+    fn urdf(mass: &str, geometry: &str) -> String {
+        format!(
+            "<robot name='thing'><link name='base'>
+               <contact><lateral_friction value='0.8'/></contact>
+               <inertial><mass value='{mass}'/></inertial>
+               <visual><geometry>{geometry}</geometry></visual>
+               <collision><origin xyz='0 0 0.1' rpy='0 0 1.5707963267948966'/><geometry>{geometry}</geometry></collision>
+             </link></robot>"
+        )
+    }
+
+    /// Loads a folder with this URDF and two OBJ files beside it.
+    fn loaded(urdf: &str) -> Result<Vec<Object>, ObjectError> {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join("thing.urdf"), urdf).unwrap();
+        fs::write(folder.path().join("two.obj"), TWO_BOXES).unwrap();
+        fs::write(folder.path().join("none.obj"), "v 0 0 0\n").unwrap();
+        load_folder(folder.path())
+    }
+
+    fn error(urdf: &str) -> String {
+        loaded(urdf).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn every_group_of_a_mesh_is_a_part() {
+        let objects = loaded(&urdf("0.25", "<mesh filename='two.obj' scale='0.1 0.2 0.1'/>")).unwrap();
+        let [object] = objects.as_slice() else { panic!("{} objects", objects.len()) };
+        assert_eq!((object.name.as_str(), object.mass, object.friction), ("thing", 0.25, 0.8));
+        assert_eq!((object.parts.len(), object.visual.triangles.len()), (2, 8));
+        assert!((object.parts[0].volume() - 0.1 * 0.2 * 0.1 / 6.0).abs() < 1e-9);
+        // A quarter turn about z takes y to −x.
+        let (low, high) = object.parts[1].bounds();
+        assert!((low - Point3::new(-0.2, 0.0, 0.3)).norm() < 1e-6, "{low}");
+        assert!((high - Point3::new(0.0, 0.1, 0.4)).norm() < 1e-6, "{high}");
+    }
+
+    #[test]
+    fn simple_shapes_are_solids() {
+        let volume = |geometry: &str| loaded(&urdf("1", geometry)).unwrap()[0].parts[0].volume();
+        assert!((volume("<box size='0.03 0.06 0.03'/>") - 5.4e-5).abs() < 1e-9);
+        assert!((volume("<cylinder radius='0.02' length='0.1'/>") / 1.2566e-4 - 1.0).abs() < 0.01);
+        assert!((volume("<sphere radius='0.03'/>") / 1.1310e-4 - 1.0).abs() < 0.02);
+    }
+
+    #[test]
+    fn errors_name_the_file_and_the_fault() {
+        let cube = "<box size='1 1 1'/>";
+        let cases = [
+            ("<robot><link>".into(), "thing.urdf is not well-formed XML"),
+            ("<robot/>".into(), "has 0 links"),
+            (urdf("-1", cube), "value=\"-1\"/> must be more than 0 kg"),
+            (urdf("heavy", cube), "value=\"heavy\"/> must be a finite number"),
+            (urdf("1", "<box size='1 1'/>"), "size=\"1 1\"/> must be three finite numbers"),
+            (urdf("1", "<sphere radius='-2'/>"), "radius=\"-2\"/> must be more than 0"),
+            (urdf("1", "<capsule/>"), "has a <capsule>"),
+            (urdf("1", "<mesh filename='none.obj'/>"), "none.obj has no faces"),
+            (urdf("1", "<mesh filename='lost.obj'/>"), "cannot read the mesh"),
+        ];
+        for (urdf, fault) in cases {
+            let message = error(&urdf);
+            assert!(message.contains(fault), "{message:?} lacks {fault:?}");
+            assert!(message.contains(".urdf") || message.contains(".obj"), "{message:?} names no file");
+        }
+    }
+
+    #[test]
+    fn a_folder_without_objects_is_an_error() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(matches!(load_folder(folder.path()), Err(ObjectError::Empty { .. })));
+        assert!(matches!(load_folder(&folder.path().join("lost")), Err(ObjectError::Read { .. })));
+    }
 }

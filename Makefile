@@ -1,0 +1,61 @@
+# Everything is one `make` target away; `make` alone lists them.
+# Native libraries come from deploy/native.py, asked only by the recipes that need them: the first
+# call downloads, the others print a path. ORT_DYLIB_PATH, LIBTORCH and GRASPD_PYTHON override it.
+
+CARGO_TARGET_DIR ?= target
+CARGO ?= cargo
+PYTHON ?= python3
+export CARGO_TARGET_DIR
+
+# grasp-train alone needs libtorch, so it is always built by itself.
+WORKSPACE = --workspace --exclude grasp-train --locked
+TRAIN = --package grasp-train --locked
+RELEASE = $(CARGO_TARGET_DIR)/release
+
+# Put before a command. Each stops the recipe if it cannot be had.
+with_onnxruntime = ORT_DYLIB_PATH="$$($(PYTHON) deploy/native.py onnxruntime)" && export ORT_DYLIB_PATH &&
+with_python = GRASPD_PYTHON="$$($(PYTHON) deploy/native.py python)" && export GRASPD_PYTHON &&
+with_libtorch = LIBTORCH="$$($(PYTHON) deploy/native.py libtorch)" && export LIBTORCH && \
+	LD_LIBRARY_PATH="$$LIBTORCH/lib$${LD_LIBRARY_PATH:+:$$LD_LIBRARY_PATH}" && export LD_LIBRARY_PATH &&
+
+.PHONY: help demo build test fmt fmt-check lint doc test-rust test-train test-python clean
+# The order of test's parts is the order in which they fail fastest, also under `make -j`.
+.NOTPARALLEL:
+
+help: ## list the targets
+	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
+
+demo: ## simulate a cluttered table, clear it with the server's grasps, draw demo.png
+	$(with_onnxruntime) $(CARGO) build --release --package graspd --package grasp-sim --locked && \
+		$(RELEASE)/grasp-sim demo --graspd $(RELEASE)/graspd --models models/zoo --picture demo.png
+
+build: ## build the server, the simulator and the client, optimised
+	$(CARGO) build --release $(WORKSPACE)
+
+test: fmt-check lint doc test-rust test-train ## everything a change must pass
+
+fmt: ## format the code
+	$(CARGO) fmt --all
+
+fmt-check: ## check the format
+	$(CARGO) fmt --all --check
+
+lint: ## clippy, every warning an error
+	$(CARGO) clippy $(WORKSPACE) --all-targets -- -D warnings
+	$(with_libtorch) $(CARGO) clippy $(TRAIN) --all-targets -- -D warnings
+
+doc: ## build the documentation, every broken link an error
+	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --no-deps $(WORKSPACE)
+
+test-rust: ## test all but training, the Python client's end-to-end tests included
+	$(with_onnxruntime) $(with_python) $(CARGO) test $(WORKSPACE)
+
+test-train: ## test training, in libtorch on the CPU
+	$(with_onnxruntime) $(with_libtorch) $(CARGO) test $(TRAIN)
+
+test-python: ## of test-rust, only the tests whose names say python
+	$(with_onnxruntime) $(with_python) $(CARGO) test $(WORKSPACE) python
+
+clean: ## remove what was built; what was downloaded stays
+	$(CARGO) clean
+	rm -f demo.png

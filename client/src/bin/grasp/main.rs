@@ -1,0 +1,109 @@
+//! The command line of graspd.
+
+mod file;
+mod show;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::{Args, Parser, Subcommand};
+use grasp_client::{Client, Health, Options};
+
+/// Asks a graspd for grasps.
+#[derive(Parser)]
+#[command(name = "grasp", version, max_term_width = 100)]
+struct Cli {
+    /// Where the server is.
+    #[arg(long, global = true, env = "GRASPD_SERVER", value_name = "ADDR", default_value = "127.0.0.1:50051")]
+    server: String,
+
+    /// Print JSON instead of tables.
+    #[arg(long, global = true)]
+    json: bool,
+
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Finds the grasps in a volume.
+    Detect(Detect),
+    /// Lists the models that are loaded.
+    Models,
+    /// Says whether the server is ready; the exit status is 1 when it is not.
+    Health,
+}
+
+#[derive(Args)]
+struct Detect {
+    /// A .npy file, or a .npz file with one array or one called `grid`: N×N×N values in [0, 1] (u8: 0 to 255), indexed
+    /// x, y, z, 0.5 on the surface and 0 where nothing was observed.
+    file: PathBuf,
+
+    /// Which model answers. By default the server chooses.
+    #[arg(long, default_value = "", hide_default_value = true)]
+    model: String,
+
+    /// Which version of it. By default the newest.
+    #[arg(long, default_value = "", hide_default_value = true)]
+    version: String,
+
+    /// Edge of a voxel, metres. By default that of a cube of 0.3 m.
+    #[arg(long, value_name = "METRES")]
+    voxel_size: Option<f64>,
+
+    /// Smallest quality of a grasp, above 0 and at most 1. By default the model's own.
+    #[arg(long)]
+    threshold: Option<f32>,
+
+    /// At most this many grasps, the best. 0 for all.
+    #[arg(long, default_value_t = 0)]
+    max_grasps: u32,
+
+    /// Also say why the other voxels hold no grasp.
+    #[arg(long)]
+    explain: bool,
+}
+
+#[tokio::main(flavor = "current_thread")]
+async fn main() -> ExitCode {
+    match run(Cli::parse()).await {
+        Ok(code) => code,
+        Err(error) => {
+            eprintln!("grasp: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+async fn run(Cli { server, json, command }: Cli) -> anyhow::Result<ExitCode> {
+    match command {
+        Command::Detect(args) => {
+            // The file first: a mistake in it needs no server to be found.
+            let volume = file::read(&args.file, args.voxel_size)?;
+            let options = Options {
+                model: args.model,
+                version: args.version,
+                threshold: args.threshold,
+                max_grasps: args.max_grasps,
+                explain: args.explain,
+                ..Options::default()
+            };
+            let detection = Client::connect(server).await?.detect(&volume, options).await?;
+            println!("{}", if json { show::detection_json(&detection) } else { show::detection(&detection) });
+        }
+        Command::Models => {
+            let models = Client::connect(server).await?.list_models().await?;
+            println!("{}", if json { show::models_json(&models) } else { show::models(&models) });
+        }
+        Command::Health => {
+            let serving = Client::connect(server).await?.health().await? == Health::Serving;
+            println!("{}", if json { show::health_json(serving) } else { show::health(serving) });
+            if !serving {
+                return Ok(ExitCode::FAILURE);
+            }
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}

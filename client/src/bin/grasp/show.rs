@@ -1,0 +1,115 @@
+use comfy_table::{Cell, CellAlignment, Table, presets};
+use grasp_client::{Detection, Dropped, Latency, Model};
+use serde_json::{Value, json};
+
+pub(crate) fn detection(detection: &Detection) -> String {
+    let mut text = String::new();
+    if detection.grasps.is_empty() {
+        text += "No grasps.\n";
+    } else {
+        let mut table = numbers(&["", "quality", "x m", "y m", "z m", "qx", "qy", "qz", "qw", "width m"]);
+        for (rank, grasp) in detection.grasps.iter().enumerate() {
+            let (position, rotation) = (grasp.pose.translation.vector, grasp.pose.rotation.coords);
+            let pose = position.iter().chain(&rotation).map(|c| format!("{c:.4}"));
+            let row = [(rank + 1).to_string(), format!("{:.3}", grasp.quality)].into_iter().chain(pose);
+            table.add_row(right(row.chain([format!("{:.4}", grasp.width)])));
+        }
+        text += &format!("{table}\n");
+    }
+    if let Some(dropped) = &detection.dropped {
+        let reasons = reasons(dropped).map(|(reason, voxels)| format!("{} {voxels}", reason.replace('_', " ")));
+        text += &format!("dropped voxels: {}\n", reasons.join(", "));
+    }
+    let stages = stages(&detection.latency).map(|(stage, seconds)| format!("{stage} {:.2}", seconds * 1e3));
+    text += &format!("{} {}; in ms: {}", detection.model, detection.version, stages.join(", "));
+    text
+}
+
+pub(crate) fn detection_json(detection: &Detection) -> String {
+    let grasps = detection.grasps.iter().map(|grasp| {
+        let (position, rotation) = (grasp.pose.translation.vector, grasp.pose.rotation.coords);
+        json!({
+            "quality": grasp.quality,
+            "position": position.as_slice(),
+            "orientation_xyzw": rotation.as_slice(),
+            "width": grasp.width,
+        })
+    });
+    let object = |pairs: &[(&str, Value)]| -> Value { pairs.iter().map(|(k, v)| ((*k).to_owned(), v.clone())).collect() };
+    let value = json!({
+        "request_id": detection.request_id,
+        "frame_id": detection.frame_id,
+        "model": detection.model,
+        "version": detection.version,
+        "grasps": grasps.collect::<Vec<_>>(),
+        "latency_seconds": object(&stages(&detection.latency).map(|(stage, seconds)| (stage, json!(seconds)))),
+        "dropped": detection.dropped.as_ref().map(|d| object(&reasons(d).map(|(reason, n)| (reason, json!(n))))),
+    });
+    format!("{value:#}")
+}
+
+pub(crate) fn models(models: &[Model]) -> String {
+    let mut table = numbers(&["model", "version", "resolution", "voxel m", "threshold", "sha256"]);
+    for model in models {
+        let Model { name, version, resolution, voxel_size, threshold, sha256, .. } = model;
+        let sha256 = sha256.get(..12).unwrap_or(sha256).to_owned();
+        let [resolution, voxel_size, threshold] =
+            [resolution.to_string(), voxel_size.to_string(), threshold.to_string()];
+        table.add_row(right([name.clone(), version.clone(), resolution, voxel_size, threshold, sha256]));
+    }
+    table.to_string()
+}
+
+pub(crate) fn models_json(models: &[Model]) -> String {
+    let models = models.iter().map(|model| {
+        json!({
+            "name": model.name,
+            "version": model.version,
+            "resolution": model.resolution,
+            "voxel_size": model.voxel_size,
+            "threshold": model.threshold,
+            "sha256": model.sha256,
+            "provenance": model.provenance,
+        })
+    });
+    format!("{:#}", Value::from_iter(models))
+}
+
+pub(crate) fn health(serving: bool) -> String {
+    if serving { "serving" } else { "not serving: warming up or shutting down" }.to_owned()
+}
+
+pub(crate) fn health_json(serving: bool) -> String {
+    format!("{:#}", json!({ "serving": serving }))
+}
+
+fn stages(latency: &Latency) -> [(&'static str, f64); 5] {
+    [
+        ("queue", latency.queue),
+        ("preprocessing", latency.preprocessing),
+        ("inference", latency.inference),
+        ("postprocessing", latency.postprocessing),
+        ("total", latency.total),
+    ]
+}
+
+fn reasons(dropped: &Dropped) -> [(&'static str, u32); 6] {
+    [
+        ("below_threshold", dropped.below_threshold),
+        ("mask", dropped.mask),
+        ("width", dropped.width),
+        ("border", dropped.border),
+        ("suppressed", dropped.suppressed),
+        ("over_limit", dropped.over_limit),
+    ]
+}
+
+fn numbers(header: &[&str]) -> Table {
+    let mut table = Table::new();
+    table.load_style(presets::UTF8_HORIZONTAL_ONLY).set_header(right(header));
+    table
+}
+
+fn right<T: ToString>(cells: impl IntoIterator<Item = T>) -> Vec<Cell> {
+    cells.into_iter().map(|cell| Cell::new(cell.to_string()).set_alignment(CellAlignment::Right)).collect()
+}

@@ -1,0 +1,135 @@
+use std::time::Duration;
+
+use grasp::Volume;
+use grasp_proto::pb;
+use grasp_proto::pb::detect_grasps_stream_response::Outcome;
+use grasp_proto::pb::grasp_service_client::GraspServiceClient;
+use tokio::time::{Instant, sleep};
+use tokio_stream::{Stream, StreamExt};
+use tonic::Code;
+use tonic::transport::{Channel, Endpoint};
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
+
+use crate::{Detection, Error, Options};
+
+/// Several replies in flight on one connection must not wait for HTTP/2's windows of 64 KiB.
+const WINDOW: u32 = 4 << 20;
+
+/// How often a server that is not ready yet is asked again.
+const POLL: Duration = Duration::from_millis(50);
+
+/// A connection to graspd. Clones share it; calls may run at the same time.
+#[derive(Clone, Debug)]
+pub struct Client {
+    channel: Channel,
+}
+
+/// What a server says of itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Health {
+    /// It answers.
+    Serving,
+    /// It is warming up or shutting down.
+    NotServing,
+}
+
+impl Client {
+    /// Connects to `address`, such as `127.0.0.1:50051` or `http://robot:50051`.
+    ///
+    /// # Errors
+    /// [`Error::Connect`] when nobody listens there.
+    pub async fn connect(address: impl Into<String>) -> Result<Self, Error> {
+        let address = address.into();
+        let uri = if address.contains("://") { address.clone() } else { format!("http://{address}") };
+        let connect = async || {
+            let endpoint = Endpoint::from_shared(uri)?;
+            endpoint.initial_stream_window_size(WINDOW).initial_connection_window_size(WINDOW).connect().await
+        };
+        let channel = connect().await.map_err(|source| Error::Connect { address, source })?;
+        Ok(Self { channel })
+    }
+
+    /// Connects to a server that may still be starting, and returns once it is ready.
+    ///
+    /// # Errors
+    /// [`Error::NotReady`] with what it said last, if that takes longer than `timeout`.
+    pub async fn wait_ready(address: impl Into<String>, timeout: Duration) -> Result<Self, Error> {
+        let address = address.into();
+        let deadline = Instant::now() + timeout;
+        loop {
+            let last = match Self::connect(address.clone()).await {
+                Ok(client) => match client.health().await {
+                    Ok(Health::Serving) => return Ok(client),
+                    Ok(Health::NotServing) => "it says that it is not serving".to_owned(),
+                    Err(error) => error.to_string(),
+                },
+                Err(error) => error.to_string(),
+            };
+            if Instant::now() >= deadline {
+                return Err(Error::NotReady { address, timeout, last });
+            }
+            sleep(POLL).await;
+        }
+    }
+
+    /// Asks for the grasps in a volume.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] with the server's status.
+    pub async fn detect(&self, volume: &Volume, options: Options) -> Result<Detection, Error> {
+        let response = self.grasps().detect_grasps(options.request(volume)).await?;
+        response.into_inner().try_into()
+    }
+
+    /// Asks for the grasps in each of a stream of volumes; one answer comes for each, in their order. A volume that is
+    /// refused does not end the stream.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] when the stream cannot be opened.
+    pub async fn detect_stream<S>(
+        &self,
+        volumes: S,
+    ) -> Result<impl Stream<Item = Result<Detection, Error>> + use<S>, Error>
+    where
+        S: Stream<Item = (Volume, Options)> + Send + 'static,
+    {
+        let requests = volumes.map(|(volume, options)| options.request(&volume));
+        let responses = self.grasps().detect_grasps_stream(requests).await?.into_inner();
+        Ok(responses.map(|response| match response?.outcome {
+            Some(Outcome::Response(response)) => response.try_into(),
+            Some(Outcome::Error(error)) => Err(error.into()),
+            None => Err(Error::Refused {
+                code: Code::Internal,
+                message: "a reply with neither a response nor an error".to_owned(),
+                retry_after: None,
+            }),
+        }))
+    }
+
+    /// The models that the server has loaded, the default first.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] with the server's status.
+    pub async fn list_models(&self) -> Result<Vec<pb::Model>, Error> {
+        Ok(self.grasps().list_models(pb::ListModelsRequest {}).await?.into_inner().models)
+    }
+
+    /// Asks whether the server is ready.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] with the server's status.
+    pub async fn health(&self) -> Result<Health, Error> {
+        let response = HealthClient::new(self.channel.clone()).check(HealthCheckRequest::default()).await?;
+        Ok(match response.into_inner().status() {
+            ServingStatus::Serving => Health::Serving,
+            ServingStatus::NotServing | ServingStatus::Unknown | ServingStatus::ServiceUnknown => Health::NotServing,
+        })
+    }
+
+    fn grasps(&self) -> GraspServiceClient<Channel> {
+        // A reply holds grasps, never volumes, but with a low threshold there may be thousands of them.
+        GraspServiceClient::new(self.channel.clone()).max_decoding_message_size(WINDOW as usize)
+    }
+}

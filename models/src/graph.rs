@@ -1,0 +1,192 @@
+//! A small builder of ONNX graphs.
+//!
+//! Every floating-point initialiser is a parameter, to be learnt; constants are `Constant` nodes. The trainer relies
+//! on that difference.
+
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, Normal, Uniform};
+
+use crate::onnx::{
+    AttributeProto, Dimension, GraphProto, ModelProto, NodeProto, OperatorSetIdProto, TensorProto, ValueInfoProto,
+};
+
+/// Opset 17 is the oldest that has `LayerNormalization`; every ONNX Runtime and OpenVINO in use takes it.
+const OPSET: i64 = 17;
+/// The file format that came with opset 17.
+const IR_VERSION: i64 = 8;
+
+/// How a parameter starts.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Init {
+    /// All the same.
+    Constant(f32),
+    /// PyTorch's default for convolutions and linear layers: uniform in ±1/√`fan_in` (Kaiming-uniform with a = √5).
+    FanIn(usize),
+    /// Normal with mean 0 and this standard deviation.
+    Normal(f32),
+}
+
+/// A graph being built; values are known by their names.
+pub(crate) struct Builder {
+    graph: GraphProto,
+    rng: ChaCha8Rng,
+}
+
+impl Builder {
+    /// An empty graph; `seed` decides every random parameter.
+    pub fn new(name: &str, seed: u64) -> Self {
+        let graph = GraphProto { name: Some(name.to_owned()), ..GraphProto::default() };
+        Self { graph, rng: ChaCha8Rng::seed_from_u64(seed) }
+    }
+
+    /// Declares an input of shape `[batch, dims…]`.
+    pub fn input(&mut self, name: &str, dims: &[usize]) -> String {
+        self.graph.input.push(batched(name, dims));
+        name.to_owned()
+    }
+
+    /// Declares an output of shape `[batch, dims…]`: `value` under that name.
+    pub fn output(&mut self, name: &str, value: &str, dims: &[usize]) {
+        // The node that computes it takes the name, unless another node reads it too, which no network here does.
+        for output in self.graph.node.iter_mut().flat_map(|node| &mut node.output).filter(|o| *o == value) {
+            name.clone_into(output);
+        }
+        self.graph.output.push(batched(name, dims));
+    }
+
+    /// A parameter.
+    pub fn parameter(&mut self, name: &str, dims: &[usize], init: Init) -> String {
+        let count = dims.iter().product();
+        let values: Vec<f32> = match init {
+            Init::Constant(value) => vec![value; count],
+            Init::FanIn(fan_in) => {
+                let bound = 1.0 / (fan_in as f32).sqrt();
+                self.sample(count, Uniform::new_inclusive(-bound, bound))
+            }
+            Init::Normal(deviation) => self.sample(count, Normal::new(0.0, deviation)),
+        };
+        let dims: Vec<i64> = dims.iter().map(|&dim| dim as i64).collect();
+        self.graph.initializer.push(TensorProto::from_f32(name, &dims, &values));
+        name.to_owned()
+    }
+
+    fn sample<D: Distribution<f32>, E: std::fmt::Debug>(&mut self, count: usize, from: Result<D, E>) -> Vec<f32> {
+        let from = from.expect("a layer has inputs, so the bounds are finite");
+        from.sample_iter(&mut self.rng).take(count).collect()
+    }
+
+    /// A constant list of whole numbers.
+    pub fn whole(&mut self, values: &[i64]) -> String {
+        self.constant(TensorProto::from_i64("", &[values.len() as i64], values))
+    }
+
+    /// A constant number.
+    pub fn number(&mut self, value: f32) -> String {
+        self.constant(TensorProto::from_f32("", &[], &[value]))
+    }
+
+    /// A constant list of numbers.
+    pub fn numbers(&mut self, values: &[f32]) -> String {
+        self.constant(TensorProto::from_f32("", &[values.len() as i64], values))
+    }
+
+    fn constant(&mut self, value: TensorProto) -> String {
+        self.node("Constant", &[], vec![AttributeProto::tensor("value", value)])
+    }
+
+    /// An operation with one output.
+    pub fn node(&mut self, op: &str, inputs: &[&str], attributes: Vec<AttributeProto>) -> String {
+        let [output] = self.nodes(op, inputs, attributes);
+        output
+    }
+
+    /// An operation with `N` outputs.
+    pub fn nodes<const N: usize>(&mut self, op: &str, inputs: &[&str], attribute: Vec<AttributeProto>) -> [String; N] {
+        let name = format!("{op}_{}", self.graph.node.len());
+        let output =
+            if N == 1 { [(); N].map(|()| name.clone()) } else { std::array::from_fn(|i| format!("{name}_{i}")) };
+        self.graph.node.push(NodeProto {
+            input: inputs.iter().map(|&input| input.to_owned()).collect(),
+            output: output.to_vec(),
+            name: Some(name),
+            op_type: Some(op.to_owned()),
+            attribute,
+            domain: None,
+        });
+        output
+    }
+
+    /// A convolution that keeps the size, divided by its stride.
+    pub fn conv(&mut self, name: &str, x: &str, conv: Conv) -> String {
+        let Conv { inputs, outputs, kernel, stride, bias } = conv;
+        let fan_in = inputs * kernel.pow(3);
+        let weight = format!("{name}.weight");
+        let weight = self.parameter(&weight, &[outputs, inputs, kernel, kernel, kernel], Init::FanIn(fan_in));
+        let pad = (kernel as i64 - 1) / 2;
+        let attributes = vec![
+            AttributeProto::ints("kernel_shape", &[kernel as i64; 3]),
+            AttributeProto::ints("pads", &[pad; 6]),
+            AttributeProto::ints("strides", &[stride as i64; 3]),
+        ];
+        if bias {
+            let bias = self.parameter(&format!("{name}.bias"), &[outputs], Init::FanIn(fan_in));
+            self.node("Conv", &[x, &weight, &bias], attributes)
+        } else {
+            self.node("Conv", &[x, &weight], attributes)
+        }
+    }
+
+    /// Doubles the size: a transposed convolution with kernel 2, stride 2, no bias.
+    pub fn conv_transpose(&mut self, name: &str, x: &str, inputs: usize, outputs: usize) -> String {
+        // PyTorch takes the fan-in of a transposed convolution from its output channels.
+        let init = Init::FanIn(outputs * 8);
+        let weight = self.parameter(&format!("{name}.weight"), &[inputs, outputs, 2, 2, 2], init);
+        let attributes = vec![AttributeProto::ints("kernel_shape", &[2; 3]), AttributeProto::ints("strides", &[2; 3])];
+        self.node("ConvTranspose", &[x, &weight], attributes)
+    }
+
+    /// A linear layer over the last dimension; the weight is stored `[inputs, outputs]`.
+    pub fn linear(&mut self, name: &str, x: &str, inputs: usize, outputs: usize, bias: bool) -> String {
+        let weight = self.parameter(&format!("{name}.weight"), &[inputs, outputs], Init::FanIn(inputs));
+        let product = self.node("MatMul", &[x, &weight], vec![]);
+        if !bias {
+            return product;
+        }
+        let bias = self.parameter(&format!("{name}.bias"), &[outputs], Init::FanIn(inputs));
+        self.node("Add", &[&product, &bias], vec![])
+    }
+
+    /// The finished file.
+    pub fn finish(self) -> ModelProto {
+        ModelProto {
+            ir_version: Some(IR_VERSION),
+            producer_name: Some("graspd".to_owned()),
+            producer_version: Some(env!("CARGO_PKG_VERSION").to_owned()),
+            graph: Some(self.graph),
+            opset_import: vec![OperatorSetIdProto { domain: Some(String::new()), version: Some(OPSET) }],
+            metadata_props: vec![],
+        }
+    }
+}
+
+/// The sizes of a convolution with a cubic kernel.
+#[derive(Clone, Copy)]
+pub(crate) struct Conv {
+    /// Input channels.
+    pub inputs: usize,
+    /// Output channels.
+    pub outputs: usize,
+    /// Edge of the kernel, odd, or equal to the stride.
+    pub kernel: usize,
+    /// Stride along each axis.
+    pub stride: usize,
+    /// Whether a bias is added.
+    pub bias: bool,
+}
+
+fn batched(name: &str, dims: &[usize]) -> ValueInfoProto {
+    let mut shape = vec![Dimension::named("batch")];
+    shape.extend(dims.iter().map(|&dim| Dimension::size(dim as i64)));
+    ValueInfoProto::tensor(name, shape)
+}

@@ -1,0 +1,169 @@
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::str::FromStr;
+
+use grasp::{DecodeParams, RESOLUTION, VoxelOrigin, WORKSPACE_SIZE};
+use thiserror::Error;
+
+use crate::onnx::{DimensionValue, ModelProto, StringStringEntryProto, ValueInfoProto};
+
+/// What a model file means, kept inside it as properties named `graspd.…`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Metadata {
+    /// The name it is asked for by.
+    pub name: String,
+    /// Its version: numbers separated by dots.
+    pub version: String,
+    /// Voxels along an edge of the volume it reads.
+    pub resolution: usize,
+    /// Edge of a voxel it was trained for, metres.
+    pub voxel_size: f64,
+    /// What a voxel's value means.
+    pub value_convention: ValueConvention,
+    /// Where in its voxel a grasp stands.
+    pub voxel_origin: VoxelOrigin,
+    /// Where the weights come from: data, seeds, steps, date and whatever else was noted (`graspd.provenance.…`).
+    pub provenance: BTreeMap<String, String>,
+}
+
+/// What a voxel's value means to a network.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ValueConvention {
+    /// VGN's: (tsdf + 1) / 2 near an observed surface, 0 elsewhere. What [`grasp::Volume`] holds.
+    #[default]
+    Vgn,
+}
+
+/// A property that cannot be what it says.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[error("the model's property `graspd.{key}` is `{value}`, it must be {expected}")]
+pub struct MetadataError {
+    /// Which property, without `graspd.`.
+    pub key: &'static str,
+    /// Its value.
+    pub value: String,
+    /// What it may be.
+    pub expected: &'static str,
+}
+
+const PREFIX: &str = "graspd.";
+const PROVENANCE: &str = "provenance.";
+
+impl Metadata {
+    /// What a file without properties means: VGN's conventions, named after the file.
+    ///
+    /// `resolution` is that of the input's shape, where it is fixed.
+    #[must_use]
+    pub fn defaults(path: &Path, resolution: Option<usize>) -> Self {
+        let resolution = resolution.unwrap_or(RESOLUTION);
+        Self {
+            name: path.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
+            version: "1".to_owned(),
+            resolution,
+            voxel_size: WORKSPACE_SIZE / resolution as f64,
+            value_convention: ValueConvention::Vgn,
+            voxel_origin: VoxelOrigin::Corner,
+            provenance: BTreeMap::new(),
+        }
+    }
+
+    /// The metadata of a model that was read from `path`; what the file does not say has its [default](Self::defaults).
+    ///
+    /// # Errors
+    /// [`MetadataError`] names the property that cannot be.
+    pub fn of(model: &ModelProto, path: &Path) -> Result<Self, MetadataError> {
+        let input = model.graph.as_ref().and_then(|graph| graph.input.first());
+        let properties = model.metadata_props.iter().filter_map(|p| Some((p.key.clone()?, p.value.clone()?)));
+        Self::from_properties(properties, Self::defaults(path, input.and_then(fixed_resolution)))
+    }
+
+    /// Overwrites `defaults` with every `graspd.…` property.
+    pub(crate) fn from_properties(
+        properties: impl IntoIterator<Item = (String, String)>,
+        defaults: Self,
+    ) -> Result<Self, MetadataError> {
+        let mut metadata = defaults;
+        for (key, value) in properties {
+            let Some(key) = key.strip_prefix(PREFIX) else { continue };
+            match key {
+                "name" => metadata.name = value,
+                "version" => metadata.version = value,
+                "resolution" => {
+                    metadata.resolution = parse("resolution", &value, "a whole number of voxels above 0", |&n| n > 0)?;
+                }
+                "voxel_size" => {
+                    let valid = |&size: &f64| size.is_finite() && size > 0.0;
+                    metadata.voxel_size = parse("voxel_size", &value, "a number of metres above 0", valid)?;
+                }
+                "value_convention" => {
+                    metadata.value_convention = match value.as_str() {
+                        "vgn" => ValueConvention::Vgn,
+                        _ => return Err(MetadataError { key: "value_convention", value, expected: "`vgn`" }),
+                    }
+                }
+                "voxel_origin" => {
+                    metadata.voxel_origin = match value.as_str() {
+                        "corner" => VoxelOrigin::Corner,
+                        "center" => VoxelOrigin::Center,
+                        _ => {
+                            return Err(MetadataError { key: "voxel_origin", value, expected: "`corner` or `center`" });
+                        }
+                    }
+                }
+                _ => {
+                    if let Some(key) = key.strip_prefix(PROVENANCE) {
+                        metadata.provenance.insert(key.to_owned(), value);
+                    }
+                }
+            }
+        }
+        Ok(metadata)
+    }
+
+    /// Replaces the model's `graspd.…` properties by these, keeping the others.
+    pub fn write_to(&self, model: &mut ModelProto) {
+        model.metadata_props.retain(|p| !p.key().starts_with(PREFIX));
+        let mut put = |key: &str, value: String| {
+            let key = Some(format!("{PREFIX}{key}"));
+            model.metadata_props.push(StringStringEntryProto { key, value: Some(value) });
+        };
+        let ValueConvention::Vgn = self.value_convention;
+        let origin = match self.voxel_origin {
+            VoxelOrigin::Corner => "corner",
+            VoxelOrigin::Center => "center",
+        };
+        put("name", self.name.clone());
+        put("version", self.version.clone());
+        put("resolution", self.resolution.to_string());
+        put("voxel_size", self.voxel_size.to_string());
+        put("value_convention", "vgn".to_owned());
+        put("voxel_origin", origin.to_owned());
+        for (key, value) in &self.provenance {
+            put(&format!("{PROVENANCE}{key}"), value.clone());
+        }
+    }
+
+    /// VGN's decoding for this network: its voxel origin, everything else as in [`DecodeParams::default`].
+    #[must_use]
+    pub fn decode_params(&self) -> DecodeParams {
+        DecodeParams { origin: self.voxel_origin, ..DecodeParams::default() }
+    }
+}
+
+/// The resolution an input of shape `[batch, 1, N, N, N]` fixes.
+fn fixed_resolution(input: &ValueInfoProto) -> Option<usize> {
+    let dims = &input.r#type.as_ref()?.tensor_type.as_ref()?.shape.as_ref()?.dim;
+    match dims.last()?.value {
+        Some(DimensionValue::Size(size)) => usize::try_from(size).ok().filter(|&size| size > 0),
+        _ => None,
+    }
+}
+
+fn parse<T: FromStr>(
+    key: &'static str,
+    value: &str,
+    expected: &'static str,
+    valid: impl Fn(&T) -> bool,
+) -> Result<T, MetadataError> {
+    value.parse().ok().filter(valid).ok_or_else(|| MetadataError { key, value: value.to_owned(), expected })
+}

@@ -1,0 +1,107 @@
+use std::collections::BTreeMap;
+use std::fmt;
+use std::str::FromStr;
+
+use grasp::{RESOLUTION, VoxelOrigin};
+use thiserror::Error;
+
+use crate::onnx::ModelProto;
+use crate::transformer::{Config, transformer};
+use crate::vgn::vgn;
+use crate::{Metadata, ValueConvention};
+
+/// The networks that are defined here.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Architecture {
+    /// VGN, convolutional, 0.3 M parameters.
+    Vgn,
+    /// The paper's transformer, 87 M parameters.
+    Transformer,
+    /// The paper's transformer with smaller sizes.
+    TransformerSmall,
+}
+
+/// The name is no network's.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[error("there is no network `{0}`; there are vgn, transformer and transformer-small")]
+pub struct UnknownArchitecture(String);
+
+/// The network cannot read volumes of this size.
+#[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
+#[error("resolution is {0}, a network halves it three times, so it must be a positive multiple of 8")]
+pub struct UnsupportedResolution(usize);
+
+/// Why no network was built.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+pub enum BuildError {
+    /// The name is no network's.
+    #[error(transparent)]
+    Name(#[from] UnknownArchitecture),
+    /// The resolution does not fit.
+    #[error(transparent)]
+    Resolution(#[from] UnsupportedResolution),
+}
+
+/// The network of that name with random weights, reading the paper's 40³ volumes.
+///
+/// # Errors
+/// [`BuildError::Name`] when there is none.
+pub fn build(name: &str, seed: u64) -> Result<ModelProto, BuildError> {
+    Ok(name.parse::<Architecture>()?.build(RESOLUTION, seed)?)
+}
+
+impl Architecture {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::Vgn, Self::Transformer, Self::TransformerSmall];
+
+    /// Its name.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Vgn => "vgn",
+            Self::Transformer => "transformer",
+            Self::TransformerSmall => "transformer-small",
+        }
+    }
+
+    /// The network with random weights for volumes of `resolution`³ voxels. The same seed gives the same bytes.
+    ///
+    /// # Errors
+    /// [`UnsupportedResolution`] unless the resolution is a multiple of 8.
+    pub fn build(self, resolution: usize, seed: u64) -> Result<ModelProto, UnsupportedResolution> {
+        if resolution == 0 || !resolution.is_multiple_of(8) {
+            return Err(UnsupportedResolution(resolution));
+        }
+        let mut model = match self {
+            Self::Vgn => vgn(resolution, seed),
+            Self::Transformer => transformer(&Config::PAPER, resolution, seed),
+            Self::TransformerSmall => transformer(&Config::SMALL, resolution, seed),
+        };
+        let provenance = [("architecture", self.name().to_owned()), ("seed", seed.to_string())];
+        let metadata = Metadata {
+            name: self.name().to_owned(),
+            version: "1".to_owned(),
+            resolution,
+            voxel_size: grasp::WORKSPACE_SIZE / resolution as f64,
+            value_convention: ValueConvention::Vgn,
+            voxel_origin: VoxelOrigin::Corner,
+            provenance: BTreeMap::from(provenance.map(|(key, value)| (key.to_owned(), value))),
+        };
+        metadata.write_to(&mut model);
+        Ok(model)
+    }
+}
+
+impl fmt::Display for Architecture {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for Architecture {
+    type Err = UnknownArchitecture;
+
+    fn from_str(name: &str) -> Result<Self, Self::Err> {
+        Self::ALL.into_iter().find(|a| a.name() == name).ok_or_else(|| UnknownArchitecture(name.to_owned()))
+    }
+}

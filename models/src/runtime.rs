@@ -1,0 +1,359 @@
+//! ONNX Runtime: the only module that touches it.
+
+use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
+use std::env::consts::{DLL_PREFIX, DLL_SUFFIX};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+use grasp::{Maps, Volume};
+use ort::environment::Environment;
+use ort::logging::LogLevel;
+use ort::memory::Allocator;
+use ort::session::{IoBinding, Session};
+use ort::value::{Outlet, Tensor, TensorElementType};
+use thiserror::Error;
+
+use crate::{Metadata, MetadataError};
+
+/// The input every network has: `[batch, 1, N, N, N]`.
+const INPUT: &str = "tsdf";
+
+/// The outputs every network has, with their channels: `[batch, channels, N, N, N]`.
+const OUTPUTS: [(&str, usize); 3] = [("quality", 1), ("rotation", 4), ("width", 1)];
+
+/// What was loaded.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RuntimeInfo {
+    /// The shared library, as it was asked for.
+    pub library: PathBuf,
+    /// Its version, such as `1.24.1`.
+    pub version: String,
+    /// What it says of how it was built.
+    pub build: String,
+}
+
+/// Why ONNX Runtime is not there or did not compute.
+#[derive(Clone, Debug, Error)]
+pub enum RuntimeError {
+    /// The shared library could not be loaded, or is too old.
+    #[error(
+        "ONNX Runtime (at least 1.{}): {reason}; get it with `python3 deploy/native.py onnxruntime` and set \
+         ORT_DYLIB_PATH to the path that prints",
+        ort::MINOR_VERSION
+    )]
+    Library {
+        /// What is wrong.
+        reason: String,
+    },
+    /// A batch without a volume.
+    #[error("the batch is empty")]
+    EmptyBatch,
+    /// A volume is of another size than the network reads.
+    #[error("resolution is {got}, the model `{model}` reads {expected}")]
+    Resolution {
+        /// The volume's.
+        got: usize,
+        /// The network's.
+        expected: usize,
+        /// The network.
+        model: String,
+    },
+    /// ONNX Runtime failed.
+    #[error("the model `{model}`: {reason}")]
+    Run {
+        /// The network.
+        model: String,
+        /// What it said.
+        reason: String,
+    },
+}
+
+/// Why a file is not a network that can be served.
+#[derive(Debug, Error)]
+#[error("{}: {reason}", path.display())]
+pub struct LoadError {
+    /// The file.
+    pub path: PathBuf,
+    /// What is wrong with it.
+    pub reason: LoadReason,
+}
+
+/// What is wrong with a file.
+#[derive(Debug, Error)]
+pub enum LoadReason {
+    /// ONNX Runtime is not there.
+    #[error(transparent)]
+    Runtime(#[from] RuntimeError),
+    /// The file system refused.
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+    /// ONNX Runtime refuses it.
+    #[error("ONNX Runtime refuses it: {0}; if the file was cut short, fetch or export it again")]
+    Model(#[from] ort::Error),
+    /// Its metadata cannot be.
+    #[error(transparent)]
+    Metadata(#[from] MetadataError),
+    /// Its inputs or outputs are not those of a grasp network.
+    #[error(
+        "{what}; a grasp network reads `tsdf` f32 [batch, 1, N, N, N] and gives `quality`, `rotation` and `width`, \
+         f32 [batch, 1, 4 and 1, N, N, N]"
+    )]
+    Signature {
+        /// What is different.
+        what: String,
+    },
+}
+
+/// Loads ONNX Runtime, once: the library that `ORT_DYLIB_PATH` names, or else the system's.
+///
+/// Telemetry, which official builds switch on, is switched off; its log goes to `tracing`.
+///
+/// # Errors
+/// [`RuntimeError::Library`] says what is wrong with the library and how to get one.
+pub fn init() -> Result<&'static RuntimeInfo, RuntimeError> {
+    Ok(&runtime()?.info)
+}
+
+struct Runtime {
+    info: RuntimeInfo,
+    /// Never dropped: threads of ONNX Runtime may outlive `main`.
+    environment: Environment,
+}
+
+fn runtime() -> Result<&'static Runtime, RuntimeError> {
+    static RUNTIME: OnceLock<Result<Runtime, RuntimeError>> = OnceLock::new();
+    RUNTIME.get_or_init(load_library).as_ref().map_err(Clone::clone)
+}
+
+fn load_library() -> Result<Runtime, RuntimeError> {
+    let library = std::env::var_os("ORT_DYLIB_PATH").filter(|path| !path.is_empty());
+    let library = library.map_or_else(|| PathBuf::from(format!("{DLL_PREFIX}onnxruntime{DLL_SUFFIX}")), PathBuf::from);
+    let refuse = |error: &dyn std::fmt::Display| RuntimeError::Library { reason: error.to_string() };
+    let builder = ort::init_from(&library).map_err(|error| refuse(&error))?;
+    let environment = builder.with_name("graspd").with_telemetry(false).build().map_err(|error| refuse(&error))?;
+    environment.set_log_level(LogLevel::Warning);
+    let build = ort::info().to_owned();
+    let info = RuntimeInfo { version: version(&build, &library), build, library };
+    Ok(Runtime { info, environment })
+}
+
+/// The version, from the branch it was built from; a build from elsewhere is known by its file name alone.
+fn version(build: &str, library: &Path) -> String {
+    let branch = build.split("git-branch=rel-").nth(1).and_then(|rest| rest.split(',').next());
+    branch.map_or_else(|| library.file_name().unwrap_or_default().to_string_lossy().into_owned(), str::to_owned)
+}
+
+/// How a network is run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Options {
+    /// Threads one inference is spread over.
+    pub threads: usize,
+}
+
+impl Default for Options {
+    /// One thread.
+    fn default() -> Self {
+        Self { threads: 1 }
+    }
+}
+
+/// A network ready to run, with its buffers. A server thread owns one each: ONNX Runtime does not promise that one
+/// session can be run from several threads at a time.
+pub struct Network {
+    metadata: Metadata,
+    session: Session,
+    /// By batch size; a batch of a size that was seen before allocates nothing.
+    buffers: BTreeMap<usize, Buffers>,
+}
+
+/// Input and outputs of one batch size, in place where ONNX Runtime reads and writes.
+struct Buffers {
+    binding: IoBinding,
+    input: Tensor<f32>,
+    outputs: [Tensor<f32>; 3],
+}
+
+/// The maps of a batch, in the network's buffers until it runs again.
+pub struct Output<'a> {
+    outputs: &'a [Tensor<f32>; 3],
+    batch: usize,
+    voxels: usize,
+}
+
+impl Network {
+    /// Loads a file, and checks that its inputs and outputs are those of a grasp network.
+    ///
+    /// # Errors
+    /// [`LoadError`] names the file and what is wrong with it.
+    pub fn load(path: &Path, options: &Options) -> Result<Self, LoadError> {
+        Self::try_load(path, options).map_err(|reason| LoadError { path: path.to_owned(), reason })
+    }
+
+    fn try_load(path: &Path, options: &Options) -> Result<Self, LoadReason> {
+        let runtime = runtime()?;
+        // Read here, so that a file that cannot be read is told from one that is no model.
+        let bytes = fs::read(path)?;
+        let builder = Session::builder(&runtime.environment)?;
+        let builder = builder.with_intra_threads(options.threads).map_err(ort::Error::from)?;
+        let mut builder = builder.with_inter_threads(1).map_err(ort::Error::from)?;
+        let session = builder.commit_from_memory(&bytes)?;
+        let resolution = check_signature(session.inputs(), session.outputs())?;
+        let metadata = read_metadata(&session, Metadata::defaults(path, resolution))?;
+        if let Some(resolution) = resolution.filter(|&resolution| resolution != metadata.resolution) {
+            let what = format!("its metadata says N = {}, its input has N = {resolution}", metadata.resolution);
+            return Err(LoadReason::Signature { what });
+        }
+        Ok(Self { metadata, session, buffers: BTreeMap::new() })
+    }
+
+    /// What the file says of itself.
+    #[must_use]
+    pub fn metadata(&self) -> &Metadata {
+        &self.metadata
+    }
+
+    /// Runs the network over a batch of volumes of its resolution.
+    ///
+    /// # Errors
+    /// [`RuntimeError`] when the batch does not fit the network, or ONNX Runtime fails.
+    pub fn infer(&mut self, batch: &[&Volume]) -> Result<Output<'_>, RuntimeError> {
+        self.fill(batch)?;
+        self.run(batch.len())
+    }
+
+    /// Copies a batch to where ONNX Runtime reads it.
+    ///
+    /// # Errors
+    /// [`RuntimeError`] when the batch does not fit the network.
+    pub fn fill(&mut self, batch: &[&Volume]) -> Result<(), RuntimeError> {
+        if batch.is_empty() {
+            return Err(RuntimeError::EmptyBatch);
+        }
+        let expected = self.metadata.resolution;
+        for volume in batch {
+            let got = volume.resolution();
+            if got != expected {
+                return Err(RuntimeError::Resolution { got, expected, model: self.metadata.name.clone() });
+            }
+        }
+        let voxels = expected.pow(3);
+        let (_, input) = self.buffers(batch.len())?.input.extract_tensor_mut();
+        for (values, volume) in input.chunks_exact_mut(voxels).zip(batch) {
+            values.copy_from_slice(volume.values());
+        }
+        Ok(())
+    }
+
+    /// Runs the network over what [`fill`](Self::fill) last left for this batch size, zeros at first: inference
+    /// without the copy, which is what a bare `session.run` is measured by.
+    ///
+    /// # Errors
+    /// [`RuntimeError::Run`] when ONNX Runtime fails.
+    pub fn run(&mut self, batch: usize) -> Result<Output<'_>, RuntimeError> {
+        self.buffers(batch)?;
+        let Self { metadata, session, buffers } = self;
+        let buffers = buffers.get_mut(&batch).ok_or(RuntimeError::EmptyBatch)?;
+        let mut run = |buffers: &mut Buffers| -> ort::Result<()> {
+            // Bound anew each time, for on some devices binding is what copies the input there.
+            buffers.binding.bind_input(INPUT, &buffers.input)?;
+            session.run_binding(&buffers.binding).map(drop)
+        };
+        run(buffers).map_err(|error| refusal(&metadata.name, &error))?;
+        Ok(Output { outputs: &buffers.outputs, batch, voxels: metadata.resolution.pow(3) })
+    }
+
+    fn buffers(&mut self, batch: usize) -> Result<&mut Buffers, RuntimeError> {
+        match self.buffers.entry(batch) {
+            Entry::Occupied(entry) => Ok(entry.into_mut()),
+            Entry::Vacant(entry) => {
+                let buffers = Buffers::new(&self.session, batch, self.metadata.resolution);
+                Ok(entry.insert(buffers.map_err(|error| refusal(&self.metadata.name, &error))?))
+            }
+        }
+    }
+}
+
+impl Buffers {
+    fn new(session: &Session, batch: usize, resolution: usize) -> ort::Result<Self> {
+        let tensor =
+            |channels| Tensor::<f32>::new(&Allocator::default(), [batch, channels, resolution, resolution, resolution]);
+        let mut input = tensor(1)?;
+        input.extract_tensor_mut().1.fill(0.0);
+        let mut outputs = [tensor(OUTPUTS[0].1)?, tensor(OUTPUTS[1].1)?, tensor(OUTPUTS[2].1)?];
+        let mut binding = session.create_binding()?;
+        for ((name, _), tensor) in OUTPUTS.iter().zip(&mut outputs) {
+            binding.bind_output(*name, tensor)?;
+        }
+        Ok(Self { binding, input, outputs })
+    }
+}
+
+impl Output<'_> {
+    /// How many volumes the batch had.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.batch
+    }
+
+    /// Never: an empty batch is refused.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.batch == 0
+    }
+
+    /// The maps of one volume of the batch.
+    ///
+    /// # Panics
+    /// When `index` is not below [`len`](Self::len).
+    #[must_use]
+    pub fn maps(&self, index: usize) -> Maps<'_> {
+        let [quality, rotation, width] = [0, 1, 2].map(|output: usize| {
+            let size = OUTPUTS[output].1 * self.voxels;
+            &self.outputs[output].extract_tensor().1[index * size..][..size]
+        });
+        Maps { quality, rotation, width }
+    }
+}
+
+fn refusal(model: &str, error: &ort::Error) -> RuntimeError {
+    RuntimeError::Run { model: model.to_owned(), reason: error.to_string() }
+}
+
+/// The resolution, if the input's shape fixes it.
+fn check_signature(inputs: &[Outlet], outputs: &[Outlet]) -> Result<Option<usize>, LoadReason> {
+    if let Some(extra) = inputs.iter().find(|input| input.name() != INPUT) {
+        return Err(LoadReason::Signature { what: format!("it has an input `{}`", extra.name()) });
+    }
+    let resolution = check_tensor(inputs, INPUT, 1)?;
+    for (name, channels) in OUTPUTS {
+        check_tensor(outputs, name, channels)?;
+    }
+    Ok(resolution)
+}
+
+fn check_tensor(outlets: &[Outlet], name: &str, channels: usize) -> Result<Option<usize>, LoadReason> {
+    let wrong = |what: String| LoadReason::Signature { what };
+    let outlet = outlets.iter().find(|outlet| outlet.name() == name);
+    let dtype = outlet.ok_or_else(|| wrong(format!("it has no `{name}`")))?.dtype();
+    let fits = |dim: i64, size: usize| dim < 0 || dim == size as i64;
+    match dtype.tensor_shape().map(|shape| &**shape) {
+        Some(&[batch, c, x, y, z])
+            if dtype.tensor_type() == Some(TensorElementType::Float32)
+                && batch < 0
+                && fits(c, channels)
+                && [y, z].iter().all(|&edge| edge < 0 || x < 0 || edge == x) =>
+        {
+            Ok([x, y, z].into_iter().find_map(|edge| usize::try_from(edge).ok()))
+        }
+        _ => Err(wrong(format!("its `{name}` is {dtype}"))),
+    }
+}
+
+fn read_metadata(session: &Session, defaults: Metadata) -> Result<Metadata, LoadReason> {
+    let properties = session.metadata()?;
+    let keys = properties.custom_keys()?;
+    let pairs = keys.into_iter().filter_map(|key| properties.custom(&key).map(|value| (key, value)));
+    Ok(Metadata::from_properties(pairs, defaults)?)
+}

@@ -1,0 +1,189 @@
+//! The paper's network: UNETR (Hatamizadeh et al., WACV 2022) cut to a grasp volume, with VGN's heads.
+//!
+//! Where the paper is silent, layers and initialisation are those of the UNETR code in MONAI.
+
+use crate::graph::{Builder, Conv, Init};
+use crate::heads::{heads, volume};
+use crate::onnx::{AttributeProto, ModelProto};
+
+/// Edge of a patch, voxels: the decoder doubles the size three times.
+const PATCH: usize = 8;
+
+/// ε of both normalisations.
+const EPSILON: f32 = 1e-5;
+
+/// The sizes of a transformer.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Config {
+    /// K: dimension of a token.
+    pub hidden: usize,
+    /// L: transformer blocks.
+    pub layers: usize,
+    /// H: attention heads; divides K.
+    pub heads: usize,
+    /// Hidden units of the feed-forward block.
+    pub mlp: usize,
+    /// D: dimension of a voxel's features.
+    pub features: usize,
+    /// The blocks (counted from 1) whose output is carried over to the decoder: the finer skip, the coarser skip.
+    pub skips: [usize; 2],
+}
+
+impl Config {
+    /// The paper's network, 87 M parameters: ViT-B's encoder.
+    pub const PAPER: Self = Self { hidden: 768, layers: 12, heads: 12, mlp: 3072, features: 16, skips: [4, 7] };
+
+    /// Small enough to train on a CPU. Most of the time is spent in the decoder's convolutions over all voxels, hence
+    /// half the features; the skips stand at the same fractions of the depth.
+    pub const SMALL: Self = Self { hidden: 192, layers: 6, heads: 6, mlp: 768, features: 8, skips: [2, 4] };
+}
+
+/// The transformer over volumes of `resolution`³ voxels, a multiple of 8.
+pub(crate) fn transformer(config: &Config, resolution: usize, seed: u64) -> ModelProto {
+    let Config { hidden, features, skips, .. } = *config;
+    let mut builder = Builder::new("transformer", seed);
+    let b = &mut builder;
+    let edge = resolution / PATCH;
+
+    let input = volume(b, resolution);
+    let mut tokens = serialize(b, &input, hidden, edge);
+    let mut carried = [String::new(), String::new()];
+    for layer in 1..=config.layers {
+        tokens = block(b, &format!("block.{layer}"), &tokens, config, edge.pow(3));
+        if let Some(skip) = skips.iter().position(|&skip| skip == layer) {
+            carried[skip] = volumetric(b, &tokens, hidden, edge);
+        }
+    }
+    let tokens = layer_norm(b, "norm", &tokens, hidden);
+    let [fine, coarse] = carried;
+
+    // Each step doubles the size, halves the features and takes in a skip of the same size and features.
+    let coarse = b.conv_transpose("skip.coarse.0", &coarse, hidden, 4 * features);
+    let fine = b.conv_transpose("skip.fine.0", &fine, hidden, 2 * features);
+    let fine = b.conv_transpose("skip.fine.1", &fine, 2 * features, 2 * features);
+    let input = residual_block(b, "skip.input", &input, 1, features);
+    let mut x = volumetric(b, &tokens, hidden, edge);
+    let mut inputs = hidden;
+    for (name, skip, outputs) in
+        [("decoder.0", coarse, 4 * features), ("decoder.1", fine, 2 * features), ("decoder.2", input, features)]
+    {
+        x = b.conv_transpose(&format!("{name}.up"), &x, inputs, outputs);
+        x = b.node("Concat", &[&x, &skip], vec![AttributeProto::int("axis", 1)]);
+        x = residual_block(b, name, &x, 2 * outputs, outputs);
+        inputs = outputs;
+    }
+    heads(b, &x, features, resolution);
+    builder.finish()
+}
+
+/// The paper, section "Serialization": each patch projected to a token, plus a learnt position. `[batch, M, K]`.
+fn serialize(b: &mut Builder, volume: &str, hidden: usize, edge: usize) -> String {
+    // A convolution whose stride is its kernel is the linear projection of every patch.
+    let weight = b.parameter("patch.weight", &[hidden, 1, PATCH, PATCH, PATCH], Init::Normal(0.02));
+    let bias = b.parameter("patch.bias", &[hidden], Init::Constant(0.0));
+    let patch = PATCH as i64;
+    let attributes =
+        vec![AttributeProto::ints("kernel_shape", &[patch; 3]), AttributeProto::ints("strides", &[patch; 3])];
+    let patches = b.node("Conv", &[volume, &weight, &bias], attributes);
+    let tokens = reshape(b, &patches, &[0, hidden as i64, edge.pow(3) as i64]);
+    let tokens = transpose(b, &tokens, &[0, 2, 1]);
+    let position = b.parameter("position", &[1, edge.pow(3), hidden], Init::Normal(0.02));
+    b.node("Add", &[&tokens, &position], vec![])
+}
+
+/// The paper, section "Encoding with Transformer Blocks": attention, then a feed-forward network, each after a
+/// normalisation and around a residual connection.
+fn block(b: &mut Builder, name: &str, x: &str, config: &Config, tokens: usize) -> String {
+    let Config { hidden, mlp, .. } = *config;
+    let y = layer_norm(b, &format!("{name}.norm.0"), x, hidden);
+    let y = attention(b, &format!("{name}.attention"), &y, config, tokens);
+    let x = b.node("Add", &[x, &y], vec![]);
+    let y = layer_norm(b, &format!("{name}.norm.1"), &x, hidden);
+    let y = b.linear(&format!("{name}.mlp.0"), &y, hidden, mlp, true);
+    let y = gelu(b, &y);
+    let y = b.linear(&format!("{name}.mlp.1"), &y, mlp, hidden, true);
+    b.node("Add", &[&x, &y], vec![])
+}
+
+/// Multi-head self-attention: softmax(q·k / √(K/H))·v in each head, then one projection.
+fn attention(b: &mut Builder, name: &str, x: &str, config: &Config, tokens: usize) -> String {
+    let Config { hidden, heads, .. } = *config;
+    let size = hidden / heads;
+    let qkv = b.linear(&format!("{name}.qkv"), x, hidden, 3 * hidden, false);
+    let sizes = b.whole(&[hidden as i64; 3]);
+    let [q, k, v] = b.nodes("Split", &[&qkv, &sizes], vec![AttributeProto::int("axis", -1)]);
+    let mut head = |value: &str, order: &[i64]| {
+        let split = reshape(b, value, &[0, tokens as i64, heads as i64, size as i64]);
+        transpose(b, &split, order)
+    };
+    let [q, k, v] = [head(&q, &[0, 2, 1, 3]), head(&k, &[0, 2, 3, 1]), head(&v, &[0, 2, 1, 3])];
+    let scale = b.number(1.0 / (size as f32).sqrt());
+    let q = b.node("Mul", &[&q, &scale], vec![]);
+    let scores = b.node("MatMul", &[&q, &k], vec![]);
+    let weights = b.node("Softmax", &[&scores], vec![AttributeProto::int("axis", -1)]);
+    let y = b.node("MatMul", &[&weights, &v], vec![]);
+    let y = transpose(b, &y, &[0, 2, 1, 3]);
+    let y = reshape(b, &y, &[0, tokens as i64, hidden as i64]);
+    b.linear(&format!("{name}.out"), &y, hidden, hidden, true)
+}
+
+/// x · Φ(x), exactly. As an operator of its own it came with opset 20 only; runtimes recognise these five nodes.
+fn gelu(b: &mut Builder, x: &str) -> String {
+    let [root, one, half] = [std::f32::consts::SQRT_2, 1.0, 0.5].map(|value| b.number(value));
+    let y = b.node("Div", &[x, &root], vec![]);
+    let y = b.node("Erf", &[&y], vec![]);
+    let y = b.node("Add", &[&y, &one], vec![]);
+    let y = b.node("Mul", &[x, &y], vec![]);
+    b.node("Mul", &[&y, &half], vec![])
+}
+
+fn layer_norm(b: &mut Builder, name: &str, x: &str, hidden: usize) -> String {
+    let weight = b.parameter(&format!("{name}.weight"), &[hidden], Init::Constant(1.0));
+    let bias = b.parameter(&format!("{name}.bias"), &[hidden], Init::Constant(0.0));
+    let attributes = vec![AttributeProto::int("axis", -1), AttributeProto::float("epsilon", EPSILON)];
+    b.node("LayerNormalization", &[x, &weight, &bias], attributes)
+}
+
+/// Tokens back to where their patches were (`Proj` in the paper): `[batch, K, n, n, n]`.
+fn volumetric(b: &mut Builder, tokens: &str, hidden: usize, edge: usize) -> String {
+    let channels_first = transpose(b, tokens, &[0, 2, 1]);
+    let edge = edge as i64;
+    reshape(b, &channels_first, &[0, hidden as i64, edge, edge, edge])
+}
+
+/// Two 3³ convolutions with a shortcut; the shortcut is a 1³ convolution where the channels change.
+fn residual_block(b: &mut Builder, name: &str, x: &str, inputs: usize, outputs: usize) -> String {
+    let layer = |inputs, kernel| Conv { inputs, outputs, kernel, stride: 1, bias: false };
+    let y = b.conv(&format!("{name}.conv.0"), x, layer(inputs, 3));
+    let y = instance_norm(b, &y, outputs);
+    let y = leaky_relu(b, &y);
+    let y = b.conv(&format!("{name}.conv.1"), &y, layer(outputs, 3));
+    let y = instance_norm(b, &y, outputs);
+    let shortcut = if inputs == outputs {
+        x.to_owned()
+    } else {
+        let x = b.conv(&format!("{name}.shortcut"), x, layer(inputs, 1));
+        instance_norm(b, &x, outputs)
+    };
+    let sum = b.node("Add", &[&y, &shortcut], vec![]);
+    leaky_relu(b, &sum)
+}
+
+/// Each channel of each volume to mean 0 and variance 1; nothing is learnt.
+fn instance_norm(b: &mut Builder, x: &str, channels: usize) -> String {
+    let [scale, bias] = [1.0, 0.0].map(|value| b.numbers(&vec![value; channels]));
+    b.node("InstanceNormalization", &[x, &scale, &bias], vec![AttributeProto::float("epsilon", EPSILON)])
+}
+
+fn leaky_relu(b: &mut Builder, x: &str) -> String {
+    b.node("LeakyRelu", &[x], vec![AttributeProto::float("alpha", 0.01)])
+}
+
+fn reshape(b: &mut Builder, x: &str, dims: &[i64]) -> String {
+    let shape = b.whole(dims);
+    b.node("Reshape", &[x, &shape], vec![])
+}
+
+fn transpose(b: &mut Builder, x: &str, order: &[i64]) -> String {
+    b.node("Transpose", &[x], vec![AttributeProto::ints("perm", order)])
+}

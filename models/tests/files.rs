@@ -1,0 +1,120 @@
+//! Metadata and the store of model files.
+
+use std::fs;
+use std::path::Path;
+
+use grasp::VoxelOrigin;
+use grasp_models::onnx::ModelProto;
+use grasp_models::{Architecture, Metadata, Store, StoreError};
+
+fn vgn() -> ModelProto {
+    Architecture::Vgn.build(8, 0).unwrap()
+}
+
+fn with(change: impl FnOnce(&mut Metadata)) -> ModelProto {
+    let mut model = vgn();
+    let mut metadata = Metadata::of(&model, Path::new("vgn.onnx")).unwrap();
+    change(&mut metadata);
+    metadata.write_to(&mut model);
+    model
+}
+
+fn named(name: &str, version: &str) -> ModelProto {
+    with(|metadata| {
+        name.clone_into(&mut metadata.name);
+        version.clone_into(&mut metadata.version);
+    })
+}
+
+#[test]
+fn metadata_travels_in_the_file() {
+    let model = with(|metadata| {
+        metadata.name = "pile".to_owned();
+        metadata.version = "2.1".to_owned();
+        metadata.voxel_size = 0.3 / 40.0;
+        metadata.voxel_origin = VoxelOrigin::Center;
+        metadata.provenance.insert("data".to_owned(), "1000 scenes, seed 7".to_owned());
+    });
+    let read = Metadata::of(&model, Path::new("other.onnx")).unwrap();
+    assert_eq!((read.name.as_str(), read.version.as_str(), read.resolution), ("pile", "2.1", 8));
+    assert_eq!(read.voxel_size, 0.3 / 40.0, "to the last bit");
+    assert_eq!(read.provenance["data"], "1000 scenes, seed 7");
+    assert_eq!(read.provenance["architecture"], "vgn");
+    assert_eq!(read.decode_params().origin, VoxelOrigin::Center);
+}
+
+#[test]
+fn a_file_without_metadata_follows_vgns_conventions() {
+    let mut model = vgn();
+    model.metadata_props.clear();
+    let read = Metadata::of(&model, Path::new("models/vgn_pile.onnx")).unwrap();
+    assert_eq!(read, Metadata::defaults(Path::new("vgn_pile.onnx"), Some(8)));
+    assert_eq!((read.name.as_str(), read.version.as_str()), ("vgn_pile", "1"));
+    assert_eq!(read.voxel_origin, VoxelOrigin::Corner);
+    assert_eq!(Metadata::defaults(Path::new("x.onnx"), None).resolution, 40);
+}
+
+#[test]
+fn metadata_that_cannot_be_is_named() {
+    for (key, value) in [
+        ("resolution", "0"),
+        ("resolution", "forty"),
+        ("voxel_size", "-1"),
+        ("voxel_size", "inf"),
+        ("value_convention", "metres"),
+        ("voxel_origin", "centre"),
+    ] {
+        let mut model = vgn();
+        let property = model.metadata_props.iter_mut().find(|p| p.key() == format!("graspd.{key}")).unwrap();
+        property.value = Some(value.to_owned());
+        let error = Metadata::of(&model, Path::new("vgn.onnx")).unwrap_err().to_string();
+        assert!(error.contains(key) && error.contains(&format!("`{value}`")), "{error}");
+    }
+}
+
+#[test]
+fn a_store_gives_the_newest_version_or_the_one_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    for (file, name, version) in [("a", "pile", "1.9"), ("b", "pile", "1.10"), ("c", "packed", "3")] {
+        named(name, version).write(&folder.path().join(file).with_extension("onnx")).unwrap();
+    }
+    fs::write(folder.path().join("notes.txt"), "no model").unwrap();
+    let store = Store::open(folder.path()).unwrap();
+    assert_eq!(store.entries().len(), 3);
+    assert_eq!(store.get("pile", None).unwrap().path, folder.path().join("b.onnx"));
+    let old = store.get("pile", Some("1.9")).unwrap();
+    assert_eq!(old.path, folder.path().join("a.onnx"));
+    assert_eq!(old.parameters, 313_238);
+    assert_eq!(old.bytes, fs::metadata(&old.path).unwrap().len());
+    let error = store.get("pile", Some("2")).unwrap_err().to_string();
+    assert!(error.contains("`pile 2`") && error.contains("packed 3, pile 1.9, pile 1.10"), "{error}");
+}
+
+#[test]
+fn a_models_hash_is_that_of_its_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("vgn.onnx");
+    vgn().write(&path).unwrap();
+    let output = std::process::Command::new("sha256sum").arg(&path).output().unwrap();
+    let expected = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(Some(Store::open(folder.path()).unwrap().entries()[0].sha256.as_str()), expected.split(' ').next());
+}
+
+#[test]
+fn a_folder_that_cannot_be_served_is_refused_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    assert!(matches!(Store::open(&folder.path().join("none")), Err(StoreError::Io { .. })));
+    assert!(matches!(Store::open(folder.path()), Err(StoreError::Empty(_))));
+
+    named("pile", "1").write(&folder.path().join("a.onnx")).unwrap();
+    named("pile", "1").write(&folder.path().join("b.onnx")).unwrap();
+    let error = Store::open(folder.path()).unwrap_err().to_string();
+    assert!(error.contains("a.onnx") && error.contains("b.onnx") && error.contains("`pile` version 1"), "{error}");
+
+    let bytes = fs::read(folder.path().join("a.onnx")).unwrap();
+    fs::write(folder.path().join("b.onnx"), &bytes[..bytes.len() - 100]).unwrap();
+    let error = Store::open(folder.path()).unwrap_err().to_string();
+    assert!(error.contains("b.onnx") && error.contains("cut short"), "{error}");
+    fs::write(folder.path().join("b.onnx"), "").unwrap();
+    assert!(Store::open(folder.path()).unwrap_err().to_string().contains("no graph"));
+}

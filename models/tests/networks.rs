@@ -1,0 +1,98 @@
+//! The definitions of the networks, as files.
+
+use std::process::Command;
+
+use grasp_models::onnx::{ModelProto, TensorProto};
+use grasp_models::{Architecture, BuildError, build};
+use prost::Message;
+
+#[test]
+fn parameters_are_those_of_the_publications() {
+    let parameters = |name| build(name, 0).unwrap().parameters();
+    assert_eq!(parameters("vgn"), 313_238, "VGN's released weights have as many");
+    // ViT-B's twelve blocks (85,026,816), its final norm, the patches and their positions, and the decoder.
+    let blocks = 12 * (3 * 768 * 768 + (768 + 1) * 768 + (768 + 1) * 3072 + (3072 + 1) * 768 + 4 * 768);
+    let ends = 2 * 768 + (512 + 1) * 768 + 125 * 768;
+    let up = 8 * (768 * 64 + 768 * 32 + 32 * 32 + 768 * 64 + 64 * 32 + 32 * 16);
+    let residual = |i: usize, o: usize| 27 * (i * o + o * o) + i * o;
+    let decoder = residual(1, 16) + residual(128, 64) + residual(64, 32) + residual(32, 16);
+    let heads = 125 * 16 * 6 + 6;
+    assert_eq!(parameters("transformer"), blocks + ends + up + decoder + heads);
+    assert_eq!((parameters("transformer") as f64 / 1e6).round(), 87.0, "the paper's size, in millions");
+    assert!(parameters("transformer-small") < 4_000_000);
+}
+
+#[test]
+fn a_seed_decides_every_byte() {
+    for architecture in [Architecture::Vgn, Architecture::TransformerSmall] {
+        let bytes = |seed| architecture.build(16, seed).unwrap().encode_to_vec();
+        assert_eq!(bytes(7), bytes(7));
+        assert_ne!(bytes(7), bytes(8));
+    }
+}
+
+#[test]
+fn weights_start_as_pytorch_starts_them() {
+    let model = build("vgn", 1).unwrap();
+    let tensor = &model.graph.as_ref().unwrap().initializer[2];
+    assert_eq!(tensor.name(), "encoder.1.weight");
+    let values = tensor.to_f32().unwrap();
+    let bound = 1.0 / (16.0_f32 * 27.0).sqrt();
+    let variance = values.iter().map(|v| v * v).sum::<f32>() / values.len() as f32;
+    assert!(values.iter().all(|v| v.abs() <= bound));
+    assert!((variance / (bound * bound / 3.0) - 1.0).abs() < 0.05, "uniform in ±{bound} has variance bound²/3");
+}
+
+#[test]
+fn what_cannot_be_built_is_named() {
+    let error = build("vng", 0).unwrap_err();
+    assert!(matches!(error, BuildError::Name(_)));
+    assert!(error.to_string().contains("`vng`") && error.to_string().contains("transformer-small"), "{error}");
+    assert!(Architecture::Vgn.build(42, 0).unwrap_err().to_string().contains("42"));
+}
+
+#[test]
+fn a_file_is_read_as_it_was_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("vgn.onnx");
+    let model = build("vgn", 3).unwrap();
+    model.write(&path).unwrap();
+    assert_eq!(ModelProto::read(&path).unwrap(), model);
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing else is left behind");
+
+    let bytes = std::fs::read(&path).unwrap();
+    std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+    let error = ModelProto::read(&path).unwrap_err().to_string();
+    assert!(error.contains("vgn.onnx") && error.contains("cut short"), "{error}");
+}
+
+#[test]
+fn tensors_are_read_in_every_form() {
+    let raw = TensorProto::from_f32("x", &[2], &[1.5, -2.0]);
+    let typed = TensorProto { raw_data: None, float_data: vec![1.5, -2.0], ..raw.clone() };
+    assert_eq!(raw.to_f32().unwrap(), typed.to_f32().unwrap());
+    let halves = TensorProto { data_type: Some(10), raw_data: Some(vec![0x00, 0x3e, 0x00, 0xc0]), ..raw.clone() };
+    assert_eq!(halves.to_f32().unwrap(), [1.5, -2.0]);
+    let typed = TensorProto { raw_data: None, int32_data: vec![0x3e00, 0xc000], ..halves.clone() };
+    assert_eq!(typed.to_f32().unwrap(), [1.5, -2.0]);
+    assert_eq!(TensorProto::from_i64("n", &[2], &[-1, 7]).to_i64().unwrap(), [-1, 7]);
+
+    let short = TensorProto { dims: vec![3], ..raw.clone() };
+    assert!(short.to_f32().unwrap_err().to_string().contains("holds 2 values"));
+    assert!(raw.to_i64().is_err());
+    let elsewhere = TensorProto { data_location: Some(1), ..raw };
+    assert!(elsewhere.to_f32().unwrap_err().to_string().contains("another file"));
+}
+
+#[test]
+fn the_onnx_checker_accepts_every_network() {
+    let python = std::env::var("GRASPD_PYTHON").expect("GRASPD_PYTHON is not set: run the tests by `make test`");
+    let folder = tempfile::tempdir().unwrap();
+    for architecture in Architecture::ALL {
+        let path = folder.path().join(format!("{architecture}.onnx"));
+        architecture.build(40, 0).unwrap().write(&path).unwrap();
+        let script = "import onnx, sys; onnx.checker.check_model(sys.argv[1], full_check=True)";
+        let output = Command::new(&python).args(["-c", script]).arg(&path).output().unwrap();
+        assert!(output.status.success(), "{architecture}: {}", String::from_utf8_lossy(&output.stderr));
+    }
+}

@@ -1,0 +1,150 @@
+//! The networks in ONNX Runtime. `ORT_DYLIB_PATH` must name its library, which `make test` takes care of.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use grasp::Volume;
+use grasp_models::onnx::ModelProto;
+use grasp_models::{Architecture, Network, Options, RuntimeError, build, init};
+use nalgebra::Isometry3;
+use tempfile::TempDir;
+
+fn save(model: &ModelProto) -> (TempDir, PathBuf) {
+    assert!(std::env::var_os("ORT_DYLIB_PATH").is_some(), "ORT_DYLIB_PATH is not set: run the tests by `make test`");
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("network.onnx");
+    model.write(&path).unwrap();
+    (folder, path)
+}
+
+fn load(model: &ModelProto) -> Network {
+    let (_folder, path) = save(model);
+    Network::load(&path, &Options { threads: 2 }).unwrap()
+}
+
+fn volume(resolution: usize, seed: usize) -> Volume {
+    let values = (0..resolution.pow(3)).map(|i| ((i * 7919 + seed * 104_729) % 1009) as f32 / 1009.0).collect();
+    Volume::new(resolution, 0.3 / resolution as f64, Isometry3::identity(), values).unwrap()
+}
+
+#[test]
+fn the_library_says_what_it_is() {
+    let (_folder, _) = save(&build("vgn", 0).unwrap());
+    let info = init().unwrap();
+    let numbers: Vec<u32> = info.version.split('.').map(|part| part.parse().unwrap()).collect();
+    assert!(numbers[0] == 1 && numbers[1] >= 24, "{info:?}");
+}
+
+#[test]
+fn vgn_gives_qualities_unit_quaternions_and_widths() {
+    let mut network = load(&build("vgn", 0).unwrap());
+    assert_eq!(network.metadata().name, "vgn");
+    let output = network.infer(&[&volume(40, 0)]).unwrap();
+    assert_eq!(output.len(), 1);
+    let maps = output.maps(0);
+    let voxels = 40 * 40 * 40;
+    assert_eq!([maps.quality.len(), maps.rotation.len(), maps.width.len()], [voxels, 4 * voxels, voxels]);
+    assert!(maps.quality.iter().all(|q| (0.0..=1.0).contains(q)));
+    assert!(maps.width.iter().all(|w| w.is_finite()));
+    for voxel in 0..voxels {
+        let length: f32 = (0..4).map(|c| maps.rotation[c * voxels + voxel].powi(2)).sum();
+        assert!((length - 1.0).abs() < 1e-4, "voxel {voxel}: |r|² = {length}");
+    }
+}
+
+#[test]
+fn a_batch_is_its_volumes_one_by_one() {
+    for architecture in Architecture::ALL {
+        let mut network = load(&architecture.build(16, 0).unwrap());
+        let volumes = [0, 1, 2].map(|seed| volume(16, seed));
+        let alone: Vec<Vec<f32>> = volumes
+            .iter()
+            .map(|volume| {
+                let output = network.infer(&[volume]).unwrap();
+                let maps = output.maps(0);
+                [maps.quality, maps.rotation, maps.width].concat()
+            })
+            .collect();
+        let output = network.infer(&volumes.each_ref()).unwrap();
+        assert_eq!(output.len(), 3);
+        for (index, alone) in alone.iter().enumerate() {
+            let maps = output.maps(index);
+            let together = [maps.quality, maps.rotation, maps.width].concat();
+            let worst = together.iter().zip(alone).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(worst <= 1e-4, "{architecture}: volume {index} differs by {worst}");
+        }
+        assert_ne!(alone[0], alone[1], "the volumes differ, so do the maps");
+    }
+}
+
+#[test]
+fn running_again_computes_the_same() {
+    let mut network = load(&Architecture::Vgn.build(16, 0).unwrap());
+    let first = network.infer(&[&volume(16, 0)]).unwrap().maps(0).quality.to_vec();
+    let other = network.infer(&[&volume(16, 1)]).unwrap().maps(0).quality.to_vec();
+    assert_ne!(first, other, "the new input is read");
+    network.fill(&[&volume(16, 0)]).unwrap();
+    assert_eq!(network.run(1).unwrap().maps(0).quality, first);
+}
+
+#[test]
+fn what_does_not_fit_is_refused() {
+    let mut network = load(&Architecture::Vgn.build(16, 0).unwrap());
+    assert!(matches!(network.infer(&[]), Err(RuntimeError::EmptyBatch)));
+    let error = network.infer(&[&volume(8, 0)]).err().unwrap().to_string();
+    assert_eq!(error, "resolution is 8, the model `vgn` reads 16");
+}
+
+fn refusal(change: impl FnOnce(&mut ModelProto)) -> String {
+    let mut model = Architecture::Vgn.build(8, 0).unwrap();
+    change(&mut model);
+    let (_folder, path) = save(&model);
+    let error = Network::load(&path, &Options::default()).err().expect("it does not fit").to_string();
+    assert!(error.contains("network.onnx"), "{error}");
+    error
+}
+
+#[test]
+fn a_file_that_is_no_grasp_network_is_refused() {
+    let output = |index: usize| {
+        move |model: &mut ModelProto| {
+            model.graph.as_mut().unwrap().output.remove(index);
+        }
+    };
+    assert!(refusal(output(2)).contains("it has no `width`"));
+    let swap = |model: &mut ModelProto| {
+        let graph = model.graph.as_mut().unwrap();
+        for name in graph.node.iter_mut().flat_map(|node| &mut node.output) {
+            match name.as_str() {
+                "rotation" => "width".clone_into(name),
+                "width" => "rotation".clone_into(name),
+                _ => {}
+            }
+        }
+        graph.output[1].r#type = None;
+        graph.output[2].r#type = None;
+    };
+    assert!(refusal(swap).contains("rotation"));
+    let renamed = |model: &mut ModelProto| {
+        let graph = model.graph.as_mut().unwrap();
+        graph.input[0].name = Some("grid".to_owned());
+        graph.node[0].input[0] = "grid".to_owned();
+    };
+    assert!(refusal(renamed).contains("it has an input `grid`"));
+    let lying = |model: &mut ModelProto| {
+        let property = model.metadata_props.iter_mut().find(|p| p.key() == "graspd.resolution").unwrap();
+        property.value = Some("16".to_owned());
+    };
+    assert!(refusal(lying).contains("says N = 16, its input has N = 8"));
+}
+
+#[test]
+fn a_file_cut_short_is_refused() {
+    let (_folder, path) = save(&build("vgn", 0).unwrap());
+    let bytes = fs::read(&path).unwrap();
+    fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+    let error = Network::load(&path, &Options::default()).err().unwrap().to_string();
+    assert!(error.contains("network.onnx") && error.contains("cut short"), "{error}");
+    let error = Network::load(Path::new("nowhere.onnx"), &Options::default()).err().unwrap().to_string();
+    assert!(error.starts_with("nowhere.onnx: No such file"), "{error}");
+}

@@ -1,0 +1,48 @@
+use tch::{Tensor, no_grad};
+
+/// Adam (Kingma and Ba, "Adam: A Method for Stochastic Optimization", ICLR 2015, algorithm 1) with its default
+/// constants. libtorch's own keeps its state to itself, so that training could not be resumed.
+pub struct Adam {
+    /// Steps taken: t.
+    pub(crate) steps: u64,
+    /// First and second moments of each parameter: m and v.
+    pub(crate) moments: Vec<[Tensor; 2]>,
+}
+
+const BETA: [f64; 2] = [0.9, 0.999];
+const EPSILON: f64 = 1e-8;
+
+impl Adam {
+    /// For parameters of these shapes.
+    #[must_use]
+    pub fn new(parameters: &[(String, Tensor)]) -> Self {
+        let moments = parameters.iter().map(|(_, weight)| [0, 1].map(|_| weight.zeros_like().set_requires_grad(false)));
+        Self { steps: 0, moments: moments.collect() }
+    }
+
+    /// How many steps were taken.
+    #[must_use]
+    pub fn steps(&self) -> u64 {
+        self.steps
+    }
+
+    /// Moves every parameter along its gradient, and clears the gradients.
+    pub fn step(&mut self, parameters: &[(String, Tensor)], learning_rate: f64) {
+        self.steps += 1;
+        let [first, second] = BETA.map(|beta| 1.0 - beta.powf(self.steps as f64));
+        no_grad(|| {
+            for ((_, weight), [mean, square]) in parameters.iter().zip(&mut self.moments) {
+                let mut weight = weight.shallow_clone();
+                let gradient = weight.grad();
+                if !gradient.defined() {
+                    continue;
+                }
+                let _ = mean.lerp_(&gradient, 1.0 - BETA[0]);
+                let _ = square.lerp_(&gradient.square(), 1.0 - BETA[1]);
+                let change = &*mean / ((&*square / second).sqrt() + EPSILON);
+                weight -= change * (learning_rate / first);
+                weight.zero_grad();
+            }
+        });
+    }
+}

@@ -1,0 +1,89 @@
+//! Scenes turned, mirrored and shifted, with their grasps.
+//!
+//! The volume's values are sampled at (index + 0.5) voxels and grasps carry real positions, so turning both about the
+//! axis of the cube is exact; only which voxel a grasp falls into depends on the network's convention. (VGN's code turns
+//! indices about 20 instead, which moves the volume against the grasps by a voxel.)
+
+use half::f16;
+use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
+use rand::{Rng, RngExt};
+use serde::Serialize;
+
+use crate::dataset::Label;
+
+/// Which changes may be made.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Augmentation {
+    /// Quarter turns about z.
+    pub turns: bool,
+    /// Mirror images, x reversed.
+    pub mirror: bool,
+    /// Shifts along z by up to so many voxels.
+    pub shift: u32,
+}
+
+/// One change: mirrored, then turned, then shifted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Transform {
+    /// Quarter turns about z, counter-clockwise seen from above.
+    pub turns: u32,
+    /// Whether x is reversed first.
+    pub mirror: bool,
+    /// Voxels upwards.
+    pub shift: i32,
+}
+
+impl Augmentation {
+    /// Any of the allowed changes, each as likely.
+    pub fn draw(self, rng: &mut impl Rng) -> Transform {
+        let shift = self.shift as i32;
+        Transform {
+            turns: if self.turns { rng.random_range(0..4) } else { 0 },
+            mirror: self.mirror && rng.random(),
+            shift: if shift > 0 { rng.random_range(-shift..=shift) } else { 0 },
+        }
+    }
+}
+
+impl Transform {
+    /// Writes the changed grid `[N, N, N]` to `out`; what is shifted in was not observed.
+    pub fn grid(self, grid: &[f16], n: usize, out: &mut [f32]) {
+        for x in 0..n {
+            for y in 0..n {
+                // Where this column of voxels comes from: every step undone, the last first.
+                let (mut from_x, mut from_y) = (x, y);
+                for _ in 0..self.turns {
+                    (from_x, from_y) = (from_y, n - 1 - from_x);
+                }
+                if self.mirror {
+                    from_x = n - 1 - from_x;
+                }
+                let column = &grid[(from_x * n + from_y) * n..][..n];
+                for (z, value) in out[(x * n + y) * n..][..n].iter_mut().enumerate() {
+                    let from_z = usize::try_from(z as i64 - i64::from(self.shift)).ok();
+                    *value = from_z.and_then(|z| column.get(z)).map_or(0.0, |value| value.to_f32());
+                }
+            }
+        }
+    }
+
+    /// The grasp in the changed scene of N³ voxels.
+    #[must_use]
+    pub fn label(self, label: &Label, n: usize) -> Label {
+        let edge = n as f64;
+        let Label { mut position, mut rotation, .. } = *label;
+        if self.mirror {
+            position.x = edge - position.x;
+            // The mirror image of a rotation about an axis is the opposite rotation about the mirrored axis. This
+            // also swaps the two fingers, which are alike.
+            let [x, y, z, w]: [f64; 4] = rotation.coords.into();
+            rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, x, -y, -z));
+        }
+        for _ in 0..self.turns {
+            position = Point3::new(edge - position.y, position.x, position.z);
+            rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2) * rotation;
+        }
+        position.z += f64::from(self.shift);
+        Label { position, rotation, ..*label }
+    }
+}

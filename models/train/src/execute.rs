@@ -1,0 +1,448 @@
+//! Executes an ONNX graph with libtorch, under autograd.
+//!
+//! What is trained is what is served: each node becomes the libtorch operation of the same meaning, each
+//! floating-point initialiser a tensor that learns. Only what grasp networks use is here, and anything else is refused
+//! when the graph is loaded, by its name: an operator or a setting that was skipped would train another network.
+
+use std::collections::HashMap;
+
+use grasp_models::onnx::{AttributeProto, ModelProto, NodeProto, TensorError, TensorProto};
+use tch::{Device, Kind, TchError, Tensor, no_grad};
+use thiserror::Error;
+
+/// An operator as ONNX names it, with the settings of it that are understood.
+const OPERATORS: &[(&str, &[&str])] = &[
+    ("Add", &[]),
+    ("Clip", &[]),
+    ("Concat", &["axis"]),
+    ("Constant", &["value"]),
+    ("Conv", &["dilations", "group", "kernel_shape", "pads", "strides"]),
+    ("ConvTranspose", &["dilations", "group", "kernel_shape", "pads", "strides"]),
+    ("Div", &[]),
+    ("Erf", &[]),
+    ("Expand", &[]),
+    ("InstanceNormalization", &["epsilon"]),
+    ("LayerNormalization", &["axis", "epsilon"]),
+    ("LeakyRelu", &["alpha"]),
+    ("MatMul", &[]),
+    ("Mul", &[]),
+    ("ReduceL2", &["axes", "keepdims"]),
+    ("Relu", &[]),
+    ("Reshape", &[]),
+    ("Resize", &["coordinate_transformation_mode", "cubic_coeff_a", "mode", "nearest_mode"]),
+    ("Shape", &[]),
+    ("Sigmoid", &[]),
+    ("Slice", &[]),
+    ("Softmax", &["axis"]),
+    ("Split", &["axis"]),
+    ("Transpose", &["perm"]),
+];
+
+/// Why a graph cannot be executed.
+#[derive(Debug, Error)]
+pub enum ExecuteError {
+    /// The file holds no graph.
+    #[error("the model holds no graph")]
+    NoGraph,
+    /// The operator is not implemented.
+    #[error("node `{node}`: the operator `{op}` cannot be trained; there are {}", supported())]
+    Operator {
+        /// The node.
+        node: String,
+        /// Its operator.
+        op: String,
+    },
+    /// A setting of an operator is not implemented.
+    #[error("node `{node}` ({op}): {what} is not supported")]
+    Setting {
+        /// The node.
+        node: String,
+        /// Its operator.
+        op: String,
+        /// The setting.
+        what: String,
+    },
+    /// A node reads what no node before it computed.
+    #[error("node `{node}` ({op}): `{value}` is not computed before it")]
+    Missing {
+        /// The node.
+        node: String,
+        /// Its operator.
+        op: String,
+        /// What it reads.
+        value: String,
+    },
+    /// libtorch refused.
+    #[error("node `{node}` ({op}): {source}")]
+    Torch {
+        /// The node.
+        node: String,
+        /// Its operator.
+        op: String,
+        /// What it said.
+        source: TchError,
+    },
+    /// The graph does not compute this output.
+    #[error("the graph has no output `{0}`")]
+    Output(&'static str),
+    /// An initialiser's values cannot be used.
+    #[error(transparent)]
+    Tensor(#[from] TensorError),
+}
+
+fn supported() -> String {
+    OPERATORS.iter().map(|&(op, _)| op).collect::<Vec<_>>().join(", ")
+}
+
+/// How the graph is executed. None of it changes the mathematics; bf16 changes the precision.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Execution {
+    /// Where.
+    pub device: Device,
+    /// Convolutions and matrix products in bfloat16, everything else in f32 (as PyTorch's autocast does).
+    pub bf16: bool,
+    /// The channels of a voxel next to each other in memory.
+    pub channels_last: bool,
+}
+
+/// A network whose weights can be trained.
+pub struct Executor {
+    model: ModelProto,
+    execution: Execution,
+    /// In the order of the initialisers.
+    parameters: Vec<(String, Tensor)>,
+    constants: HashMap<String, Tensor>,
+}
+
+/// What a grasp network computes over a batch, f32.
+pub struct Outputs {
+    /// `[batch, 1, N, N, N]`, in [0, 1].
+    pub quality: Tensor,
+    /// `[batch, 4, N, N, N]`, unit quaternions x y z w.
+    pub rotation: Tensor,
+    /// `[batch, 1, N, N, N]`, voxels.
+    pub width: Tensor,
+}
+
+impl Executor {
+    /// Takes over a model: checks that every node can be executed and makes its weights trainable.
+    ///
+    /// # Errors
+    /// [`ExecuteError`] names the node that cannot be executed.
+    pub fn new(model: ModelProto, execution: Execution) -> Result<Self, ExecuteError> {
+        let graph = model.graph.as_ref().ok_or(ExecuteError::NoGraph)?;
+        let mut parameters = Vec::new();
+        let mut constants = HashMap::new();
+        for initializer in &graph.initializer {
+            let name = initializer.name().to_owned();
+            if initializer.is_float() {
+                let weight = tensor_of(initializer)?.to_device(execution.device);
+                parameters.push((name, execution.arrange(&weight).set_requires_grad(true)));
+            } else {
+                constants.insert(name, tensor_of(initializer)?);
+            }
+        }
+        for node in &graph.node {
+            check(node)?;
+            if node.op_type() == "Constant"
+                && let Some(value) = node.attribute("value").and_then(|value| value.t.as_ref())
+            {
+                let value = tensor_of(value)?;
+                // Whole numbers are shapes and sizes, which are read on the CPU.
+                let device = if value.kind() == Kind::Float { execution.device } else { Device::Cpu };
+                constants.insert(output_name(node, 0), value.to_device(device));
+            }
+        }
+        Ok(Self { model, execution, parameters, constants })
+    }
+
+    /// The weights, by the names of their initialisers.
+    #[must_use]
+    pub fn parameters(&self) -> &[(String, Tensor)] {
+        &self.parameters
+    }
+
+    /// Where it is executed.
+    #[must_use]
+    pub fn device(&self) -> Device {
+        self.execution.device
+    }
+
+    /// The model with the weights as they are now.
+    #[must_use]
+    pub fn to_model(&self) -> ModelProto {
+        let mut model = self.model.clone();
+        let initializers = model.graph.iter_mut().flat_map(|graph| &mut graph.initializer);
+        for (initializer, (_, weight)) in initializers.filter(|tensor| tensor.is_float()).zip(&self.parameters) {
+            initializer.set_f32(&values_of(weight));
+        }
+        model
+    }
+
+    /// Runs the network over `[batch, 1, N, N, N]`.
+    ///
+    /// # Errors
+    /// [`ExecuteError`] names the node at which it failed.
+    pub fn forward(&self, volumes: &Tensor) -> Result<Outputs, ExecuteError> {
+        let graph = self.model.graph.as_ref().ok_or(ExecuteError::NoGraph)?;
+        let mut values: HashMap<String, Tensor> = HashMap::with_capacity(graph.node.len());
+        if let Some(input) = graph.input.first() {
+            values.insert(input.name().to_owned(), volumes.shallow_clone());
+        }
+        for (name, tensor) in self.constants.iter().chain(self.parameters.iter().map(|(name, weight)| (name, weight))) {
+            values.insert(name.clone(), tensor.shallow_clone());
+        }
+        for node in graph.node.iter().filter(|node| node.op_type() != "Constant") {
+            let inputs = node
+                .input
+                .iter()
+                .map(|name| match values.get(name) {
+                    Some(value) => Ok(Some(value)),
+                    None if name.is_empty() => Ok(None),
+                    None => Err(ExecuteError::Missing {
+                        node: node.name().to_owned(),
+                        op: node.op_type().to_owned(),
+                        value: name.clone(),
+                    }),
+                })
+                .collect::<Result<Vec<_>, _>>()?;
+            let step = Step { node, inputs, execution: self.execution };
+            let outputs = step.run()?;
+            values.extend(node.output.iter().cloned().zip(outputs));
+        }
+        let mut output = |name| match values.remove(name) {
+            Some(value) => Ok(value.to_kind(Kind::Float)),
+            None => Err(ExecuteError::Output(name)),
+        };
+        Ok(Outputs { quality: output("quality")?, rotation: output("rotation")?, width: output("width")? })
+    }
+}
+
+impl Execution {
+    /// A weight as it should lie in memory; the numbers stay the same.
+    #[must_use]
+    pub fn arrange(self, weight: &Tensor) -> Tensor {
+        if self.channels_last && weight.dim() == 5 {
+            weight.permute([0, 2, 3, 4, 1]).contiguous().permute([0, 4, 1, 2, 3])
+        } else {
+            weight.contiguous()
+        }
+    }
+}
+
+/// A tensor's numbers, row-major.
+pub(crate) fn values_of(tensor: &Tensor) -> Vec<f32> {
+    let tensor = no_grad(|| tensor.to_device(Device::Cpu).contiguous());
+    let mut values = vec![0.0; tensor.numel()];
+    let count = values.len();
+    tensor.copy_data(&mut values, count);
+    values
+}
+
+pub(crate) fn tensor_of(tensor: &TensorProto) -> Result<Tensor, TensorError> {
+    let flat =
+        if tensor.is_float() { Tensor::from_slice(&tensor.to_f32()?) } else { Tensor::from_slice(&tensor.to_i64()?) };
+    Ok(flat.reshape(&tensor.dims))
+}
+
+fn output_name(node: &NodeProto, index: usize) -> String {
+    node.output.get(index).cloned().unwrap_or_default()
+}
+
+fn check(node: &NodeProto) -> Result<(), ExecuteError> {
+    let (name, op) = (node.name().to_owned(), node.op_type().to_owned());
+    let known = OPERATORS.iter().find(|(known, _)| *known == op && node.domain().is_empty());
+    let Some((_, settings)) = known else { return Err(ExecuteError::Operator { node: name, op }) };
+    match node.attribute.iter().find(|attribute| !settings.contains(&attribute.name())) {
+        Some(unknown) => {
+            Err(ExecuteError::Setting { node: name, op, what: format!("the setting `{}`", unknown.name()) })
+        }
+        None => Ok(()),
+    }
+}
+
+/// One node with the values it reads.
+struct Step<'a> {
+    node: &'a NodeProto,
+    inputs: Vec<Option<&'a Tensor>>,
+    execution: Execution,
+}
+
+impl Step<'_> {
+    fn run(&self) -> Result<Vec<Tensor>, ExecuteError> {
+        let one = |result: Result<Tensor, TchError>| Ok(vec![result.map_err(|source| self.torch(source))?]);
+        match self.node.op_type() {
+            "Add" => one(self.input(0)?.f_add(self.input(1)?)),
+            "Clip" => one(self.input(0)?.f_clamp_tensor(self.optional(1), self.optional(2))),
+            "Concat" => {
+                let values: Vec<&Tensor> = self.inputs.iter().copied().flatten().collect();
+                one(Tensor::f_cat(&values, self.int("axis", 0)))
+            }
+            "Conv" => self.convolution(false),
+            "ConvTranspose" => self.convolution(true),
+            "Div" => one(self.input(0)?.f_div(self.input(1)?)),
+            "Erf" => one(self.input(0)?.f_erf()),
+            "Expand" => one(self.input(0)?.f_broadcast_to(self.whole(1)?)),
+            "InstanceNormalization" => {
+                let [x, scale, bias] = [self.full(0)?, self.full(1)?, self.full(2)?];
+                let epsilon = self.float("epsilon", 1e-5);
+                one(x.f_instance_norm(Some(scale), Some(bias), None, None, true, 0.0, epsilon, false))
+            }
+            "LayerNormalization" => {
+                let [x, scale, bias] = [self.full(0)?, self.full(1)?, self.full(2)?];
+                let size = x.size();
+                let axis = self.axis("axis", -1, size.len())?;
+                one(x.f_layer_norm(&size[axis..], Some(scale), Some(bias), self.float("epsilon", 1e-5), false))
+            }
+            "LeakyRelu" => {
+                let x = self.input(0)?;
+                // libtorch's binding has the slope 0.01 built in; PReLU with a constant slope is the same function.
+                let slope = Tensor::from(self.float("alpha", 0.01)).to_kind(x.kind()).to_device(x.device());
+                one(x.f_prelu(&slope))
+            }
+            "MatMul" => one(self.reduced(0)?.f_matmul(&self.reduced(1)?)),
+            "Mul" => one(self.input(0)?.f_mul(self.input(1)?)),
+            "ReduceL2" => {
+                let axes = self.ints("axes", &[]);
+                one(self.full(0)?.f_norm_scalaropt_dim(2, axes, self.int("keepdims", 1) != 0))
+            }
+            "Relu" => one(self.input(0)?.f_relu()),
+            "Reshape" => one(self.input(0)?.f_reshape(self.new_shape()?)),
+            "Resize" => one(self.nearest()?),
+            "Shape" => one(Tensor::f_from_slice(&self.input(0)?.size())),
+            "Sigmoid" => one(self.full(0)?.f_sigmoid()),
+            "Slice" => self.slice(),
+            "Softmax" => one(self.full(0)?.f_softmax(self.int("axis", -1), Kind::Float)),
+            "Split" => {
+                let sizes = self.whole(1)?;
+                let split = self.input(0)?.f_split_with_sizes(sizes, self.int("axis", 0));
+                split.map_err(|source| self.torch(source))
+            }
+            "Transpose" => {
+                let x = self.input(0)?;
+                let reversed: Vec<i64> = (0..x.dim() as i64).rev().collect();
+                one(x.f_permute(self.ints("perm", &reversed)))
+            }
+            op => Err(ExecuteError::Operator { node: self.node.name().to_owned(), op: op.to_owned() }),
+        }
+    }
+
+    fn convolution(&self, transposed: bool) -> Result<Vec<Tensor>, ExecuteError> {
+        let [x, weight] = [self.reduced(0)?, self.reduced(1)?];
+        let bias = self.optional(2).map(|bias| bias.to_kind(x.kind()));
+        let axes = weight.dim() - 2;
+        let (ones, zeros) = (vec![1; axes], vec![0; axes]);
+        let pads = self.ints("pads", &[0].repeat(2 * axes));
+        let (begin, end) = pads.split_at(axes);
+        if begin != end {
+            return Err(self.setting(format!("a padding of {begin:?} before and {end:?} after")));
+        }
+        let y = x.f_convolution(
+            &weight,
+            bias.as_ref(),
+            self.ints("strides", &ones),
+            begin,
+            self.ints("dilations", &ones),
+            transposed,
+            &zeros,
+            self.int("group", 1),
+        );
+        Ok(vec![y.map_err(|source| self.torch(source))?])
+    }
+
+    /// Repeats voxels: `Resize` as far as it agrees with libtorch's `nearest`.
+    fn nearest(&self) -> Result<Result<Tensor, TchError>, ExecuteError> {
+        for (name, expected) in
+            [("mode", "nearest"), ("coordinate_transformation_mode", "asymmetric"), ("nearest_mode", "floor")]
+        {
+            let got = self.node.attribute(name).map(AttributeProto::s).unwrap_or_default();
+            if got != expected.as_bytes() {
+                let got = String::from_utf8_lossy(got);
+                return Err(self.setting(format!("{name} `{got}` (only `{expected}`)")));
+            }
+        }
+        let x = self.input(0)?;
+        let size = match (self.optional(2).filter(|scales| scales.numel() > 0), self.optional(3)) {
+            (Some(scales), _) => {
+                let scales = values_of(scales);
+                x.size().iter().zip(scales).map(|(&size, scale)| (size as f32 * scale).floor() as i64).collect()
+            }
+            (None, Some(_)) => self.whole(3)?,
+            (None, None) => return Err(self.setting("neither scales nor sizes".to_owned())),
+        };
+        if x.dim() != 5 || size.len() != 5 || size[..2] != x.size()[..2] {
+            return Err(self.setting(format!("enlarging {:?} to {size:?}", x.size())));
+        }
+        Ok(x.f_upsample_nearest3d(&size[2..], None, None, None))
+    }
+
+    fn slice(&self) -> Result<Vec<Tensor>, ExecuteError> {
+        let mut x = self.input(0)?.shallow_clone();
+        let [starts, ends] = [self.whole(1)?, self.whole(2)?];
+        let axes = if self.optional(3).is_some() { self.whole(3)? } else { (0..starts.len() as i64).collect() };
+        let steps = if self.optional(4).is_some() { self.whole(4)? } else { vec![1; starts.len()] };
+        for (((axis, start), end), step) in axes.into_iter().zip(starts).zip(ends).zip(steps) {
+            x = x.f_slice(axis, start, end, step).map_err(|source| self.torch(source))?;
+        }
+        Ok(vec![x])
+    }
+
+    /// The target of a `Reshape`, where 0 means the size there is.
+    fn new_shape(&self) -> Result<Vec<i64>, ExecuteError> {
+        let size = self.input(0)?.size();
+        let shape = self.whole(1)?.into_iter().enumerate();
+        Ok(shape.map(|(axis, dim)| if dim == 0 { size.get(axis).copied().unwrap_or(0) } else { dim }).collect())
+    }
+
+    fn optional(&self, index: usize) -> Option<&Tensor> {
+        self.inputs.get(index).copied().flatten()
+    }
+
+    fn input(&self, index: usize) -> Result<&Tensor, ExecuteError> {
+        self.optional(index).ok_or_else(|| self.setting(format!("leaving out input {index}")))
+    }
+
+    /// An input in f32: where bf16 would cost accuracy.
+    fn full(&self, index: usize) -> Result<Tensor, ExecuteError> {
+        Ok(self.input(index)?.to_kind(Kind::Float))
+    }
+
+    /// An input in the precision of convolutions and matrix products.
+    fn reduced(&self, index: usize) -> Result<Tensor, ExecuteError> {
+        let kind = if self.execution.bf16 { Kind::BFloat16 } else { Kind::Float };
+        Ok(self.input(index)?.to_kind(kind))
+    }
+
+    /// An input of whole numbers.
+    fn whole(&self, index: usize) -> Result<Vec<i64>, ExecuteError> {
+        let tensor = self.input(index)?;
+        Vec::<i64>::try_from(tensor.to_device(Device::Cpu)).map_err(|source| self.torch(source))
+    }
+
+    fn int(&self, name: &str, default: i64) -> i64 {
+        self.node.attribute(name).and_then(|attribute| attribute.i).unwrap_or(default)
+    }
+
+    fn float(&self, name: &str, default: f32) -> f64 {
+        self.node.attribute(name).and_then(|attribute| attribute.f).unwrap_or(default).into()
+    }
+
+    fn ints(&self, name: &str, default: &[i64]) -> Vec<i64> {
+        self.node.attribute(name).map_or_else(|| default.to_vec(), |attribute| attribute.ints.clone())
+    }
+
+    /// An axis, counted from the end when negative.
+    fn axis(&self, name: &str, default: i64, dims: usize) -> Result<usize, ExecuteError> {
+        let axis = self.int(name, default);
+        let from_start = if axis < 0 { axis + dims as i64 } else { axis };
+        usize::try_from(from_start).ok().filter(|&axis| axis < dims).ok_or_else(|| self.setting(format!("axis {axis}")))
+    }
+
+    fn setting(&self, what: String) -> ExecuteError {
+        ExecuteError::Setting { node: self.node.name().to_owned(), op: self.node.op_type().to_owned(), what }
+    }
+
+    fn torch(&self, source: TchError) -> ExecuteError {
+        ExecuteError::Torch { node: self.node.name().to_owned(), op: self.node.op_type().to_owned(), source }
+    }
+}

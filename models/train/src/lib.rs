@@ -1,0 +1,22 @@
+//! Training of grasp networks.
+//!
+//! A [`Trainer`] takes [`Scene`]s out of a [`Dataset`], [changes](Augmentation) them, and runs them through an
+//! [`Executor`]: the ONNX graph that is served, in libtorch and under autograd. [`Targets::loss`] is what [`Adam`]
+//! minimises; a [`Checkpoint`] is where a run stands.
+
+mod adam;
+mod augment;
+mod checkpoint;
+pub mod curves;
+mod dataset;
+mod execute;
+mod loss;
+mod trainer;
+
+pub use adam::Adam;
+pub use augment::{Augmentation, Transform};
+pub use checkpoint::{Checkpoint, CheckpointError};
+pub use dataset::{Dataset, DatasetError, Label, Scene};
+pub use execute::{ExecuteError, Execution, Executor, Outputs};
+pub use loss::{Loss, Sums, Targets};
+pub use trainer::{Epoch, Record, Settings, TrainError, Trainer, Validation};

@@ -1,0 +1,169 @@
+//! What is minimised (the paper, section "Training"; the weight of the width and the handling of the gripper's symmetry
+//! are those of VGN's code, which the paper builds on).
+
+use grasp::VoxelOrigin;
+use tch::{Kind, Reduction, TchError, Tensor};
+
+use crate::dataset::Label;
+use crate::execute::Outputs;
+
+/// Weight of the width's squared error, voxels², against the other two parts. The paper's equation leaves it out.
+const WIDTH_WEIGHT: f64 = 0.01;
+
+/// The labelled voxels of a batch.
+#[derive(Debug, Default)]
+pub struct Targets {
+    /// Which voxel: flat index into `[batch, N, N, N]`.
+    cells: Vec<i64>,
+    /// 1 for a success, 0 for a failure.
+    labels: Vec<f32>,
+    /// The rotation and the same turned by 180° about its z, x y z w each.
+    rotations: Vec<[[f32; 4]; 2]>,
+    /// Voxels.
+    widths: Vec<f32>,
+}
+
+/// The loss over a batch.
+pub struct Loss {
+    /// The mean over the labelled voxels, to be minimised.
+    pub mean: Tensor,
+    /// What the mean is made of.
+    pub sums: Sums,
+}
+
+/// Sums over labelled voxels; the means of several batches are those of their sums.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Sums {
+    /// Labelled voxels.
+    pub voxels: f64,
+    /// Binary cross-entropy of the quality.
+    pub quality: f64,
+    /// 1 − |r·r*|, successes only.
+    pub rotation: f64,
+    /// Weighted squared error of the width, successes only.
+    pub width: f64,
+    /// Successes with a quality above 0.5.
+    pub true_positives: f64,
+    /// Failures with a quality above 0.5.
+    pub false_positives: f64,
+    /// Successes with a quality of 0.5 or less.
+    pub false_negatives: f64,
+}
+
+impl Targets {
+    /// Adds a grasp in the volume number `index` of the batch; without effect when it lies outside the volume.
+    pub fn push(&mut self, index: usize, label: &Label, n: usize, origin: VoxelOrigin) {
+        let Some(cell) = voxel_of(label, n, origin) else { return };
+        let [x, y, z, w]: [f32; 4] = label.rotation.coords.map(|c| c as f32).into();
+        self.cells.push((index * n.pow(3) + cell) as i64);
+        self.labels.push(f32::from(u8::from(label.success)));
+        // The second is q · (0, 0, 1, 0): turned by 180° about its own z.
+        self.rotations.push([[x, y, z, w], [y, -x, w, -z]]);
+        self.widths.push(label.width as f32);
+    }
+
+    /// How many voxels are labelled.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.cells.len()
+    }
+
+    /// Whether none is.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.cells.is_empty()
+    }
+
+    /// The loss of a network's outputs: L = w·BCE(q, q*) + q*·(1 − max |r·r*| + 0.01·(w − w*)²), averaged over the
+    /// labelled voxels. `class_weights` weigh the cross-entropy of failures and successes.
+    ///
+    /// # Errors
+    /// When libtorch refuses, because the outputs are of another batch.
+    pub fn loss(&self, outputs: &Outputs, class_weights: [f64; 2]) -> Result<Loss, TchError> {
+        let device = outputs.quality.device();
+        let voxels = outputs.quality.size()[2..].iter().product::<i64>();
+        let cells = Tensor::f_from_slice(&self.cells)?.to_device(device);
+        let labels = Tensor::f_from_slice(&self.labels)?.to_device(device);
+
+        let quality = outputs.quality.f_flatten(0, -1)?.f_index_select(0, &cells)?;
+        let [failure, success] = class_weights;
+        let weights = &labels * (success - failure) + failure;
+        let quality_loss = quality.f_binary_cross_entropy(&labels, Some(&weights), Reduction::Sum)?;
+
+        // Channel c of voxel v of volume b lies at (4 b + c) · voxels + v.
+        let first = cells.divide_scalar_mode(voxels, "floor") * (3 * voxels) + &cells;
+        let channels = Tensor::arange(4, (Kind::Int64, device)) * voxels;
+        let channels = (first.unsqueeze(1) + channels).flatten(0, 1);
+        let rotation = outputs.rotation.f_flatten(0, -1)?.f_index_select(0, &channels)?.f_reshape([-1, 1, 4])?;
+        let both = Tensor::f_from_slice(self.rotations.as_flattened().as_flattened())?;
+        let cosines = (rotation * both.to_device(device).f_reshape([-1, 2, 4])?).sum_dim_intlist(-1, false, None).abs();
+        let rotation_loss: Tensor = &labels * (1.0 - cosines.amax([1], false));
+        let rotation_loss = rotation_loss.sum(None);
+
+        let width = outputs.width.f_flatten(0, -1)?.f_index_select(0, &cells)?;
+        let expected = Tensor::f_from_slice(&self.widths)?.to_device(device);
+        let width_loss: Tensor = &labels * (width - expected).square();
+        let width_loss = width_loss.sum(None) * WIDTH_WEIGHT;
+
+        let positive = quality.gt(0.5).to_kind(Kind::Float);
+        let count = |tensor: Tensor| tensor.sum(None).double_value(&[]);
+        let true_positives = count(&positive * &labels);
+        let sums = Sums {
+            voxels: self.len() as f64,
+            quality: quality_loss.double_value(&[]),
+            rotation: rotation_loss.double_value(&[]),
+            width: width_loss.double_value(&[]),
+            true_positives,
+            false_positives: count(positive) - true_positives,
+            false_negatives: f64::from(self.labels.iter().sum::<f32>()) - true_positives,
+        };
+        Ok(Loss { mean: (quality_loss + rotation_loss + width_loss) / self.len() as f64, sums })
+    }
+}
+
+/// The voxel that stands for a grasp there: the nearest index (VGN), or the voxel it lies in.
+fn voxel_of(label: &Label, n: usize, origin: VoxelOrigin) -> Option<usize> {
+    let index = match origin {
+        VoxelOrigin::Corner => label.position.coords.map(f64::round),
+        VoxelOrigin::Center => label.position.coords.map(f64::floor),
+    };
+    let inside = index.iter().all(|&c| c >= 0.0 && c < n as f64);
+    inside.then(|| (index.x as usize * n + index.y as usize) * n + index.z as usize)
+}
+
+impl Sums {
+    /// Adds those of another batch.
+    pub fn add(&mut self, other: &Self) {
+        self.voxels += other.voxels;
+        self.quality += other.quality;
+        self.rotation += other.rotation;
+        self.width += other.width;
+        self.true_positives += other.true_positives;
+        self.false_positives += other.false_positives;
+        self.false_negatives += other.false_negatives;
+    }
+
+    /// The mean loss of a voxel.
+    #[must_use]
+    pub fn loss(&self) -> f64 {
+        (self.quality + self.rotation + self.width) / self.voxels
+    }
+
+    /// Share of the voxels on the right side of 0.5.
+    #[must_use]
+    pub fn accuracy(&self) -> f64 {
+        1.0 - (self.false_positives + self.false_negatives) / self.voxels
+    }
+
+    /// Share of successes among the voxels above 0.5.
+    #[must_use]
+    pub fn precision(&self) -> f64 {
+        self.true_positives / (self.true_positives + self.false_positives)
+    }
+
+    /// Share of the successes that are above 0.5.
+    #[must_use]
+    pub fn recall(&self) -> f64 {
+        self.true_positives / (self.true_positives + self.false_negatives)
+    }
+}

@@ -1,0 +1,205 @@
+//! The command `train`: a run with its files, its progress bar and Ctrl-C.
+
+use std::fs;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::{Context, Result, ensure};
+use grasp::VoxelOrigin;
+use grasp_models::onnx::ModelProto;
+use grasp_models::{Metadata, build};
+use grasp_train::{Augmentation, Checkpoint, Dataset, Epoch, Execution, Record, Settings, Trainer, curves};
+use indicatif::{ProgressBar, ProgressStyle};
+use tch::Device;
+use time::OffsetDateTime;
+
+use crate::{Change, Keep, Origin, Training};
+
+/// Trains as told, until the last epoch or Ctrl-C.
+pub(crate) fn train(training: &Training) -> Result<()> {
+    if let Some(threads) = training.threads {
+        tch::set_num_threads(i32::try_from(threads).context("--threads")?);
+    }
+    ensure!((0.0..1.0).contains(&training.val), "--val is {}, must be at least 0 and below 1", training.val);
+    let files = Files::beside(&training.out);
+    let (model, mut metadata) = start_from(training)?;
+    let settings = settings(training, &metadata);
+    let dataset = Dataset::read(&training.data)?;
+    ensure!(
+        dataset.resolution == metadata.resolution,
+        "the data have {0}³ voxels, the network reads {1}³",
+        dataset.resolution,
+        metadata.resolution
+    );
+    let device = Device::cuda_if_available();
+    let execution = Execution { device, bf16: training.bf16, channels_last: true };
+    let mut trainer = Trainer::new(model, &dataset, settings.clone(), execution)?;
+    describe(training, &settings, &dataset, &mut metadata);
+
+    let mut records = Vec::new();
+    let mut best = None;
+    if training.resume {
+        let checkpoint = Checkpoint::read(&files.state)?;
+        trainer.resume(&checkpoint)?;
+        best = checkpoint.best;
+        records = files.read_log(trainer.epochs())?;
+    }
+    let (learnt, held_out) = trainer.scenes();
+    let (grasps, successes) = dataset.grasps();
+    eprintln!("{learnt} scenes to learn from, {held_out} held out, {grasps} grasps, {successes} of them successes");
+
+    let stop = Arc::new(AtomicBool::new(false));
+    let signal = Arc::clone(&stop);
+    ctrlc::set_handler(move || signal.store(true, Ordering::Relaxed)).context("cannot listen for Ctrl-C")?;
+
+    while trainer.epochs() < settings.epochs {
+        let bar = progress_bar(trainer.steps_per_epoch(), trainer.epochs() + 1, settings.epochs);
+        let epoch = trainer.epoch(&stop, |batch, loss| {
+            bar.set_position(batch);
+            bar.set_message(format!("{loss:.4}"));
+        })?;
+        bar.finish_and_clear();
+        let mut better = best.is_none();
+        let interrupted = matches!(epoch, Epoch::Interrupted);
+        if let Epoch::Done(record) = epoch {
+            println!("{}", serde_json::to_string(&record)?);
+            if let Some(validation) = record.validation {
+                better = best.is_none_or(|best| validation.loss < best);
+                best = if better { Some(validation.loss) } else { best };
+            }
+            records.push(record);
+            files.write_log(&records)?;
+            curves::draw(&files.curves, &records)?;
+        }
+        if training.keep == Keep::Last || better {
+            write_model(&trainer, &metadata, records.last(), &training.out)?;
+        }
+        Checkpoint { best, ..trainer.checkpoint() }.write(&files.state)?;
+        if interrupted {
+            eprintln!("stopped after step {}; go on with --resume", trainer.steps());
+            return Ok(());
+        }
+    }
+    Ok(())
+}
+
+/// The network and what it says of itself.
+fn start_from(training: &Training) -> Result<(ModelProto, Metadata)> {
+    let model = match (&training.from, &training.network) {
+        (Some(path), _) => ModelProto::read(path)?,
+        (None, Some(network)) => build(network, training.seed)?,
+        (None, None) => anyhow::bail!("give --network or --from"),
+    };
+    let path = training.from.as_deref().unwrap_or(&training.out);
+    let mut metadata = Metadata::of(&model, path).with_context(|| path.display().to_string())?;
+    let file_name = Metadata::defaults(&training.out, None).name;
+    metadata.name = training.name.clone().unwrap_or(file_name);
+    metadata.version.clone_from(&training.model_version);
+    metadata.voxel_origin = match training.voxel_origin {
+        Some(Origin::Corner) => VoxelOrigin::Corner,
+        Some(Origin::Center) => VoxelOrigin::Center,
+        None if training.from.is_some() => metadata.voxel_origin,
+        None => VoxelOrigin::Center,
+    };
+    Ok((model, metadata))
+}
+
+/// VGN's released code trains with Adam at 3e-4 in batches of 32 for 30 epochs; the paper with 1e-4, 64 and 21.
+fn settings(training: &Training, metadata: &Metadata) -> Settings {
+    let of_paper = training.network.as_deref().is_some_and(|network| network.starts_with("transformer"));
+    let (epochs, batch, learning_rate) = if of_paper { (21, 64, 1e-4) } else { (30, 32, 3e-4) };
+    let allows = |change| training.augment.contains(&change);
+    Settings {
+        epochs: training.epochs.unwrap_or(epochs),
+        batch: training.batch.unwrap_or(batch),
+        learning_rate: training.lr.unwrap_or(learning_rate),
+        warmup: training.warmup,
+        cosine: training.cosine,
+        seed: training.seed,
+        validation: training.val,
+        augmentation: Augmentation {
+            turns: allows(Change::Turns),
+            mirror: allows(Change::Mirror),
+            shift: if allows(Change::Shift) { training.max_shift } else { 0 },
+        },
+        balance: training.balance,
+        voxel_origin: metadata.voxel_origin,
+        bf16: training.bf16,
+    }
+}
+
+/// Notes in the metadata where the weights will come from.
+fn describe(training: &Training, settings: &Settings, dataset: &Dataset, metadata: &mut Metadata) {
+    let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let (grasps, successes) = dataset.grasps();
+    let mut note = |key: &str, value: String| metadata.provenance.insert(key.to_owned(), value);
+    note("data", training.data.iter().map(name).collect::<Vec<_>>().join(" "));
+    note("scenes", dataset.scenes.len().to_string());
+    note("grasps", grasps.to_string());
+    note("successes", successes.to_string());
+    note("settings", serde_json::to_string(settings).unwrap_or_default());
+    note("seed", settings.seed.to_string());
+    note("date", OffsetDateTime::now_utc().date().to_string());
+    note("trainer", format!("grasp-train {}", env!("CARGO_PKG_VERSION")));
+    if let Some(from) = &training.from {
+        note("from", name(from));
+    }
+}
+
+fn write_model(trainer: &Trainer, metadata: &Metadata, last: Option<&Record>, path: &Path) -> Result<()> {
+    let mut metadata = metadata.clone();
+    let mut note = |key: &str, value: String| metadata.provenance.insert(key.to_owned(), value);
+    note("epochs", trainer.epochs().to_string());
+    note("steps", trainer.steps().to_string());
+    if let Some(record) = last {
+        note("loss", record.loss.to_string());
+        if let Some(validation) = record.validation {
+            note("validation_loss", validation.loss.to_string());
+            note("validation_accuracy", validation.accuracy.to_string());
+        }
+    }
+    let mut model = trainer.model();
+    metadata.write_to(&mut model);
+    Ok(model.write(path)?)
+}
+
+fn progress_bar(steps: u64, epoch: u64, epochs: u64) -> ProgressBar {
+    let style = ProgressStyle::with_template("{prefix} {bar:30} {pos}/{len} {elapsed} (left {eta}) loss {msg}");
+    let bar = ProgressBar::new(steps).with_prefix(format!("epoch {epoch}/{epochs}"));
+    bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+}
+
+/// What is kept beside the model.
+struct Files {
+    state: PathBuf,
+    log: PathBuf,
+    curves: PathBuf,
+}
+
+impl Files {
+    fn beside(model: &Path) -> Self {
+        Self {
+            state: model.with_extension("state"),
+            log: model.with_extension("jsonl"),
+            curves: model.with_extension("png"),
+        }
+    }
+
+    /// The first `epochs` lines of the log.
+    fn read_log(&self, epochs: u64) -> Result<Vec<Record>> {
+        let text = match fs::read_to_string(&self.log) {
+            Err(error) if error.kind() == ErrorKind::NotFound => String::new(),
+            text => text.with_context(|| self.log.display().to_string())?,
+        };
+        let records = text.lines().take(epochs as usize).map(serde_json::from_str);
+        records.collect::<Result<_, _>>().with_context(|| self.log.display().to_string())
+    }
+
+    fn write_log(&self, records: &[Record]) -> Result<()> {
+        let lines =
+            records.iter().map(|record| Ok(serde_json::to_string(record)? + "\n")).collect::<Result<String>>()?;
+        fs::write(&self.log, lines).with_context(|| self.log.display().to_string())
+    }
+}

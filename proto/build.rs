@@ -1,0 +1,18 @@
+//! Compiles the .proto files without protoc.
+
+use std::env;
+use std::error::Error;
+use std::fs;
+use std::path::PathBuf;
+
+use prost::Message;
+
+fn main() -> Result<(), Box<dyn Error>> {
+    println!("cargo:rerun-if-changed=proto");
+    let descriptors = protox::compile(["grasp/v1/grasp.proto"], ["proto"])?;
+    let out = PathBuf::from(env::var("OUT_DIR")?);
+    fs::write(out.join("descriptors.bin"), descriptors.encode_to_vec())?;
+    // `Bytes` shares the buffer that the message arrived in instead of copying the volume out of it.
+    tonic_prost_build::configure().bytes(".grasp.v1.Volume.data").compile_fds(descriptors)?;
+    Ok(())
+}

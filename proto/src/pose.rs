@@ -1,0 +1,49 @@
+use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
+
+use crate::{FieldError, pb};
+
+/// How far from 1 the length of an orientation may be: what single precision and four printed digits leave.
+const UNIT_TOLERANCE: f64 = 1e-3;
+
+/// The fields of one pose, as a request names them.
+pub(crate) struct PoseFields {
+    pub position: &'static str,
+    pub orientation: &'static str,
+}
+
+/// The pose as an isometry, its orientation brought to unit length.
+pub(crate) fn decode(pose: &pb::Pose, fields: &PoseFields) -> Result<Isometry3<f64>, FieldError> {
+    let position = pose.position.ok_or_else(|| FieldError::new(fields.position, "absent", "must be given"))?;
+    let pb::Vector3 { x, y, z } = position;
+    if ![x, y, z].iter().all(|c| c.is_finite()) {
+        return Err(FieldError::new(fields.position, format_args!("({x}, {y}, {z})"), "must be finite"));
+    }
+    let translation = Translation3::new(x, y, z);
+
+    let orientation = pose.orientation.ok_or_else(|| FieldError::new(fields.orientation, "absent", "must be given"))?;
+    let pb::Quaternion { x, y, z, w } = orientation;
+    let quaternion = Quaternion::new(w, x, y, z);
+    let length = quaternion.norm();
+    // Written so that NaN fails.
+    if !((length - 1.0).abs() <= UNIT_TOLERANCE) {
+        let value = format_args!("(x {x}, y {y}, z {z}, w {w}), of length {length}");
+        return Err(FieldError::new(fields.orientation, value, "must be of unit length to within 0.001"));
+    }
+    Ok(Isometry3::from_parts(translation, UnitQuaternion::new_normalize(quaternion)))
+}
+
+impl From<&Isometry3<f64>> for pb::Pose {
+    fn from(pose: &Isometry3<f64>) -> Self {
+        let position = pose.translation.vector;
+        let orientation = pose.rotation.coords;
+        Self {
+            position: Some(pb::Vector3 { x: position.x, y: position.y, z: position.z }),
+            orientation: Some(pb::Quaternion {
+                x: orientation.x,
+                y: orientation.y,
+                z: orientation.z,
+                w: orientation.w,
+            }),
+        }
+    }
+}

@@ -1,0 +1,106 @@
+use grasp::{Volume, VolumeError};
+use half::f16;
+use half::slice::HalfFloatSliceExt;
+use nalgebra::Isometry3;
+
+use crate::pose::{self, PoseFields};
+use crate::{FieldError, pb};
+
+const POSE: PoseFields = PoseFields { position: "volume.pose.position", orientation: "volume.pose.orientation" };
+
+/// The resolution that a volume claims, checked against the length of its data: what a model is chosen by, before
+/// anything is converted.
+///
+/// # Errors
+/// [`FieldError`] when the resolution or the dtype is not supported, or the data's length does not fit them.
+pub fn resolution(volume: &pb::Volume) -> Result<usize, FieldError> {
+    let value_size = match volume.dtype() {
+        pb::DataType::F32 => 4,
+        pb::DataType::F16 => 2,
+        pb::DataType::U8 => 1,
+        pb::DataType::Unspecified => return Err(FieldError::new("volume.dtype", volume.dtype, "must be 1 (f32), 2 (f16) or 3 (u8)")),
+    };
+    let resolution = volume.resolution as usize;
+    if resolution == 0 || resolution > Volume::MAX_RESOLUTION {
+        return Err(VolumeError::Resolution(resolution).into());
+    }
+    let expected = resolution.pow(3) * value_size;
+    if volume.data.len() != expected {
+        let needed = format_args!(
+            "a resolution of {resolution} needs {resolution}³ · {value_size} = {expected} ({dtype})",
+            dtype = volume.dtype().as_str_name(),
+        );
+        return Err(FieldError::new("volume.data", format_args!("{} bytes", volume.data.len()), needed));
+    }
+    Ok(resolution)
+}
+
+impl TryFrom<&pb::Volume> for Volume {
+    type Error = FieldError;
+
+    /// Checks every field; the data is copied once, while it is widened.
+    fn try_from(volume: &pb::Volume) -> Result<Self, FieldError> {
+        let resolution = resolution(volume)?;
+        let pose = volume.pose.as_ref().map_or(Ok(Isometry3::identity()), |p| pose::decode(p, &POSE))?;
+        let values = match volume.dtype() {
+            pb::DataType::F16 => widen_f16(&volume.data),
+            pb::DataType::U8 => volume.data.iter().map(|&v| f32::from(v) / 255.0).collect(),
+            // `resolution` has refused what is not a type.
+            pb::DataType::F32 | pb::DataType::Unspecified => {
+                volume.data.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect()
+            }
+        };
+        Ok(Self::new(resolution, volume.voxel_size, pose, values)?)
+    }
+}
+
+/// Through a block on the stack: the bytes need not be aligned, and `half` converts slices with the CPU's instructions.
+fn widen_f16(data: &[u8]) -> Vec<f32> {
+    let mut values = vec![0.0; data.len() / 2];
+    let mut block = [f16::ZERO; 512];
+    for (bytes, wide) in data.as_chunks().0.chunks(block.len()).zip(values.chunks_mut(block.len())) {
+        let narrow = &mut block[..bytes.len()];
+        for (value, &bytes) in narrow.iter_mut().zip(bytes) {
+            *value = f16::from_le_bytes(bytes);
+        }
+        narrow.convert_to_f32_slice(wide);
+    }
+    values
+}
+
+/// Writes a volume as `dtype`, in the frame `frame_id`. U8 rounds to the nearest of 255 steps; what is above 0 stays
+/// above 0, for 0 means unobserved. An unspecified type is written as F32.
+#[must_use]
+pub fn encode(volume: &Volume, dtype: pb::DataType, frame_id: impl Into<String>) -> pb::Volume {
+    let values = volume.values().iter();
+    let (dtype, data) = match dtype {
+        pb::DataType::F32 | pb::DataType::Unspecified => {
+            (pb::DataType::F32, values.flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>())
+        }
+        pb::DataType::F16 => (dtype, values.flat_map(|&v| f16::from_f32(v).to_le_bytes()).collect()),
+        pb::DataType::U8 => {
+            (dtype, values.map(|&v| ((v * 255.0).round() as u8).max(u8::from(v > 0.0))).collect())
+        }
+    };
+    pb::Volume {
+        data: data.into(),
+        dtype: dtype.into(),
+        // At most `Volume::MAX_RESOLUTION`.
+        resolution: volume.resolution() as u32,
+        voxel_size: volume.voxel_size(),
+        pose: Some(volume.pose().into()),
+        frame_id: frame_id.into(),
+        stamp: None,
+    }
+}
+
+impl From<VolumeError> for FieldError {
+    fn from(error: VolumeError) -> Self {
+        let field = match error.field() {
+            "resolution" => "volume.resolution",
+            "voxel_size" => "volume.voxel_size",
+            _ => "volume.data",
+        };
+        Self { field, message: format!("volume.{error}") }
+    }
+}

@@ -1,0 +1,199 @@
+use std::fmt::{self, Display};
+use std::net::SocketAddr;
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+use std::str::FromStr;
+use std::thread::available_parallelism;
+use std::time::Duration;
+
+use clap::Parser;
+use grasp_models::Store;
+use tracing_subscriber::EnvFilter;
+
+/// Everything that can be set, checked.
+pub(crate) struct Config {
+    pub store: Store,
+    pub default_model: Option<String>,
+    pub listen: SocketAddr,
+    pub http: SocketAddr,
+    /// Sessions of each model.
+    pub workers: usize,
+    /// Threads of each session.
+    pub threads: usize,
+    /// Threads that move messages.
+    pub io_threads: usize,
+    /// Requests of each model that may wait.
+    pub queue: usize,
+    pub max_message_bytes: usize,
+    pub drain_timeout: Duration,
+    pub log: String,
+    pub log_format: LogFormat,
+}
+
+/// How the log is written.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum LogFormat {
+    Text,
+    Json,
+}
+
+/// Answers volumes with 6-DoF grasps over gRPC.
+///
+/// Every flag can be given by the environment too. ORT_DYLIB_PATH names ONNX Runtime's shared library.
+//
+// Values are read as text and checked together, so that one run reports every mistake.
+#[derive(Parser)]
+#[command(name = "graspd", version, max_term_width = 100)]
+struct Flags {
+    /// Folder whose .onnx files are served.
+    #[arg(long, env = "GRASPD_MODELS", value_name = "DIR")]
+    models: Option<PathBuf>,
+
+    /// Model that answers requests which name none, if their volume fits it. By default the first by name.
+    #[arg(long, env = "GRASPD_DEFAULT_MODEL", value_name = "NAME")]
+    default_model: Option<String>,
+
+    /// Address of the gRPC listener. Port 0 takes a free one; stdout says which.
+    #[arg(long, env = "GRASPD_LISTEN", value_name = "ADDR", default_value = "127.0.0.1:50051")]
+    listen: String,
+
+    /// Address of the HTTP listener: /metrics for Prometheus, /healthz, /readyz.
+    #[arg(long, env = "GRASPD_HTTP", value_name = "ADDR", default_value = "127.0.0.1:9090")]
+    http: String,
+
+    /// Sessions of each model: requests that it answers at the same time.
+    #[arg(long, env = "GRASPD_WORKERS", value_name = "N", default_value = "1")]
+    workers: String,
+
+    /// Threads of each session. By default the CPUs that this process may use, divided by --workers.
+    #[arg(long, env = "GRASPD_THREADS", value_name = "N")]
+    threads: Option<String>,
+
+    /// Requests of each model that may wait for a session. Further ones are refused at once.
+    #[arg(long, env = "GRASPD_QUEUE", value_name = "N", default_value = "32")]
+    queue: String,
+
+    /// Largest message that is taken, bytes.
+    #[arg(long, env = "GRASPD_MAX_MESSAGE_BYTES", value_name = "N", default_value = "16777216")]
+    max_message_bytes: String,
+
+    /// After SIGTERM, how long requests that were taken may still run, seconds.
+    #[arg(long, env = "GRASPD_DRAIN_TIMEOUT", value_name = "SECONDS", default_value = "20", allow_negative_numbers = true)]
+    drain_timeout: String,
+
+    /// What is logged to stderr: a level, or tracing's directives such as `warn,graspd=debug`.
+    #[arg(long, env = "GRASPD_LOG", value_name = "FILTER", default_value = "info")]
+    log: String,
+
+    /// How the log is written: text or json.
+    #[arg(long, env = "GRASPD_LOG_FORMAT", value_name = "FORMAT", default_value = "text")]
+    log_format: String,
+}
+
+/// Every mistake in the configuration.
+#[derive(Debug, Default)]
+pub(crate) struct ConfigErrors(Vec<String>);
+
+impl Config {
+    /// From the command line and the environment. `--help` and unknown flags end the process, as clap does.
+    pub fn from_args() -> Result<Self, ConfigErrors> {
+        Self::new(Flags::parse())
+    }
+
+    fn new(flags: Flags) -> Result<Self, ConfigErrors> {
+        const ADDRESS: &str = "an address and a port, such as 127.0.0.1:50051";
+        const COUNT: &str = "a whole number above 0";
+        let cpus = available_parallelism().map_or(1, NonZeroUsize::get);
+        let mut errors = ConfigErrors::default();
+
+        let listen = errors.parse("listen", &flags.listen, ADDRESS);
+        let http = errors.parse("http", &flags.http, ADDRESS);
+        let workers = errors.parse("workers", &flags.workers, COUNT).map(NonZeroUsize::get);
+        let threads = match &flags.threads {
+            Some(threads) => errors.parse("threads", threads, COUNT).map(NonZeroUsize::get),
+            None => workers.map(|workers| (cpus / workers).max(1)),
+        };
+        let queue = errors.parse("queue", &flags.queue, COUNT).map(NonZeroUsize::get);
+        let max_message_bytes = errors.parse("max-message-bytes", &flags.max_message_bytes, COUNT);
+        let drain_timeout = errors
+            .parse("drain-timeout", &flags.drain_timeout, "a number of seconds, 0 or more")
+            .map(|Seconds(duration)| duration);
+        let log_format = errors.parse("log-format", &flags.log_format, "text or json");
+        if let Err(error) = EnvFilter::try_new(&flags.log) {
+            errors.add("log", format_args!("is `{}`: {error}", flags.log));
+        }
+        let store = match flags.models {
+            Some(models) => Store::open(&models).map_err(|error| errors.add("models", error)).ok(),
+            None => {
+                errors.add("models", "is missing: name the folder that holds the .onnx files");
+                None
+            }
+        };
+        if let (Some(store), Some(name)) = (&store, &flags.default_model)
+            && let Err(error) = store.get(name, None)
+        {
+            errors.add("default-model", error);
+        }
+
+        let config = || {
+            Some(Self {
+                store: store?,
+                default_model: flags.default_model,
+                listen: listen?,
+                http: http?,
+                workers: workers?,
+                threads: threads?,
+                // A request costs them a tenth of a millisecond: more than four would only take CPUs from the networks.
+                io_threads: cpus.min(4),
+                queue: queue?,
+                max_message_bytes: max_message_bytes.map(NonZeroUsize::get)?,
+                drain_timeout: drain_timeout?,
+                log: flags.log,
+                log_format: log_format?,
+            })
+        };
+        config().filter(|_| errors.0.is_empty()).ok_or(errors)
+    }
+}
+
+impl ConfigErrors {
+    fn add(&mut self, flag: &str, error: impl Display) {
+        let variable = flag.to_uppercase().replace('-', "_");
+        self.0.push(format!("--{flag} (GRASPD_{variable}) {error}"));
+    }
+
+    fn parse<T: FromStr>(&mut self, flag: &str, value: &str, expected: &str) -> Option<T> {
+        value.parse().map_err(|_| self.add(flag, format_args!("is `{value}`, it must be {expected}"))).ok()
+    }
+}
+
+impl Display for ConfigErrors {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        writeln!(f, "graspd: {} in the configuration:", if self.0.len() == 1 { "a mistake" } else { "mistakes" })?;
+        self.0.iter().try_for_each(|error| writeln!(f, "  {error}"))?;
+        writeln!(f, "`graspd --help` says what each flag means.")
+    }
+}
+
+struct Seconds(Duration);
+
+impl FromStr for Seconds {
+    type Err = ();
+
+    fn from_str(text: &str) -> Result<Self, ()> {
+        let seconds: f64 = text.parse().map_err(drop)?;
+        Duration::try_from_secs_f64(seconds).map(Self).map_err(drop)
+    }
+}
+
+impl FromStr for LogFormat {
+    type Err = ();
+
+    fn from_str(text: &str) -> Result<Self, ()> {
+        match text {
+            "text" => Ok(Self::Text),
+            "json" => Ok(Self::Json),
+            _ => Err(()),
+        }
+    }
+}

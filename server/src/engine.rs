@@ -1,0 +1,225 @@
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use grasp::{DecodeError, DecodeParams, Decoded, Volume, decode};
+use grasp_models::{Entry, LoadError, Network, Options, RuntimeError};
+use nalgebra::Isometry3;
+use prometheus::IntGauge;
+use thiserror::Error;
+use tokio::sync::{mpsc, oneshot};
+use tracing::{Span, error, info};
+
+use crate::refusal::Refusal;
+
+/// One model: its queue, and what is said of it. The sessions that take from the queue end when the engine is dropped.
+pub(crate) struct Engine {
+    pub entry: Entry,
+    /// `name version`, as the log and the metrics have it.
+    pub label: String,
+    queue: SyncSender<Job>,
+    capacity: usize,
+    waiting: IntGauge,
+    pace: Arc<Pace>,
+}
+
+/// The threads of every engine's sessions.
+pub(crate) struct Sessions {
+    threads: Vec<JoinHandle<()>>,
+    warm: mpsc::Receiver<Result<(), EngineError>>,
+    /// Held for the sessions that are still to be started.
+    report: mpsc::Sender<Result<(), EngineError>>,
+}
+
+/// What a session made of a volume.
+pub(crate) struct Answer {
+    pub decoded: Decoded,
+    pub queue: Duration,
+    pub inference: Duration,
+    pub postprocessing: Duration,
+}
+
+/// Why a session could not answer.
+#[derive(Debug, Error)]
+pub(crate) enum EngineError {
+    #[error(transparent)]
+    Run(#[from] RuntimeError),
+    #[error("the model's output is unusable: {0}")]
+    Decode(#[from] DecodeError),
+    #[error("the session panicked: {0}")]
+    Panic(String),
+}
+
+pub(crate) type Reply = oneshot::Receiver<Result<Answer, EngineError>>;
+
+struct Job {
+    volume: Volume,
+    params: DecodeParams,
+    span: Span,
+    submitted: Instant,
+    reply: oneshot::Sender<Result<Answer, EngineError>>,
+}
+
+/// How long the last answer took: when the next place in the queue will be free.
+struct Pace(AtomicU64);
+
+impl Engine {
+    /// Loads `workers` sessions of `threads` threads each and starts them behind a queue of `capacity`.
+    pub fn start(
+        entry: Entry,
+        workers: usize,
+        threads: usize,
+        capacity: usize,
+        waiting: impl FnOnce(&str) -> IntGauge,
+        sessions: &mut Sessions,
+    ) -> Result<Self, LoadError> {
+        let label = format!("{} {}", entry.metadata.name, entry.metadata.version);
+        let waiting = waiting(&label);
+        let pace = Arc::new(Pace(AtomicU64::new(0)));
+        let (queue, jobs) = sync_channel(capacity);
+        let jobs = Arc::new(Mutex::new(jobs));
+        for worker in 0..workers {
+            let session = Session {
+                network: Network::load(&entry.path, &Options { threads })?,
+                jobs: Arc::clone(&jobs),
+                waiting: waiting.clone(),
+                pace: Arc::clone(&pace),
+            };
+            sessions.spawn(format!("{} {worker}", entry.metadata.name), session);
+        }
+        info!(model = label, sha256 = entry.sha256, workers, threads, "loaded");
+        Ok(Self { entry, label, queue, capacity, waiting, pace })
+    }
+
+    /// Queues a volume, or refuses at once. A caller that drops the reply has gone: its job is skipped.
+    pub fn submit(&self, volume: Volume, params: DecodeParams, span: Span) -> Result<Reply, Refusal> {
+        let (reply, answer) = oneshot::channel();
+        let job = Job { volume, params, span, submitted: Instant::now(), reply };
+        // Before the session can take it, or the gauge could fall below 0.
+        self.waiting.inc();
+        self.queue.try_send(job).map_err(|refused| {
+            self.waiting.dec();
+            match refused {
+                TrySendError::Full(_) => Refusal::Overloaded {
+                    model: self.entry.metadata.name.clone(),
+                    waiting: self.capacity,
+                    retry_after: self.pace.get(),
+                },
+                TrySendError::Disconnected(_) => EngineError::Panic("it is gone".to_owned()).into(),
+            }
+        })?;
+        Ok(answer)
+    }
+}
+
+impl Sessions {
+    pub fn none() -> Self {
+        let (report, warm) = mpsc::channel(1);
+        Self { threads: Vec::new(), warm, report }
+    }
+
+    fn spawn(&mut self, name: String, session: Session) {
+        let report = self.report.clone();
+        let thread = thread::Builder::new().name(name).spawn(move || session.run(&report));
+        self.threads.push(thread.expect("the system has threads left, or nothing could be served"));
+    }
+
+    /// Waits until every session has answered once.
+    pub async fn warm(&mut self) -> Result<(), EngineError> {
+        for _ in &self.threads {
+            // `self` holds a sender, so there is always one to wait for.
+            if let Some(report) = self.warm.recv().await {
+                report?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Waits for the sessions to end, which they do once their engine is dropped.
+    pub fn join(self) {
+        for thread in self.threads {
+            // A session catches its panics, and one that did not has nothing left to be waited for.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// A thread's own network and its end of the queue.
+struct Session {
+    network: Network,
+    jobs: Arc<Mutex<Receiver<Job>>>,
+    waiting: IntGauge,
+    pace: Arc<Pace>,
+}
+
+impl Session {
+    fn run(mut self, report: &mpsc::Sender<Result<(), EngineError>>) {
+        // Nobody to report to: the server is stopping already, and the queue says so next.
+        let _ = report.blocking_send(self.warm_up());
+        while let Some(job) = self.next() {
+            let Job { volume, params, span, submitted, reply } = job;
+            if reply.is_closed() {
+                continue;
+            }
+            let queue = submitted.elapsed();
+            let answer = span.in_scope(|| self.answer(&volume, &params, queue));
+            // The caller may have gone meanwhile; that is theirs to count.
+            let _ = reply.send(answer);
+        }
+    }
+
+    fn next(&self) -> Option<Job> {
+        // Whoever holds the lock is the one that waits. A panic cannot have left the receiver half changed.
+        let job = self.jobs.lock().unwrap_or_else(PoisonError::into_inner).recv().ok()?;
+        self.waiting.dec();
+        Some(job)
+    }
+
+    fn answer(&mut self, volume: &Volume, params: &DecodeParams, queue: Duration) -> Result<Answer, EngineError> {
+        let started = Instant::now();
+        let network = &mut self.network;
+        // The network's buffers are written anew for each volume, so what a panic leaves in them does no harm.
+        let answer = catch_unwind(AssertUnwindSafe(|| {
+            let output = network.infer(&[volume])?;
+            let inference = started.elapsed();
+            let decoded = decode(volume, &output.maps(0), params)?;
+            Ok(Answer { decoded, queue, inference, postprocessing: started.elapsed() - inference })
+        }))
+        .unwrap_or_else(|panic| Err(EngineError::Panic(message(&*panic))));
+        self.pace.set(started.elapsed());
+        if let Err(error) = &answer {
+            error!(%error, "the session failed");
+        }
+        answer
+    }
+
+    /// The first inference allocates and tunes; no caller should wait for that.
+    fn warm_up(&mut self) -> Result<(), EngineError> {
+        let metadata = self.network.metadata();
+        let values = vec![0.5; metadata.resolution.pow(3)];
+        let volume = Volume::new(metadata.resolution, metadata.voxel_size, Isometry3::identity(), values);
+        let params = metadata.decode_params();
+        let volume = volume.expect("metadata has a positive resolution and voxel size, and 0.5 is a surface");
+        self.answer(&volume, &params, Duration::ZERO).map(drop)
+    }
+}
+
+impl Pace {
+    fn set(&self, duration: Duration) {
+        self.0.store(duration.as_micros().try_into().unwrap_or(u64::MAX), Ordering::Relaxed);
+    }
+
+    /// At least a millisecond, the unit in which clients are told.
+    fn get(&self) -> Duration {
+        Duration::from_micros(self.0.load(Ordering::Relaxed)).max(Duration::from_millis(1))
+    }
+}
+
+fn message(panic: &(dyn Any + Send)) -> String {
+    let text = panic.downcast_ref::<&str>().copied().or_else(|| panic.downcast_ref::<String>().map(String::as_str));
+    text.unwrap_or("without a message").to_owned()
+}

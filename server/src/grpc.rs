@@ -1,0 +1,50 @@
+use std::time::Duration;
+
+use grasp_proto::FILE_DESCRIPTOR_SET;
+use grasp_proto::pb::grasp_service_server::GraspServiceServer;
+use tokio::net::TcpListener;
+use tokio::sync::watch;
+use tonic::transport::Server;
+use tonic::transport::server::TcpIncoming;
+use tonic_health::pb::health_server::HealthServer;
+
+use crate::health::{Health, State, draining};
+use crate::service::Grasps;
+
+/// HTTP/2's default of 64 KiB holds a quarter of a 40³ volume: the client would wait for us four times per request.
+const STREAM_WINDOW: u32 = 4 << 20;
+/// For several volumes in flight on one connection.
+const CONNECTION_WINDOW: u32 = 16 << 20;
+/// A volume in one frame instead of sixteen.
+const MAX_FRAME: u32 = 1 << 20;
+/// Clients that vanished without a word are noticed.
+const KEEPALIVE: Duration = Duration::from_secs(30);
+
+/// Serves until the state is draining and every request that was taken is answered.
+pub(crate) async fn serve(
+    listener: TcpListener,
+    max_message_bytes: usize,
+    service: Grasps,
+    state: watch::Receiver<State>,
+) -> anyhow::Result<()> {
+    let reflection = || {
+        tonic_reflection::server::Builder::configure()
+            .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
+            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+    };
+    // `Server::tcp_nodelay` does nothing for a listener that was bound before; without it replies wait 40 ms for
+    // the client's acknowledgements.
+    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
+    Server::builder()
+        .initial_stream_window_size(STREAM_WINDOW)
+        .initial_connection_window_size(CONNECTION_WINDOW)
+        .max_frame_size(MAX_FRAME)
+        .http2_keepalive_interval(Some(KEEPALIVE))
+        .add_service(GraspServiceServer::new(service).max_decoding_message_size(max_message_bytes))
+        .add_service(HealthServer::new(Health(state.clone())))
+        .add_service(reflection().build_v1()?)
+        .add_service(reflection().build_v1alpha()?)
+        .serve_with_incoming_shutdown(incoming, draining(state))
+        .await?;
+    Ok(())
+}

@@ -1,0 +1,123 @@
+//! graspd: volumes in, grasps out, over gRPC.
+
+mod config;
+mod engine;
+mod grpc;
+mod health;
+mod http;
+mod metrics;
+mod models;
+mod refusal;
+mod service;
+mod shutdown;
+mod telemetry;
+mod timings;
+
+use std::io::Write;
+use std::net::SocketAddr;
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use anyhow::Context;
+use tokio::net::TcpListener;
+use tracing::{error, info, warn};
+
+use crate::config::Config;
+use crate::engine::Sessions;
+use crate::health::Readiness;
+use crate::metrics::Metrics;
+use crate::models::Models;
+use crate::service::Grasps;
+use crate::shutdown::Signals;
+
+fn main() -> ExitCode {
+    let config = match Config::from_args() {
+        Ok(config) => config,
+        Err(errors) => {
+            eprint!("{errors}");
+            return ExitCode::from(2);
+        }
+    };
+    telemetry::init(&config);
+    match run(&config) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            error!("{error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// From the configuration to the last session dropped.
+fn run(config: &Config) -> anyhow::Result<()> {
+    let onnxruntime = grasp_models::init()?;
+    info!(version = onnxruntime.version, library = %onnxruntime.library.display(), "ONNX Runtime");
+
+    let metrics = Arc::new(Metrics::new());
+    let (models, mut sessions) = Models::load(config, &metrics)?;
+
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(config.io_threads)
+        .thread_name("grpc")
+        .enable_all()
+        .build()
+        .context("cannot start the runtime's threads")?;
+    let served = runtime.block_on(serve(config, models, &mut sessions, &metrics));
+
+    // What is still connected goes with the runtime, and with it the last way to reach the sessions, which then end.
+    drop(runtime);
+    sessions.join();
+    served
+}
+
+/// From binding the listeners to the end of the drain.
+async fn serve(
+    config: &Config,
+    models: Models,
+    sessions: &mut Sessions,
+    metrics: &Arc<Metrics>,
+) -> anyhow::Result<()> {
+    let mut signals = Signals::new().context("cannot handle signals")?;
+    let grpc = bind(config.listen, "--listen").await?;
+    let http = bind(config.http, "--http").await?;
+    announce(&format!("grpc listening on {}", grpc.local_addr()?));
+    announce(&format!("http listening on {}", http.local_addr()?));
+
+    let readiness = Readiness::starting();
+    let state = readiness.subscribe();
+    let http = tokio::spawn(http::serve(http, Arc::clone(metrics), state.clone()));
+    let service = Grasps::new(Arc::new(models), Arc::clone(metrics), state.clone());
+    let mut grpc = tokio::spawn(grpc::serve(grpc, config.max_message_bytes, service, state));
+
+    let stopped = tokio::select! {
+        warm = sessions.warm() => { warm?; false }
+        () = signals.next() => true,
+    };
+    if !stopped {
+        readiness.ready();
+        announce("ready");
+        tokio::select! {
+            () = signals.next() => {}
+            ended = &mut grpc => return ended?.context("the gRPC listener failed"),
+        }
+    }
+
+    info!(timeout = ?config.drain_timeout, "draining");
+    readiness.drain();
+    tokio::select! {
+        ended = &mut grpc => { ended??; info!("drained") }
+        () = tokio::time::sleep(config.drain_timeout) => warn!("still busy after the drain timeout, leaving"),
+        () = signals.next() => warn!("told twice, leaving"),
+    }
+    http.abort();
+    Ok(())
+}
+
+async fn bind(address: SocketAddr, flag: &str) -> anyhow::Result<TcpListener> {
+    TcpListener::bind(address).await.with_context(|| format!("cannot listen on {flag} {address}"))
+}
+
+/// Tells whoever started this process; it need not be listening.
+fn announce(line: &str) {
+    let _ = writeln!(std::io::stdout(), "{line}");
+}

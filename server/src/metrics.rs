@@ -1,0 +1,90 @@
+use prometheus::{
+    HistogramOpts, HistogramVec, IntCounterVec, IntGauge, IntGaugeVec, Opts, Registry, TEXT_FORMAT, TextEncoder,
+};
+use tonic::Code;
+
+use crate::timings::Timings;
+
+/// Seconds. Dense from a cached wake-up to a large network on a slow CPU.
+const BUCKETS: [f64; 27] = [
+    50e-6, 75e-6, 100e-6, 150e-6, 200e-6, 300e-6, 500e-6, 750e-6, 1e-3, 1.5e-3, 2e-3, 3e-3, 5e-3, 7.5e-3, 10e-3, 15e-3,
+    20e-3, 30e-3, 50e-3, 75e-3, 100e-3, 150e-3, 200e-3, 300e-3, 500e-3, 750e-3, 1.0,
+];
+
+/// What Prometheus sees. A model is labelled `name version`; requests that reached no model have an empty label.
+pub(crate) struct Metrics {
+    registry: Registry,
+    stages: HistogramVec,
+    requests: IntCounterVec,
+    grasps: IntCounterVec,
+    waiting: IntGaugeVec,
+}
+
+impl Metrics {
+    /// The format of [`render`](Self::render).
+    pub const CONTENT_TYPE: &str = TEXT_FORMAT;
+
+    pub fn new() -> Self {
+        const VALID: &str = "the names below are valid and differ";
+        let stages = HistogramOpts::new("graspd_stage_duration_seconds", "Time a request spent in each stage.");
+        let metrics = Self {
+            registry: Registry::new(),
+            stages: HistogramVec::new(stages.buckets(BUCKETS.to_vec()), &["model", "stage"]).expect(VALID),
+            requests: IntCounterVec::new(
+                Opts::new("graspd_requests_total", "Requests by their outcome, a gRPC status code."),
+                &["model", "code"],
+            )
+            .expect(VALID),
+            grasps: IntCounterVec::new(Opts::new("graspd_grasps_total", "Grasps sent."), &["model"]).expect(VALID),
+            waiting: IntGaugeVec::new(
+                Opts::new("graspd_queue_requests", "Requests waiting for a session."),
+                &["model"],
+            )
+            .expect(VALID),
+        };
+        let Self { registry, stages, requests, grasps, waiting } = &metrics;
+        registry.register(Box::new(stages.clone())).expect(VALID);
+        registry.register(Box::new(requests.clone())).expect(VALID);
+        registry.register(Box::new(grasps.clone())).expect(VALID);
+        registry.register(Box::new(waiting.clone())).expect(VALID);
+        metrics
+    }
+
+    /// A request was answered.
+    pub fn answered(&self, model: &str, timings: &Timings, grasps: usize) {
+        for (stage, seconds) in timings.stages() {
+            self.stages.with_label_values(&[model, stage]).observe(seconds);
+        }
+        self.grasps.with_label_values(&[model]).inc_by(grasps as u64);
+        self.ended(model, Code::Ok);
+    }
+
+    /// A request came to an end.
+    pub fn ended(&self, model: &str, code: Code) {
+        self.requests.with_label_values(&[model, code_name(code)]).inc();
+    }
+
+    /// The gauge of a model's queue.
+    pub fn waiting(&self, model: &str) -> IntGauge {
+        self.waiting.with_label_values(&[model])
+    }
+
+    /// In Prometheus' text format.
+    pub fn render(&self) -> String {
+        TextEncoder::new().encode_to_string(&self.registry.gather()).expect("the encoder writes to memory")
+    }
+}
+
+/// As the gRPC specification writes it; the codes that this server ends requests with.
+fn code_name(code: Code) -> &'static str {
+    match code {
+        Code::Ok => "OK",
+        Code::Cancelled => "CANCELLED",
+        Code::InvalidArgument => "INVALID_ARGUMENT",
+        Code::NotFound => "NOT_FOUND",
+        Code::ResourceExhausted => "RESOURCE_EXHAUSTED",
+        Code::Unavailable => "UNAVAILABLE",
+        Code::Internal => "INTERNAL",
+        _ => "UNKNOWN",
+    }
+}

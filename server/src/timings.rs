@@ -1,0 +1,47 @@
+use std::time::Duration;
+
+use grasp_proto::pb;
+use tracing::Span;
+
+/// Where a request's time went: the one source of the reply's latency, the span's fields and the histograms.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Timings {
+    pub queue: Duration,
+    pub preprocessing: Duration,
+    pub inference: Duration,
+    pub postprocessing: Duration,
+    pub total: Duration,
+}
+
+impl Timings {
+    /// Each stage with its name, seconds.
+    pub fn stages(&self) -> [(&'static str, f64); 5] {
+        [
+            ("queue", self.queue),
+            ("preprocessing", self.preprocessing),
+            ("inference", self.inference),
+            ("postprocessing", self.postprocessing),
+            ("total", self.total),
+        ]
+        .map(|(stage, duration)| (stage, duration.as_secs_f64()))
+    }
+
+    /// Fills the fields that the request's span was created with.
+    pub fn record(&self, span: &Span) {
+        for (stage, seconds) in self.stages() {
+            span.record(stage, seconds);
+        }
+    }
+}
+
+impl From<&Timings> for pb::Latency {
+    fn from(timings: &Timings) -> Self {
+        Self {
+            queue: timings.queue.as_secs_f64(),
+            preprocessing: timings.preprocessing.as_secs_f64(),
+            inference: timings.inference.as_secs_f64(),
+            postprocessing: timings.postprocessing.as_secs_f64(),
+            total: timings.total.as_secs_f64(),
+        }
+    }
+}

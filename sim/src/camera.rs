@@ -1,0 +1,138 @@
+//! The depth camera: where it stands, what it sees, and how it errs.
+
+use std::f64::consts::{FRAC_PI_2, FRAC_PI_3, TAU};
+use std::ops::RangeInclusive;
+
+use grasp::{DepthImage, Fusion, Intrinsics};
+use nalgebra::{Isometry3, Point3, Vector3};
+use rand::{Rng, RngExt};
+use rand_distr::{Distribution, Gamma, Normal};
+
+use crate::TABLE_HEIGHT;
+use crate::physics::World;
+use crate::raster::{Instance, render};
+
+/// Nearest depth that is seen, metres.
+const NEAR: f64 = 0.1;
+
+/// Furthest depth that is seen, metres.
+const FAR: f64 = 2.0;
+
+/// A depth image and where it was taken from.
+#[derive(Clone, Debug)]
+pub struct View {
+    /// Metres along the optical axis, row by row, 0 where nothing was seen.
+    pub depth: Vec<f32>,
+    /// `T_camera_task`.
+    pub camera_from_task: Isometry3<f64>,
+}
+
+/// Where a scene is looked at from.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Views {
+    /// GIGA's and the paper's one fixed side view, turned by `azimuth` radians about the vertical.
+    Side {
+        /// 0 is the paper's view.
+        azimuth: f64,
+    },
+    /// VGN's six views on a circle, 30° from the vertical.
+    Circle,
+    /// So many views from anywhere: azimuth any, polar angle 20–75°, distance 0.48–0.72 m.
+    Anywhere(RangeInclusive<usize>),
+}
+
+impl Views {
+    /// The cameras' poses (`T_camera_task`).
+    pub fn sample(&self, rng: &mut impl Rng) -> Vec<Isometry3<f64>> {
+        match self {
+            Self::Side { azimuth } => {
+                vec![look_at(&Point3::new(0.15, 0.15, 0.1), 0.6, FRAC_PI_3, azimuth - FRAC_PI_2)]
+            }
+            Self::Circle => (0..6)
+                .map(|i| look_at(&Point3::new(0.15, 0.15, 0.0), 0.6, TAU / 12.0, f64::from(i) * TAU / 6.0))
+                .collect(),
+            Self::Anywhere(count) => {
+                let count = rng.random_range(count.clone());
+                (0..count)
+                    .map(|_| {
+                        let (distance, polar) =
+                            (rng.random_range(0.48..0.72), rng.random_range(20f64..75.0).to_radians());
+                        look_at(&Point3::new(0.15, 0.15, 0.08), distance, polar, rng.random_range(0.0..TAU))
+                    })
+                    .collect()
+            }
+        }
+    }
+}
+
+/// A camera at `distance` from `target`, `polar` from the vertical, at `azimuth` about it, upright: `T_camera_task`.
+#[must_use]
+pub fn look_at(target: &Point3<f64>, distance: f64, polar: f64, azimuth: f64) -> Isometry3<f64> {
+    let direction = Vector3::new(polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos());
+    let eye = target + direction * distance;
+    // nalgebra's right-handed view looks along -z with y up; the optical frame looks along +z with y down.
+    let optical = nalgebra::UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
+    optical * Isometry3::look_at_rh(&eye, target, &Vector3::z())
+}
+
+/// Renders the scene's depth from each camera, without noise.
+#[must_use]
+pub fn look(world: &World, cameras: &[Isometry3<f64>]) -> Vec<View> {
+    let instances: Vec<Instance> = world
+        .objects()
+        .iter()
+        .zip(0..)
+        .map(|(body, id)| Instance { mesh: &body.object.visual, pose: world.pose(body.id), scale: body.scale, id })
+        .collect();
+    cameras
+        .iter()
+        .map(|camera_from_task| {
+            let frame =
+                render(&instances, Some(TABLE_HEIGHT), &Intrinsics::BENCHMARK, camera_from_task, NEAR, FAR);
+            View { depth: frame.depth, camera_from_task: *camera_from_task }
+        })
+        .collect()
+}
+
+/// Adds the noise of GIGA's evaluation (Dex-Net's model): one Gamma(1000, 0.001) factor per image, then for every
+/// second image N(0, 5 mm) drawn on a quarter-resolution grid and enlarged bilinearly.
+pub fn add_noise(view: &mut View, rng: &mut impl Rng) {
+    let gamma = Gamma::new(1000.0f32, 0.001).expect("both parameters are positive");
+    let factor = gamma.sample(rng);
+    view.depth.iter_mut().for_each(|d| *d *= factor);
+    if rng.random_bool(0.5) {
+        let normal = Normal::new(0.0f32, 0.005).expect("the deviation is finite");
+        let Intrinsics { width, height, .. } = Intrinsics::BENCHMARK;
+        let (w, h) = (width / 4, height / 4);
+        let coarse: Vec<f32> = (0..w * h).map(|_| normal.sample(rng)).collect();
+        let at = |pixel: usize, cells: usize| {
+            let x = ((pixel as f32 + 0.5) / 4.0 - 0.5).clamp(0.0, (cells - 1) as f32);
+            let cell = (x as usize).min(cells - 2);
+            (cell, x - cell as f32)
+        };
+        for v in 0..height {
+            let (row, fv) = at(v, h);
+            for u in 0..width {
+                let d = &mut view.depth[v * width + u];
+                if *d > 0.0 {
+                    let (col, fu) = at(u, w);
+                    let cell = |r: usize, c: usize| coarse[r * w + c];
+                    let upper = cell(row, col) * (1.0 - fu) + cell(row, col + 1) * fu;
+                    let lower = cell(row + 1, col) * (1.0 - fu) + cell(row + 1, col + 1) * fu;
+                    *d += upper * (1.0 - fv) + lower * fv;
+                }
+            }
+        }
+    }
+}
+
+/// Fuses views into a field of `resolution`³ voxels over the workspace.
+#[must_use]
+pub fn fuse(views: &[View], resolution: usize) -> Fusion {
+    let mut fusion = Fusion::new(resolution, grasp::WORKSPACE_SIZE);
+    for view in views {
+        let image = DepthImage::new(Intrinsics::BENCHMARK, &view.depth).expect("views are of the benchmark's camera");
+        fusion.integrate(&image, &view.camera_from_task);
+    }
+    fusion
+}

@@ -1,0 +1,170 @@
+//! Labels: grasp points on the observed surface of a scene, each tried at six yaws.
+
+use std::f64::consts::PI;
+
+use grasp::{FINGER_DEPTH, Grasp, MAX_OPENING, RESOLUTION, SurfacePoint};
+use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use rand::{Rng, RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, Poisson};
+
+use crate::camera::{Views, add_noise, fuse, look};
+use crate::objects::ObjectSet;
+use crate::physics::World;
+use crate::scene::{SceneKind, generate};
+use crate::trial;
+
+/// Yaws at which a point is tried, evenly from 0 to 180° inclusive.
+const YAWS: usize = 6;
+
+/// Resolution of the second volume, whose surface the points are drawn from.
+const CLOUD_RESOLUTION: usize = 120;
+
+/// How scenes are made, looked at and tried.
+#[derive(Clone, Debug)]
+pub struct Recipe {
+    /// Pile or packed.
+    pub kind: SceneKind,
+    /// What the scenes are made of.
+    pub objects: ObjectSet,
+    /// Grasp points a scene.
+    pub points: usize,
+    /// What the network will see.
+    pub views: Views,
+    /// Whether those views carry the benchmark's noise.
+    pub noise: bool,
+    /// Seed of the whole data set.
+    pub seed: u64,
+}
+
+/// A scene as a network sees it, with what came of trying it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LabelledScene {
+    /// The observed volume's values, `[x][y][z]`, [`RESOLUTION`]³.
+    pub volume: Vec<f32>,
+    /// The trials.
+    pub trials: Vec<Trial>,
+}
+
+/// A grasp point, tried. `grasp.quality` is 1 for a success and 0 for a failure.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Trial {
+    /// Pose in the task frame; width measured after the lift, or the greatest for a failure.
+    pub grasp: Grasp,
+    /// Whether any yaw lifted an object.
+    pub success: bool,
+}
+
+impl Recipe {
+    /// A generator of its own for each scene: the result does not depend on which thread makes it, or when.
+    fn rng(&self, index: u64) -> ChaCha8Rng {
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+        rng.set_stream(index);
+        rng
+    }
+
+    /// Makes, looks at and labels scene number `index`; `None` if nothing of it can be seen.
+    #[must_use]
+    pub fn label(&self, index: u64) -> Option<LabelledScene> {
+        let mut rng = self.rng(index);
+        let count = Poisson::new(4.0).expect("4 is positive").sample(&mut rng) as usize + 1;
+        let world = generate(self.kind, &self.objects, count, &mut rng);
+
+        let mut views = look(&world, &self.views.sample(&mut rng));
+        if self.noise {
+            views.iter_mut().for_each(|view| add_noise(view, &mut rng));
+        }
+        let volume = fuse(&views, RESOLUTION).volume(Isometry3::identity()).ok()?.values().to_vec();
+
+        let cloud = graspable_surface(&world, &mut rng);
+        if cloud.is_empty() {
+            return None;
+        }
+        let trials = (0..self.points).map(|_| try_point(&world, &cloud, &mut rng)).collect();
+        Some(LabelledScene { volume, trials })
+    }
+}
+
+/// The surface that six clean views from above see, without the table, the borders, and what faces down.
+#[must_use]
+pub fn graspable_surface(world: &World, rng: &mut impl Rng) -> Vec<SurfacePoint> {
+    const LOWER: [f64; 3] = [0.02, 0.02, 0.055];
+    const UPPER: [f64; 3] = [0.28, 0.28, 0.30];
+    let mut surface = fuse(&look(world, &Views::Circle.sample(rng)), CLOUD_RESOLUTION).surface();
+    surface.retain(|point| {
+        (0..3).all(|axis| (LOWER[axis]..=UPPER[axis]).contains(&point.position[axis])) && point.normal.z > -0.1
+    });
+    surface
+}
+
+/// Draws a grasp point (VGN's `sample_grasp_point`): somewhere on the surface, at a random depth of the fingers.
+///
+/// The pose has its approach against the normal and its x axis near the task frame's.
+#[must_use]
+pub fn sample_pose(cloud: &[SurfacePoint], rng: &mut impl Rng) -> Isometry3<f64> {
+    const MARGIN: f64 = 0.1;
+    let point = cloud[rng.random_range(0..cloud.len())];
+    let depth = rng.random_range(-MARGIN * FINGER_DEPTH..(1.0 + MARGIN) * FINGER_DEPTH);
+    let z = -point.normal;
+    let reference = if z.x.abs() > 1.0 - 1e-4 { Vector3::y() } else { Vector3::x() };
+    let y = z.cross(&reference).normalize();
+    let axes = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[y.cross(&z), y, z]));
+    let position = point.position + point.normal * depth;
+    Isometry3::from_parts(Translation3::from(position), UnitQuaternion::from_rotation_matrix(&axes))
+}
+
+fn try_point(world: &World, cloud: &[SurfacePoint], rng: &mut impl Rng) -> Trial {
+    let pose = sample_pose(cloud, rng);
+    let turned = |yaw: usize| {
+        pose * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw as f64 * PI / (YAWS - 1) as f64)
+    };
+    let widths: [Option<f64>; YAWS] = std::array::from_fn(|yaw| match trial::label(world, &turned(yaw)) {
+        trial::Outcome::Lifted { width, .. } => Some(width),
+        _ => None,
+    });
+    let best = middle_of_widest_run(&widths.map(|width| width.is_some()));
+    match best.and_then(|yaw| widths[yaw].map(|width| (yaw, width))) {
+        Some((yaw, width)) => Trial { grasp: Grasp { pose: turned(yaw), width, quality: 1.0 }, success: true },
+        None => Trial { grasp: Grasp { pose, width: MAX_OPENING, quality: 0.0 }, success: false },
+    }
+}
+
+/// The middle of the first longest run of successes, as `scipy.signal.find_peaks` places it.
+fn middle_of_widest_run(successes: &[bool]) -> Option<usize> {
+    let mut widest: Option<(usize, usize)> = None;
+    let mut start = 0;
+    for run in successes.chunk_by(|a, b| a == b) {
+        if run[0] && widest.is_none_or(|(_, length)| run.len() > length) {
+            widest = Some((start, run.len()));
+        }
+        start += run.len();
+    }
+    widest.map(|(start, length)| start + (length - 1) / 2)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_widest_run_gives_its_middle() {
+        let runs = |s: &str| middle_of_widest_run(&s.chars().map(|c| c == '1').collect::<Vec<_>>());
+        assert_eq!(runs("000000"), None);
+        assert_eq!(runs("010000"), Some(1));
+        assert_eq!(runs("101110"), Some(3));
+        assert_eq!(runs("110110"), Some(0), "the first of equals, rounded down as scipy does");
+        assert_eq!(runs("111111"), Some(2));
+    }
+
+    #[test]
+    fn a_pose_approaches_against_the_normal() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        for normal in [Vector3::z(), Vector3::x(), -Vector3::x(), Vector3::new(0.3, -0.5, 0.4).normalize()] {
+            let cloud = [SurfacePoint { position: nalgebra::Point3::new(0.1, 0.1, 0.1), normal }];
+            let pose = sample_pose(&cloud, &mut rng);
+            assert!((pose.rotation * Vector3::z() + normal).norm() < 1e-9);
+            let offset = pose.translation.vector - cloud[0].position.coords;
+            assert!((offset - normal * offset.dot(&normal)).norm() < 1e-9, "the depth runs along the normal");
+        }
+    }
+}

@@ -1,0 +1,10 @@
+//! The physics: a table, rigid objects on it, and a hand. Everything that knows the engine is in here.
+//!
+//! The interface is in metres, kilograms and f64; the engine's world is in centimetres and f32, because at the size of
+//! a grasp its collision code loses millimetres when it counts in metres.
+
+mod gripper;
+mod world;
+
+pub use gripper::{Gripper, HandBox, OPEN_HAND};
+pub use world::{Body, BodyId, STEPS_PER_SECOND, World};

@@ -1,0 +1,210 @@
+use nalgebra::{Isometry3, Point3, Vector3};
+use rapier3d::math::{AngVector, Vector};
+use rapier3d::prelude::{
+    ColliderBuilder, ColliderHandle, GenericJoint, Group, InteractionGroups, InteractionTestMode, MotorModel,
+    PrismaticJointBuilder, RigidBodyBuilder, RigidBodyHandle, RigidBodyVelocity,
+};
+
+use super::world::{SCALE, from_engine, to_engine, vector};
+use super::{BodyId, World};
+
+/// Force with which each finger closes, newtons.
+const FINGER_FORCE: f64 = 20.0;
+
+/// Velocity gain of the fingers' motor, N·s/m: at rest against an object it pushes with [`FINGER_FORCE`].
+const MOTOR_DAMPING: f64 = 130.0;
+
+/// How fast a finger that lags behind the other catches up, 1/s: the hand's gear keeps both at the same opening.
+const GEAR_GAIN: f64 = 60.0;
+
+const FINGER_MASS: f32 = 0.15;
+const FINGER_TRAVEL: f64 = grasp::MAX_OPENING / 2.0;
+
+/// A box of the hand in the grasp frame, metres: the frame's z is the approach, ±y the closing axis.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct HandBox {
+    /// Smallest coordinates.
+    pub lower: [f64; 3],
+    /// Largest coordinates.
+    pub upper: [f64; 3],
+}
+
+/// Height of the grasp frame above the Panda hand's own frame, along the approach (VGN's TCP).
+const TCP: f64 = 0.062;
+
+const FINGER: HandBox = HandBox { lower: [-0.0105, 0.0, 0.0584 - TCP], upper: [0.0105, 0.0264, 0.0584 + 0.0538 - TCP] };
+const PALM: HandBox = HandBox { lower: [-0.0316, -0.10, -0.026 - TCP], upper: [0.0316, 0.10, 0.066 - TCP] };
+
+/// The Panda hand, fully open: left finger (+y), right finger, palm.
+pub const OPEN_HAND: [HandBox; 3] = [FINGER.shifted(FINGER_TRAVEL), FINGER.mirrored().shifted(-FINGER_TRAVEL), PALM];
+
+impl HandBox {
+    const fn shifted(self, y: f64) -> Self {
+        Self {
+            lower: [self.lower[0], self.lower[1] + y, self.lower[2]],
+            upper: [self.upper[0], self.upper[1] + y, self.upper[2]],
+        }
+    }
+
+    const fn mirrored(self) -> Self {
+        Self {
+            lower: [self.lower[0], -self.upper[1], self.lower[2]],
+            upper: [self.upper[0], -self.lower[1], self.upper[2]],
+        }
+    }
+
+    /// The space swept when the box comes from `distance` metres back along the approach.
+    #[must_use]
+    pub const fn swept(self, distance: f64) -> Self {
+        Self { lower: [self.lower[0], self.lower[1], self.lower[2] - distance], upper: self.upper }
+    }
+
+    pub(super) fn centre(&self) -> Vector3<f64> {
+        (Vector3::from(self.lower) + Vector3::from(self.upper)) / 2.0
+    }
+
+    pub(super) fn half_extents(&self) -> Vector3<f64> {
+        (Vector3::from(self.upper) - Vector3::from(self.lower)) / 2.0
+    }
+
+    /// Height of the box's lowest corner when its frame stands at `pose`.
+    #[must_use]
+    pub fn lowest_point(&self, pose: &Isometry3<f64>) -> f64 {
+        let half = self.half_extents();
+        let down = pose.rotation.to_rotation_matrix().matrix().row(2).map(f64::abs);
+        (pose * Point3::from(self.centre())).z - (down * half)[0]
+    }
+}
+
+/// A free-floating Panda hand in a world: a palm that moves as it is told, and two fingers that push.
+pub struct Gripper {
+    palm: RigidBodyHandle,
+    fingers: [Finger; 2],
+}
+
+struct Finger {
+    body: RigidBodyHandle,
+    collider: ColliderHandle,
+    joint: rapier3d::prelude::ImpulseJointHandle,
+    /// +1 for the left finger, −1 for the right: its outward direction along y.
+    side: f64,
+}
+
+impl Gripper {
+    /// Puts an open hand into `world` with its grasp frame at `pose` (`T_task_grasp`).
+    #[must_use]
+    pub fn insert(world: &mut World, pose: &Isometry3<f64>) -> Self {
+        world.grip();
+        let palm = world.bodies.insert(RigidBodyBuilder::kinematic_velocity_based().pose(to_engine(pose)));
+        insert_box(world, palm, &PALM, 0.0);
+        let fingers = [1.0, -1.0].map(|side| {
+            let offset = Vector3::new(0.0, side * FINGER_TRAVEL, 0.0);
+            let body = RigidBodyBuilder::dynamic()
+                .pose(to_engine(&(pose * nalgebra::Translation3::from(offset))))
+                .gravity_scale(0.0)
+                .can_sleep(false);
+            let body = world.bodies.insert(body);
+            let shape = if side > 0.0 { FINGER } else { FINGER.mirrored() };
+            let collider = insert_box(world, body, &shape, FINGER_MASS);
+            // Open at 0, closed at -travel: the joint's axis points outward.
+            let joint = PrismaticJointBuilder::new(Vector::new(0.0, side as f32, 0.0))
+                .local_anchor1(vector(&(offset * SCALE)))
+                .local_anchor2(Vector::ZERO)
+                .limits([-(FINGER_TRAVEL * SCALE) as f32, 0.0])
+                .motor_model(MotorModel::ForceBased)
+                .motor_velocity(0.0, MOTOR_DAMPING as f32)
+                .motor_max_force((1.5 * FINGER_FORCE * SCALE) as f32)
+                .contacts_enabled(false)
+                .build();
+            // An impulse joint: multibody joints were seen to lift a frictionless cube.
+            let joint = world.joints.insert(palm, body, GenericJoint::from(joint), true);
+            Finger { body, collider, joint, side }
+        });
+        Self { palm, fingers }
+    }
+
+    /// Lets the fingers push shut during the next step.
+    pub fn close(&self, world: &mut World) {
+        let joints = self.positions(world);
+        let mean = (joints[0] + joints[1]) / 2.0;
+        for (finger, position) in self.fingers.iter().zip(joints) {
+            let velocity = -FINGER_FORCE / MOTOR_DAMPING - GEAR_GAIN * (position - mean);
+            if let Some(joint) = world.joints.get_mut(finger.joint, true) {
+                joint.data.set_motor_velocity(
+                    rapier3d::prelude::JointAxis::LinX,
+                    (velocity * SCALE) as f32,
+                    MOTOR_DAMPING as f32,
+                );
+            }
+        }
+    }
+
+    /// Moves the palm at `velocity` (task frame, m/s) from the next step on.
+    pub fn set_velocity(&self, world: &mut World, velocity: &Vector3<f64>) {
+        let velocity = RigidBodyVelocity { linvel: vector(&(velocity * SCALE)), angvel: AngVector::ZERO };
+        world.bodies[self.palm].set_vels(velocity, true);
+    }
+
+    /// Opening between the fingers, metres.
+    #[must_use]
+    pub fn width(&self, world: &World) -> f64 {
+        let joints = self.positions(world);
+        grasp::MAX_OPENING + joints[0] + joints[1]
+    }
+
+    /// The object the fingers press hardest, if they press any.
+    #[must_use]
+    pub fn held(&self, world: &World) -> Option<BodyId> {
+        let mut hardest = None;
+        for finger in &self.fingers {
+            for pair in world.narrow_phase.contact_pairs_with(finger.collider) {
+                // The manifolds' distances are stale between steps; an impulse means that it was touched in this one.
+                let impulse = pair.total_impulse_magnitude();
+                let other = if pair.collider1 == finger.collider { pair.collider2 } else { pair.collider1 };
+                if impulse > hardest.map_or(0.0, |(most, _)| most)
+                    && let Some(id) = world.object_of(other)
+                {
+                    hardest = Some((impulse, id));
+                }
+            }
+        }
+        hardest.map(|(_, id)| id)
+    }
+
+    /// `T_task_grasp` of the hand.
+    #[must_use]
+    pub fn pose(&self, world: &World) -> Isometry3<f64> {
+        from_engine(world.bodies[self.palm].position())
+    }
+
+    /// Takes the hand out of the world.
+    pub fn remove(self, world: &mut World) {
+        for finger in &self.fingers {
+            world.remove_engine_body(finger.body);
+        }
+        world.remove_engine_body(self.palm);
+        world.release();
+    }
+
+    /// Each finger's joint, metres: 0 open, −0.04 closed.
+    fn positions(&self, world: &World) -> [f64; 2] {
+        let palm = self.pose(world);
+        [0, 1].map(|i| {
+            let finger = &self.fingers[i];
+            let base = from_engine(world.bodies[finger.body].position()).translation.vector;
+            palm.inverse_transform_point(&Point3::from(base)).y * finger.side - FINGER_TRAVEL
+        })
+    }
+}
+
+fn insert_box(world: &mut World, body: RigidBodyHandle, part: &HandBox, mass: f32) -> ColliderHandle {
+    // The parts of the hand pass through each other.
+    let groups = InteractionGroups::new(Group::GROUP_2, !Group::GROUP_2, InteractionTestMode::And);
+    let half = part.half_extents() * SCALE;
+    let collider = ColliderBuilder::cuboid(half.x as f32, half.y as f32, half.z as f32)
+        .translation(vector(&(part.centre() * SCALE)))
+        .mass(mass)
+        .friction(0.0)
+        .collision_groups(groups);
+    world.colliders.insert_with_parent(collider, body, &mut world.bodies)
+}

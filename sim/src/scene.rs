@@ -1,0 +1,136 @@
+//! Scenes: objects dropped into a pile or packed upright, settled on the table.
+
+use std::f64::consts::TAU;
+use std::ops::Range;
+use std::sync::Arc;
+
+use grasp::WORKSPACE_SIZE;
+use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
+use rand::{Rng, RngExt};
+use rand_distr::{Distribution, StandardNormal};
+
+use crate::TABLE_HEIGHT;
+use crate::objects::{Object, ObjectSet};
+use crate::physics::{STEPS_PER_SECOND, World};
+
+/// The two ways in which a scene is made.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SceneKind {
+    /// Objects dropped on one another at random.
+    Pile,
+    /// Objects standing upright, side by side.
+    Packed,
+}
+
+/// Velocity norm (m/s and rad/s together) at which a body counts as resting.
+const REST_SPEED: f64 = 0.01;
+
+/// Steps between two looks at whether everything rests.
+const REST_CHUNK: u32 = 60;
+
+/// Makes a scene of up to `count` objects drawn from `objects`, at rest; the same for the same state of `rng`.
+#[must_use]
+pub fn generate(kind: SceneKind, objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
+    let mut world = match kind {
+        SceneKind::Pile => pile(objects, count, rng),
+        SceneKind::Packed => packed(objects, count, rng),
+    };
+    wait_for_rest(&mut world, 5.0);
+    // The contacts need a while longer than the eye before nothing creeps.
+    (0..STEPS_PER_SECOND).for_each(|_| world.step());
+    world
+}
+
+/// Simulates until everything rests, taking away what left the workspace, until nothing leaves any more.
+pub fn settle(world: &mut World) {
+    loop {
+        wait_for_rest(world, 2.0);
+        let workspace = 0.0..=WORKSPACE_SIZE;
+        let gone: Vec<_> = world
+            .objects()
+            .iter()
+            .map(|body| body.id)
+            .filter(|&id| !world.pose(id).translation.vector.iter().all(|c| workspace.contains(c)))
+            .collect();
+        if gone.is_empty() {
+            return;
+        }
+        gone.into_iter().for_each(|id| world.remove(id));
+    }
+}
+
+/// Whether every object rests.
+#[must_use]
+pub fn is_at_rest(world: &World) -> bool {
+    world.objects().iter().all(|body| world.speed(body.id) <= REST_SPEED)
+}
+
+/// Simulates until every object rests, for at most `timeout` seconds.
+fn wait_for_rest(world: &mut World, timeout: f64) {
+    let chunks = (timeout * f64::from(STEPS_PER_SECOND) / f64::from(REST_CHUNK)).ceil() as u32;
+    for _ in 0..chunks {
+        (0..REST_CHUNK).for_each(|_| world.step());
+        if is_at_rest(world) {
+            return;
+        }
+    }
+}
+
+/// Objects dropped one by one into an open box, which is then taken away.
+fn pile(objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
+    const BOX: Range<f64> = 0.02..0.28;
+    const BOX_HEIGHT: f64 = 0.13;
+    const DROP_HEIGHT: f64 = 0.2;
+    let mut world = World::new();
+    world.add_walls([BOX.start; 2], [BOX.end; 2], BOX_HEIGHT);
+    for _ in 0..count {
+        let object = draw(objects, rng);
+        let position =
+            Translation3::new(rng.random_range(0.1..0.2), rng.random_range(0.1..0.2), TABLE_HEIGHT + DROP_HEIGHT);
+        let pose = Isometry3::from_parts(position, random_rotation(rng));
+        world.add(&object, rng.random_range(0.8..1.0), &pose);
+        wait_for_rest(&mut world, 1.0);
+    }
+    world.remove_walls();
+    settle(&mut world);
+    world
+}
+
+/// Objects stood upright where there is room.
+fn packed(objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
+    const ATTEMPTS: usize = 12;
+    const CLEARANCE: f64 = 0.002;
+    let mut world = World::new();
+    for _ in 0..ATTEMPTS {
+        if world.objects().len() >= count {
+            break;
+        }
+        let object = draw(objects, rng);
+        let (x, y) = (rng.random_range(0.08..0.22), rng.random_range(0.08..0.22));
+        let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), rng.random_range(0.0..TAU));
+        let scale = rng.random_range(0.7..0.9);
+        let z = TABLE_HEIGHT - scale * lowest_point(&object) + CLEARANCE;
+        let pose = Isometry3::from_parts(Translation3::new(x, y, z), rotation);
+        if !world.is_occupied(&object, scale, &pose) {
+            world.add(&object, scale, &pose);
+            settle(&mut world);
+        }
+    }
+    world
+}
+
+fn draw(objects: &ObjectSet, rng: &mut impl Rng) -> Arc<Object> {
+    let index = rng.random_range(0..objects.len());
+    Arc::clone(objects.iter().nth(index).expect("the index was drawn below the length"))
+}
+
+/// Uniform over all rotations: a 4-D Gaussian has no preferred direction.
+fn random_rotation(rng: &mut impl Rng) -> UnitQuaternion<f64> {
+    let [x, y, z, w] = std::array::from_fn(|_| StandardNormal.sample(rng));
+    UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z))
+}
+
+fn lowest_point(object: &Object) -> f64 {
+    let heights = object.parts.iter().flat_map(|part| &part.vertices).map(|p: &Point3<f64>| p.z);
+    heights.fold(f64::INFINITY, f64::min)
+}

@@ -1,0 +1,137 @@
+//! One grasp, tried: pre-grasp, approach, close, lift.
+
+use std::f64::consts::FRAC_PI_3;
+
+use nalgebra::{Isometry3, Translation3, Vector3};
+
+use crate::physics::{BodyId, Gripper, OPEN_HAND, STEPS_PER_SECOND, World};
+
+/// Distance of the pre-grasp from the grasp along the approach, metres.
+pub const PREGRASP_DISTANCE: f64 = 0.05;
+
+/// Height of the lift, metres.
+const LIFT: f64 = 0.1;
+
+/// Speed of the lift, m/s.
+const LIFT_SPEED: f64 = 0.1;
+
+/// Time in which the lift gains its speed, seconds.
+const LIFT_RAMP: f64 = 0.05;
+
+/// Opening below which the hand holds nothing: a tenth of its greatest (VGN).
+const EMPTY_WIDTH: f64 = 0.1 * grasp::MAX_OPENING;
+
+/// Step of the approach, metres.
+const APPROACH_STEP: f64 = 0.002;
+
+/// What became of a grasp.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Outcome {
+    /// The object was lifted; `width` is the opening after the lift, metres.
+    Lifted {
+        /// What was lifted.
+        object: BodyId,
+        /// Opening, metres.
+        width: f64,
+    },
+    /// The open hand collided at the pre-grasp.
+    BlockedAtPregrasp,
+    /// The open hand collided on its way to the grasp, where that counts as a failure.
+    BlockedOnApproach,
+    /// The fingers closed on nothing.
+    ClosedOnNothing,
+    /// What was held slipped out while it was lifted.
+    LostInLift,
+}
+
+impl Outcome {
+    /// Whether the object was lifted.
+    #[must_use]
+    pub fn is_success(&self) -> bool {
+        matches!(self, Self::Lifted { .. })
+    }
+}
+
+/// Tries a grasp as training data is labelled: any contact on the way is a failure. `world` is left as it was.
+#[must_use]
+pub fn label(world: &World, grasp: &Isometry3<f64>) -> Outcome {
+    // One test of the swept hand stands for the pre-grasp and every step of the approach.
+    if world.collides(&OPEN_HAND.map(|part| part.swept(PREGRASP_DISTANCE)), grasp) {
+        return Outcome::BlockedOnApproach;
+    }
+    close_and_lift(&mut world.clone(), grasp, grasp)
+}
+
+/// Executes a grasp as in evaluation: the hand closes where its approach met something. A lifted object is still in
+/// the hand's place in `world`; the caller decides what becomes of it.
+pub fn execute(world: &mut World, grasp: &Isometry3<f64>) -> Outcome {
+    let at = |distance: f64| grasp * Translation3::new(0.0, 0.0, -distance);
+    if world.collides(&OPEN_HAND, &at(PREGRASP_DISTANCE)) {
+        return Outcome::BlockedAtPregrasp;
+    }
+    let steps = (PREGRASP_DISTANCE / APPROACH_STEP).round() as u32;
+    let reached = (1..=steps)
+        .map(|step| at(PREGRASP_DISTANCE - f64::from(step) * APPROACH_STEP))
+        .take_while(|pose| !world.collides(&OPEN_HAND, pose))
+        .last()
+        .unwrap_or_else(|| at(PREGRASP_DISTANCE));
+    close_and_lift(world, &reached, grasp)
+}
+
+/// Closes the hand at `start` and lifts it to where a lift from `grasp` ends.
+fn close_and_lift(world: &mut World, start: &Isometry3<f64>, grasp: &Isometry3<f64>) -> Outcome {
+    let gripper = Gripper::insert(world, start);
+    let outcome = close(world, &gripper).map_or(Outcome::ClosedOnNothing, |()| lift(world, &gripper, start, grasp));
+    gripper.remove(world);
+    outcome
+}
+
+/// Closes until the width is still for 0.1 s, or 0.5 s at the longest. `None` if nothing is held then.
+fn close(world: &mut World, gripper: &Gripper) -> Option<()> {
+    const STILL: f64 = 1e-5;
+    let mut still_since = 0;
+    let mut width = gripper.width(world);
+    for step in 1..=STEPS_PER_SECOND / 2 {
+        gripper.close(world);
+        world.step();
+        let now = gripper.width(world);
+        if (now - width).abs() > STILL {
+            still_since = step;
+        } else if step - still_since >= STEPS_PER_SECOND / 10 {
+            break;
+        }
+        width = now;
+    }
+    holds(world, gripper).map(|_| ())
+}
+
+fn lift(world: &mut World, gripper: &Gripper, start: &Isometry3<f64>, grasp: &Isometry3<f64>) -> Outcome {
+    let target = grasp.translation.vector + retreat(grasp) * LIFT;
+    let path = target - start.translation.vector;
+    let direction = path.normalize();
+    let duration = path.norm() / LIFT_SPEED + LIFT_RAMP / 2.0;
+    let steps = (duration * f64::from(STEPS_PER_SECOND)).round() as u32;
+    for step in 1..=steps {
+        let ramp = (f64::from(step) / f64::from(STEPS_PER_SECOND) / LIFT_RAMP).min(1.0);
+        gripper.set_velocity(world, &(direction * LIFT_SPEED * ramp));
+        gripper.close(world);
+        world.step();
+        if step % (STEPS_PER_SECOND / 20) == 0 && holds(world, gripper).is_none() {
+            return Outcome::LostInLift;
+        }
+    }
+    match holds(world, gripper) {
+        Some(object) => Outcome::Lifted { object, width: gripper.width(world) },
+        None => Outcome::LostInLift,
+    }
+}
+
+fn holds(world: &World, gripper: &Gripper) -> Option<BodyId> {
+    gripper.held(world).filter(|_| gripper.width(world) > EMPTY_WIDTH)
+}
+
+/// Back along the approach, or straight up where the approach is more than 60° off straight down.
+fn retreat(grasp: &Isometry3<f64>) -> Vector3<f64> {
+    let approach = grasp.rotation * Vector3::z();
+    if approach.angle(&-Vector3::z()) > FRAC_PI_3 { Vector3::z() } else { -approach }
+}

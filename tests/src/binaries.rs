@@ -1,0 +1,47 @@
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::LazyLock;
+
+use serde_json::Value;
+
+/// Cargo builds a package's programs for that package's own tests alone, so these are built here, before the first
+/// test that runs one; after a `cargo build` there is nothing left to do.
+static BINARIES: LazyLock<HashMap<String, PathBuf>> = LazyLock::new(build);
+
+/// The server.
+///
+/// # Panics
+/// When it does not build.
+#[must_use]
+pub fn graspd() -> &'static Path {
+    &BINARIES["graspd"]
+}
+
+/// The command-line client.
+///
+/// # Panics
+/// When it does not build.
+#[must_use]
+pub fn grasp() -> &'static Path {
+    &BINARIES["grasp"]
+}
+
+fn build() -> HashMap<String, PathBuf> {
+    let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let mut command = Command::new(env!("CARGO"));
+    // From the workspace's root, as a relative CARGO_TARGET_DIR is meant.
+    command.current_dir(workspace).args(["build", "--bins", "--package", "graspd", "--package", "grasp-client"]);
+    command.args(["--locked", "--message-format", "json-render-diagnostics"]);
+    if !cfg!(debug_assertions) {
+        command.arg("--release");
+    }
+    let output = command.stderr(Stdio::inherit()).output().expect("cargo runs, for it runs this test");
+    assert!(output.status.success(), "the programs under test do not build");
+    let messages = output.stdout.split(|&byte| byte == b'\n').filter_map(|line| serde_json::from_slice(line).ok());
+    let executable = |message: Value| {
+        let path = message["executable"].as_str()?.into();
+        Some((message["target"]["name"].as_str()?.to_owned(), path))
+    };
+    messages.filter_map(executable).collect()
+}

@@ -1,0 +1,154 @@
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use grasp_models::onnx::{
+    AttributeProto, Dimension, GraphProto, ModelProto, NodeProto, OperatorSetIdProto, TensorProto, ValueInfoProto,
+};
+use grasp_models::{Metadata, ValueConvention};
+
+/// Voxels along an edge of what the test models read.
+pub const RESOLUTION: usize = 16;
+
+/// The width that they predict everywhere, voxels.
+pub const WIDTH: f32 = 5.0;
+
+/// Channels of the convolutions that make a model slow.
+const CHANNELS: i64 = 16;
+
+/// A network whose answer is known: the quality is the volume itself, every grasp is upright and [`WIDTH`] wide.
+///
+/// It has the signature of every grasp network, and runs in microseconds unless it is told to be slow.
+#[derive(Clone, Debug)]
+pub struct TestModel {
+    name: String,
+    version: String,
+    resolution: usize,
+    convolutions: usize,
+    rotation: [f32; 4],
+}
+
+impl TestModel {
+    /// Version 1, for volumes of [`RESOLUTION`]³.
+    #[must_use]
+    pub fn new(name: &str) -> Self {
+        Self {
+            name: name.to_owned(),
+            version: "1".to_owned(),
+            resolution: RESOLUTION,
+            convolutions: 0,
+            rotation: [0.0, 0.0, 0.0, 1.0],
+        }
+    }
+
+    /// Another version of it.
+    #[must_use]
+    pub fn version(self, version: &str) -> Self {
+        Self { version: version.to_owned(), ..self }
+    }
+
+    /// For other volumes.
+    #[must_use]
+    pub fn resolution(self, resolution: usize) -> Self {
+        Self { resolution, ..self }
+    }
+
+    /// Slows it by this many convolutions, of about 0.1 GFLOP each at [`RESOLUTION`], that change nothing.
+    #[must_use]
+    pub fn convolutions(self, convolutions: usize) -> Self {
+        Self { convolutions, ..self }
+    }
+
+    /// Its quaternions are 0: where it finds a grasp, its output is unusable.
+    #[must_use]
+    pub fn broken(self) -> Self {
+        Self { rotation: [0.0; 4], ..self }
+    }
+
+    /// Writes it into a folder.
+    ///
+    /// # Panics
+    /// When it cannot be written.
+    pub fn write(&self, folder: &Path) {
+        let path = folder.join(format!("{}-{}.onnx", self.name, self.version));
+        self.build().write(&path).expect("the temporary folder can be written");
+    }
+
+    fn build(&self) -> ModelProto {
+        let mut graph = GraphProto { name: Some(self.name.clone()), ..GraphProto::default() };
+        graph.input.push(self.tensor("tsdf", 1));
+        for (name, channels) in [("quality", 1), ("rotation", 4), ("width", 1)] {
+            graph.output.push(self.tensor(name, channels));
+        }
+
+        constant(&mut graph, "nought", 0.0);
+        node(&mut graph, "Mul", &["tsdf", "nought"], "zeros", vec![]);
+        for (index, component) in self.rotation.into_iter().enumerate() {
+            constant(&mut graph, &format!("component_{index}"), component);
+            node(&mut graph, "Add", &["zeros", &format!("component_{index}")], &format!("channel_{index}"), vec![]);
+        }
+        let channels = ["channel_0", "channel_1", "channel_2", "channel_3"];
+        node(&mut graph, "Concat", &channels, "rotation", vec![AttributeProto::int("axis", 1)]);
+        constant(&mut graph, "opening", WIDTH);
+        node(&mut graph, "Add", &["zeros", "opening"], "width", vec![]);
+
+        let mut delay = "zeros".to_owned();
+        for layer in 0..self.convolutions {
+            let inputs = if layer == 0 { 1 } else { CHANNELS };
+            delay = convolution(&mut graph, &delay, &format!("delay_{layer}"), inputs, CHANNELS);
+        }
+        if self.convolutions > 0 {
+            delay = convolution(&mut graph, &delay, "delay", CHANNELS, 1);
+        }
+        node(&mut graph, "Add", &["tsdf", &delay], "quality", vec![]);
+
+        let mut model = ModelProto {
+            ir_version: Some(8),
+            producer_name: Some("grasp-tests".to_owned()),
+            graph: Some(graph),
+            opset_import: vec![OperatorSetIdProto { domain: Some(String::new()), version: Some(17) }],
+            ..ModelProto::default()
+        };
+        let metadata = Metadata {
+            name: self.name.clone(),
+            version: self.version.clone(),
+            resolution: self.resolution,
+            voxel_size: grasp::WORKSPACE_SIZE / self.resolution as f64,
+            value_convention: ValueConvention::Vgn,
+            voxel_origin: grasp::VoxelOrigin::Corner,
+            provenance: BTreeMap::from([("data".to_owned(), "none".to_owned())]),
+        };
+        metadata.write_to(&mut model);
+        model
+    }
+
+    fn tensor(&self, name: &str, channels: i64) -> ValueInfoProto {
+        let edge = Dimension::size(self.resolution as i64);
+        let shape = vec![Dimension::named("batch"), Dimension::size(channels), edge.clone(), edge.clone(), edge];
+        ValueInfoProto::tensor(name, shape)
+    }
+}
+
+/// Weights of 0: all the work, and zeros out.
+fn convolution(graph: &mut GraphProto, input: &str, output: &str, inputs: i64, outputs: i64) -> String {
+    let weight = format!("{output}.weight");
+    let values = vec![0.0; (outputs * inputs * 125) as usize];
+    graph.initializer.push(TensorProto::from_f32(&weight, &[outputs, inputs, 5, 5, 5], &values));
+    let attributes = vec![AttributeProto::ints("kernel_shape", &[5; 3]), AttributeProto::ints("pads", &[2; 6])];
+    node(graph, "Conv", &[input, &weight], output, attributes);
+    output.to_owned()
+}
+
+fn constant(graph: &mut GraphProto, name: &str, value: f32) {
+    graph.initializer.push(TensorProto::from_f32(name, &[], &[value]));
+}
+
+fn node(graph: &mut GraphProto, op: &str, inputs: &[&str], output: &str, attribute: Vec<AttributeProto>) {
+    graph.node.push(NodeProto {
+        input: inputs.iter().map(|&input| input.to_owned()).collect(),
+        output: vec![output.to_owned()],
+        name: Some(output.to_owned()),
+        op_type: Some(op.to_owned()),
+        attribute,
+        domain: None,
+    });
+}

@@ -1,0 +1,243 @@
+//! Everything that can be wrong with a request gets its own clear status, and the connection goes on.
+
+use grasp::Volume;
+use grasp_proto::pb::{self, DataType};
+use grasp_proto::encode;
+use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
+use nalgebra::Isometry3;
+use tonic::Code;
+
+fn volume() -> Volume {
+    blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]])
+}
+
+fn request() -> pb::DetectGraspsRequest {
+    pb::DetectGraspsRequest { volume: Some(encode(&volume(), DataType::F32, "base")), ..Default::default() }
+}
+
+fn with_data(values: &[f32]) -> impl Fn(&mut pb::Volume) + use<> {
+    let data: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+    move |volume| volume.data = data.clone().into()
+}
+
+fn with_value(index: usize, value: f32) -> impl Fn(&mut pb::Volume) {
+    let mut values = volume().values().to_vec();
+    values[index] = value;
+    with_data(&values)
+}
+
+fn with_pose(position: [f64; 3], orientation: [f64; 4]) -> impl Fn(&mut pb::Volume) {
+    move |volume| {
+        let ([x, y, z], [qx, qy, qz, qw]) = (position, orientation);
+        let (position, orientation) = (pb::Vector3 { x, y, z }, pb::Quaternion { x: qx, y: qy, z: qz, w: qw });
+        volume.pose = Some(pb::Pose { position: Some(position), orientation: Some(orientation) });
+    }
+}
+
+/// A server and one connection to it.
+struct Case {
+    server: Server,
+    client: pb::grasp_service_client::GraspServiceClient<tonic::transport::Channel>,
+}
+
+impl Case {
+    async fn new() -> Self {
+        let server = Server::run(&[TestModel::new("mirror"), TestModel::new("second").resolution(24)], &[]);
+        let client = server.raw().await;
+        Self { server, client }
+    }
+
+    /// The request is refused with this code and message, and the next one on the same connection is answered.
+    async fn refused(&mut self, request: pb::DetectGraspsRequest, code: Code, message: &str) {
+        let status = self.client.detect_grasps(request).await.expect_err(message);
+        assert_eq!((status.code(), status.message()), (code, message));
+        self.still_answers().await;
+    }
+
+    async fn refused_volume(&mut self, change: impl Fn(&mut pb::Volume), message: &str) {
+        let mut request = request();
+        request.volume.as_mut().map(change);
+        self.refused(request, Code::InvalidArgument, message).await;
+    }
+
+    async fn still_answers(&mut self) {
+        let response = self.client.detect_grasps(request()).await.unwrap().into_inner();
+        assert_eq!(response.grasps.len(), 1);
+    }
+}
+
+#[tokio::test]
+async fn the_data_must_fit_the_resolution_and_the_dtype() {
+    let mut case = Case::new().await;
+    let length = |bytes: usize| {
+        format!(
+            "volume.data is {bytes} bytes, a resolution of 16 needs 16³ · 4 = 16384 (DATA_TYPE_F32)"
+        )
+    };
+    case.refused_volume(|v| v.data = vec![0; 16_383].into(), &length(16_383)).await;
+    case.refused_volume(|v| v.data = vec![0; 16_388].into(), &length(16_388)).await;
+    case.refused_volume(|v| v.data = vec![].into(), &length(0)).await;
+    for (dtype, value) in [(0, "0"), (4, "4"), (-1, "-1")] {
+        let message = format!("volume.dtype is {value}, must be 1 (f32), 2 (f16) or 3 (u8)");
+        case.refused_volume(|v| v.dtype = dtype, &message).await;
+    }
+}
+
+#[tokio::test]
+async fn the_resolution_must_be_one_that_a_model_takes() {
+    let mut case = Case::new().await;
+    let mut other = request();
+    other.volume = Some(encode(&blobs(20, Isometry3::identity(), &[[5, 5, 5]]), DataType::F32, ""));
+    let taken = "the models that could answer take 16 (mirror 1), 24 (second 1)";
+    case.refused(other.clone(), Code::InvalidArgument, &format!("volume.resolution is 20, {taken}")).await;
+    other.model = "mirror".to_owned();
+    let taken = "the models that could answer take 16 (mirror 1)";
+    case.refused(other, Code::InvalidArgument, &format!("volume.resolution is 20, {taken}")).await;
+    for resolution in [0, 257, u32::MAX] {
+        let message = format!("volume.resolution is {resolution}, must be from 1 to 256");
+        case.refused_volume(|v| v.resolution = resolution, &message).await;
+    }
+}
+
+#[tokio::test]
+async fn the_values_must_be_finite_and_between_0_and_1() {
+    let mut case = Case::new().await;
+    let finite = "every value must be finite";
+    case.refused_volume(with_value(77, f32::NAN), &format!("volume.data[77] is NaN, {finite}")).await;
+    case.refused_volume(with_value(0, f32::INFINITY), &format!("volume.data[0] is inf, {finite}")).await;
+    case.refused_volume(with_value(4095, f32::NEG_INFINITY), &format!("volume.data[4095] is -inf, {finite}")).await;
+    let range = "every value must lie in [0, 1] (0.5 = surface, 0 = unobserved)";
+    case.refused_volume(with_value(1, 1.5), &format!("volume.data[1] is 1.5, {range}")).await;
+    case.refused_volume(with_value(2, -0.25), &format!("volume.data[2] is -0.25, {range}")).await;
+    let empty = "volume.data is all zero: nothing was observed; check the camera's extrinsics and the workspace pose";
+    case.refused_volume(with_data(&[0.0; 4096]), empty).await;
+}
+
+#[tokio::test]
+async fn half_precision_is_checked_after_it_was_widened() {
+    let mut case = Case::new().await;
+    // 0x7e00 is NaN, 0x4000 is 2.
+    for (bits, message) in [(0x7e00_u16, "is NaN, every value must be finite"), (0x4000, "is 2, every value must lie")] {
+        let mut request = request();
+        let mut volume = encode(&volume(), DataType::F16, "");
+        let mut data = volume.data.to_vec();
+        data[1000..1002].copy_from_slice(&bits.to_le_bytes());
+        volume.data = data.into();
+        request.volume = Some(volume);
+        let status = case.client.detect_grasps(request).await.unwrap_err();
+        assert_eq!(status.code(), Code::InvalidArgument);
+        assert!(status.message().starts_with(&format!("volume.data[500] {message}")), "{}", status.message());
+    }
+    case.still_answers().await;
+}
+
+#[tokio::test]
+async fn the_voxel_size_must_be_the_models() {
+    let mut case = Case::new().await;
+    for size in [0.0, -0.0075, f64::NAN, f64::INFINITY] {
+        let message = format!("volume.voxel_size is {size}, must be a positive number of metres");
+        case.refused_volume(|v| v.voxel_size = size, &message).await;
+    }
+    let message = "volume.voxel_size is 18.75, the model mirror 1 takes 0.01875 m, to one in a thousand";
+    case.refused_volume(|v| v.voxel_size = 18.75, message).await;
+    for factor in [0.9985, 1.0015] {
+        let size = 0.01875 * factor;
+        let message = format!("volume.voxel_size is {size}, the model mirror 1 takes 0.01875 m, to one in a thousand");
+        case.refused_volume(|v| v.voxel_size = size, &message).await;
+    }
+    let mut request = request();
+    request.volume.as_mut().unwrap().voxel_size = 0.01875 * 1.0005;
+    assert!(case.client.detect_grasps(request).await.is_ok());
+}
+
+#[tokio::test]
+async fn the_pose_must_be_finite_with_a_unit_quaternion() {
+    let mut case = Case::new().await;
+    let unit = "must be of unit length to within 0.001";
+    case.refused_volume(
+        with_pose([0.0; 3], [0.0, 0.0, 0.0, 2.0]),
+        &format!("volume.pose.orientation is (x 0, y 0, z 0, w 2), of length 2, {unit}"),
+    )
+    .await;
+    case.refused_volume(
+        with_pose([0.0; 3], [0.0; 4]),
+        &format!("volume.pose.orientation is (x 0, y 0, z 0, w 0), of length 0, {unit}"),
+    )
+    .await;
+    case.refused_volume(
+        with_pose([0.0; 3], [f64::NAN, 0.0, 0.0, 1.0]),
+        &format!("volume.pose.orientation is (x NaN, y 0, z 0, w 1), of length NaN, {unit}"),
+    )
+    .await;
+    case.refused_volume(
+        with_pose([0.0, f64::INFINITY, 0.0], [0.0, 0.0, 0.0, 1.0]),
+        "volume.pose.position is (0, inf, 0), must be finite",
+    )
+    .await;
+    let half = |volume: &mut pb::Volume| volume.pose = Some(pb::Pose { position: Some(pb::Vector3::default()), orientation: None });
+    case.refused_volume(half, "volume.pose.orientation is absent, must be given").await;
+    let half = |volume: &mut pb::Volume| volume.pose = Some(pb::Pose::default());
+    case.refused_volume(half, "volume.pose.position is absent, must be given").await;
+
+    let mut request = request();
+    with_pose([0.0; 3], [0.0, 0.0, 0.0, 1.0009])(request.volume.as_mut().unwrap());
+    assert!(case.client.detect_grasps(request).await.is_ok(), "within the tolerance");
+}
+
+#[tokio::test]
+async fn the_model_and_its_version_must_be_loaded() {
+    let mut case = Case::new().await;
+    let there = "there is no such; there are mirror 1, second 1";
+    let ask = |model: &str, version: &str| pb::DetectGraspsRequest {
+        model: model.to_owned(),
+        version: version.to_owned(),
+        ..request()
+    };
+    case.refused(ask("vgn", ""), Code::NotFound, &format!("model is `vgn`, {there}")).await;
+    case.refused(ask("mirror", "2"), Code::NotFound, &format!("model is `mirror 2`, {there}")).await;
+    let message = "version is `1`, which needs a `model` that it is a version of";
+    case.refused(ask("", "1"), Code::InvalidArgument, message).await;
+}
+
+#[tokio::test]
+async fn the_parameters_must_be_in_range() {
+    let mut case = Case::new().await;
+    case.refused(Default::default(), Code::InvalidArgument, "volume is absent, must be given").await;
+    for value in [0.0, -0.5, 1.5, f32::NAN] {
+        let needed = format!("is {value}, must be above 0 and at most 1");
+        let bad = pb::DetectGraspsRequest { threshold: Some(value), ..request() };
+        case.refused(bad, Code::InvalidArgument, &format!("threshold {needed}")).await;
+        let bad = pb::DetectGraspsRequest { force: Some(value), ..request() };
+        case.refused(bad, Code::InvalidArgument, &format!("force {needed}")).await;
+    }
+    let bad = pb::DetectGraspsRequest { request_id: "x".repeat(257), ..request() };
+    case.refused(bad, Code::InvalidArgument, "request_id is 257 bytes long, at most 256 are taken").await;
+    case.refused_volume(|v| v.frame_id = "x".repeat(300), "volume.frame_id is 300 bytes long, at most 256 are taken").await;
+}
+
+#[tokio::test]
+async fn a_model_that_fails_on_a_volume_fails_that_request_alone() {
+    let server = Server::run(&[TestModel::new("broken").broken()], &[]);
+    let mut client = server.raw().await;
+    for _ in 0..3 {
+        let status = client.detect_grasps(request()).await.unwrap_err();
+        assert_eq!(status.code(), Code::Internal);
+        assert!(status.message().contains("`rotation`"), "{}", status.message());
+        // Nothing reaches this threshold, so no quaternion is looked at.
+        let empty = pb::DetectGraspsRequest { threshold: Some(1.0), ..request() };
+        assert!(client.detect_grasps(empty).await.unwrap().into_inner().grasps.is_empty());
+    }
+    assert_eq!(server.get("/readyz").0, 200);
+}
+
+#[tokio::test]
+async fn refusals_are_counted_by_their_code() {
+    let mut case = Case::new().await;
+    case.refused_volume(|v| v.voxel_size = 0.0, "volume.voxel_size is 0, must be a positive number of metres").await;
+    let unknown = pb::DetectGraspsRequest { model: "vgn".to_owned(), ..request() };
+    case.client.detect_grasps(unknown).await.unwrap_err();
+    let count = |code, model| case.server.metric(&format!("graspd_requests_total{{code=\"{code}\",model=\"{model}\"}}"));
+    assert_eq!(count("INVALID_ARGUMENT", "mirror 1"), 1.0);
+    assert_eq!(count("NOT_FOUND", ""), 1.0);
+    assert_eq!(count("OK", "mirror 1"), 1.0);
+}

@@ -1,0 +1,201 @@
+//! What a valid request is answered with.
+
+use std::time::{Duration, SystemTime};
+
+use grasp::{DecodeParams, Grasp, Volume};
+use grasp_client::{DataType, Dropped, Options};
+use grasp_tests::{RESOLUTION, Server, TestModel, blobs, expected};
+use nalgebra::{Isometry3, Vector3};
+use tokio_stream::StreamExt;
+
+const CENTRES: [[usize; 3]; 2] = [[4, 5, 6], [11, 10, 9]];
+
+fn volume() -> Volume {
+    blobs(RESOLUTION, Isometry3::identity(), &CENTRES)
+}
+
+fn voxels(dropped: &Dropped) -> usize {
+    let Dropped { below_threshold, mask, width, border, suppressed, over_limit } = *dropped;
+    (below_threshold + mask + width + border + suppressed + over_limit) as usize
+}
+
+fn assert_same(got: &[Grasp], wanted: &[Grasp]) {
+    assert_eq!(got.len(), wanted.len());
+    for (got, wanted) in got.iter().zip(wanted) {
+        assert!((got.pose.translation.vector - wanted.pose.translation.vector).norm() < 1e-12, "{got:?} {wanted:?}");
+        assert!(got.pose.rotation.angle_to(&wanted.pose.rotation) < 1e-7, "{got:?} {wanted:?}");
+        assert_eq!((got.width, got.quality), (wanted.width, wanted.quality));
+    }
+}
+
+#[tokio::test]
+async fn the_answer_is_the_decoded_output_of_the_network() {
+    let server = Server::run(&[TestModel::new("mirror").version("3")], &[]);
+    let detection = server.client().await.detect(&volume(), Options::default()).await.unwrap();
+    let wanted = expected(&volume(), &DecodeParams::default());
+    assert_eq!(wanted.grasps.len(), CENTRES.len());
+    assert_same(&detection.grasps, &wanted.grasps);
+    assert_eq!((detection.model.as_str(), detection.version.as_str()), ("mirror", "3"));
+    assert_eq!(detection.dropped, None, "it was not asked for");
+}
+
+#[tokio::test]
+async fn every_dtype_gives_the_same_grasps() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let client = server.client().await;
+    let detect = async |dtype| client.detect(&volume(), Options { dtype, ..Options::default() }).await;
+    let f32 = detect(DataType::F32).await.unwrap().grasps;
+    let f16 = detect(DataType::F16).await.unwrap().grasps;
+    let u8 = detect(DataType::U8).await.unwrap().grasps;
+    assert_same(&f32, &u8);
+    assert_eq!(f32.len(), f16.len());
+    for (wide, half) in f32.iter().zip(&f16) {
+        assert_eq!((wide.pose, wide.width), (half.pose, half.width));
+        assert!((wide.quality - half.quality).abs() < 1e-3);
+    }
+}
+
+#[tokio::test]
+async fn grasps_are_in_the_frame_of_the_volumes_pose() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let client = server.client().await;
+    let pose = Isometry3::new(Vector3::new(0.4, -0.2, 1.1), Vector3::new(0.3, -0.8, 2.0));
+    let placed = blobs(RESOLUTION, pose, &CENTRES);
+    let at_origin = client.detect(&volume(), Options::default()).await.unwrap().grasps;
+    let options = Options { frame_id: "panda_link0".to_owned(), ..Options::default() };
+    let detection = client.detect(&placed, options).await.unwrap();
+    let moved: Vec<_> = at_origin.iter().map(|grasp| Grasp { pose: pose * grasp.pose, ..*grasp }).collect();
+    assert_same(&detection.grasps, &moved);
+    assert_eq!(detection.frame_id, "panda_link0");
+}
+
+#[tokio::test]
+async fn every_voxel_is_explained_once() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let client = server.client().await;
+    for threshold in [0.3, 0.7, 0.9, 1.0] {
+        for max_grasps in [0, 1] {
+            let options = Options { threshold: Some(threshold), max_grasps, explain: true, ..Options::default() };
+            let detection = client.detect(&volume(), options).await.unwrap();
+            let dropped = detection.dropped.expect("it was asked for");
+            assert_eq!(voxels(&dropped) + detection.grasps.len(), RESOLUTION.pow(3), "{dropped:?}");
+            let wanted = expected(&volume(), &DecodeParams { threshold, ..DecodeParams::default() });
+            let sent = if max_grasps == 0 { wanted.grasps.len() } else { 1.min(wanted.grasps.len()) };
+            assert_eq!(detection.grasps.len(), sent);
+            assert_eq!(dropped.over_limit as usize, wanted.grasps.len() - sent);
+            assert_eq!(dropped.suppressed as usize, wanted.dropped.suppressed);
+        }
+    }
+}
+
+#[tokio::test]
+async fn an_empty_answer_is_always_explained() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let options = Options { threshold: Some(1.0), ..Options::default() };
+    let detection = server.client().await.detect(&volume(), options).await.unwrap();
+    assert!(detection.grasps.is_empty());
+    assert_eq!(voxels(&detection.dropped.expect("no grasp needs a reason")), RESOLUTION.pow(3));
+}
+
+#[tokio::test]
+async fn force_gives_the_best_grasp_alone() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let options = Options { threshold: Some(1.0), force: Some(0.5), ..Options::default() };
+    let detection = server.client().await.detect(&volume(), options).await.unwrap();
+    let best = expected(&volume(), &DecodeParams::default()).grasps[0];
+    assert_same(&detection.grasps, &[best]);
+}
+
+#[tokio::test]
+async fn what_names_a_request_comes_back() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let client = server.client().await;
+    let stamp = SystemTime::UNIX_EPOCH + Duration::new(1_700_000_000, 123_456_789);
+    let options = Options { request_id: "pick 7".to_owned(), stamp: Some(stamp), ..Options::default() };
+    let named = client.detect(&volume(), options).await.unwrap();
+    assert_eq!((named.request_id.as_str(), named.stamp), ("pick 7", Some(stamp)));
+
+    let first = client.detect(&volume(), Options::default()).await.unwrap();
+    let second = client.detect(&volume(), Options::default()).await.unwrap();
+    assert!(!first.request_id.is_empty());
+    assert_ne!(first.request_id, second.request_id);
+    assert_eq!(first.stamp, None);
+}
+
+#[tokio::test]
+async fn the_stages_of_the_latency_add_up() {
+    let server = Server::run(&[TestModel::new("mirror").convolutions(2)], &[]);
+    let latency = server.client().await.detect(&volume(), Options::default()).await.unwrap().latency;
+    let stages = [latency.queue, latency.preprocessing, latency.inference, latency.postprocessing];
+    assert!(stages.iter().all(|&stage| stage > 0.0), "{latency:?}");
+    assert!(stages.iter().sum::<f64>() <= latency.total, "{latency:?}");
+}
+
+#[tokio::test]
+async fn a_stream_answers_in_order_and_survives_bad_volumes() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let requests: Vec<_> = (0..50)
+        .map(|index| {
+            let model = if index % 5 == 3 { "nobody" } else { "" }.to_owned();
+            (volume(), Options { request_id: format!("volume {index}"), model, ..Options::default() })
+        })
+        .collect();
+    let replies = server.client().await.detect_stream(tokio_stream::iter(requests)).await.unwrap();
+    let replies: Vec<_> = replies.collect().await;
+    assert_eq!(replies.len(), 50);
+    for (index, reply) in replies.into_iter().enumerate() {
+        match reply {
+            Ok(detection) => {
+                assert_eq!(detection.request_id, format!("volume {index}"));
+                assert_eq!(detection.grasps.len(), CENTRES.len());
+            }
+            Err(error) => {
+                assert_eq!(index % 5, 3, "{error}");
+                assert_eq!(error.code(), Some(tonic::Code::NotFound));
+            }
+        }
+    }
+}
+
+#[tokio::test]
+async fn the_model_is_the_one_asked_for_or_the_first_that_fits() {
+    let models = [
+        TestModel::new("large").resolution(24),
+        TestModel::new("mirror").version("1.9"),
+        TestModel::new("mirror").version("1.10"),
+        TestModel::new("small"),
+    ];
+    let server = Server::run(&models, &["--default-model", "small"]);
+    let client = server.client().await;
+    let listed = client.list_models().await.unwrap();
+    let listed: Vec<_> = listed.iter().map(|model| format!("{} {}", model.name, model.version)).collect();
+    assert_eq!(listed, ["small 1", "large 1", "mirror 1.10", "mirror 1.9"]);
+
+    let large = blobs(24, Isometry3::identity(), &CENTRES);
+    for (volume, model, version, wanted) in [
+        (&volume(), "", "", "small 1"),
+        (&large, "", "", "large 1"),
+        (&volume(), "mirror", "", "mirror 1.10"),
+        (&volume(), "mirror", "1.9", "mirror 1.9"),
+    ] {
+        let options = Options { model: model.to_owned(), version: version.to_owned(), ..Options::default() };
+        let detection = client.detect(volume, options).await.unwrap();
+        assert_eq!(format!("{} {}", detection.model, detection.version), wanted);
+    }
+}
+
+#[tokio::test]
+async fn a_reply_larger_than_http2s_windows_comes_whole() {
+    // One grasp for each 8th voxel of an edge: some 4000 of them, 400 kB.
+    let resolution = 64;
+    let server = Server::run(&[TestModel::new("mirror").resolution(resolution)], &[]);
+    let centres: Vec<_> = (3..61)
+        .step_by(6)
+        .flat_map(|x| (3..61).step_by(6).flat_map(move |y| (3..61).step_by(6).map(move |z| [x, y, z])))
+        .collect();
+    let volume = blobs(resolution, Isometry3::identity(), &centres);
+    let wanted = expected(&volume, &DecodeParams::default());
+    assert!(wanted.grasps.len() * 80 > 65_536, "{} grasps", wanted.grasps.len());
+    let detection = server.client().await.detect(&volume, Options::default()).await.unwrap();
+    assert_same(&detection.grasps, &wanted.grasps);
+}

@@ -1,0 +1,130 @@
+//! How the server ends.
+
+use std::process::Command;
+
+use grasp::Volume;
+use grasp_client::{Client, Options};
+use grasp_tests::{RESOLUTION, Server, TestModel, blobs, graspd};
+use nalgebra::Isometry3;
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+use tokio_stream::StreamExt;
+use tokio_stream::wrappers::ReceiverStream;
+
+fn volume() -> Volume {
+    blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]])
+}
+
+fn slow() -> TestModel {
+    TestModel::new("slow").convolutions(60)
+}
+
+#[tokio::test]
+async fn an_idle_server_exits_with_0() {
+    for workers in ["1", "3"] {
+        let server = Server::run(&[TestModel::new("mirror")], &["--workers", workers]);
+        let client = server.client().await;
+        client.detect(&volume(), Options::default()).await.unwrap();
+        // The connection is still open.
+        assert_eq!(stop(server).await, Some(0));
+        assert!(client.detect(&volume(), Options::default()).await.is_err());
+    }
+}
+
+#[tokio::test]
+async fn what_was_taken_is_answered() {
+    let mut server = Server::run(&[slow()], &["--queue", "8"]);
+    let client = server.client().await;
+    let mut calls = JoinSet::new();
+    for _ in 0..4 {
+        let client = client.clone();
+        calls.spawn(async move { client.detect(&volume(), Options::default()).await });
+    }
+    server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 3.0).await;
+    server.terminate().unwrap();
+    for outcome in calls.join_all().await {
+        assert_eq!(outcome.unwrap().grasps.len(), 1);
+    }
+    assert!(Client::connect(server.grpc().to_string()).await.is_err(), "nothing more is taken");
+    assert_eq!(server.wait().unwrap().code(), Some(0));
+}
+
+#[tokio::test]
+async fn a_stream_is_answered_as_far_as_it_was_read_and_ended() {
+    let mut server = Server::run(&[TestModel::new("mirror")], &[]);
+    let (send, requests) = mpsc::channel(1);
+    send.send((volume(), Options::default())).await.unwrap();
+    let mut replies = server.client().await.detect_stream(ReceiverStream::new(requests)).await.unwrap();
+    assert_eq!(replies.next().await.unwrap().unwrap().grasps.len(), 1);
+    server.terminate().unwrap();
+    // The client would go on sending; it is the server that ends the stream, without an error.
+    assert!(replies.next().await.is_none());
+    assert_eq!(server.wait().unwrap().code(), Some(0));
+    drop(send);
+}
+
+#[tokio::test]
+async fn after_the_drain_timeout_callers_are_told_and_the_exit_is_still_0() {
+    let mut server = Server::run(&[slow()], &["--queue", "8", "--drain-timeout", "0"]);
+    let client = server.client().await;
+    let mut calls = JoinSet::new();
+    for _ in 0..4 {
+        let client = client.clone();
+        calls.spawn(async move { client.detect(&volume(), Options::default()).await });
+    }
+    server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 3.0).await;
+    server.terminate().unwrap();
+    for outcome in calls.join_all().await {
+        outcome.expect_err("there was no time to answer");
+    }
+    assert_eq!(server.wait().unwrap().code(), Some(0));
+}
+
+#[tokio::test]
+async fn a_server_that_is_still_warming_up_exits_with_0() {
+    let server = Server::start(&[slow()], &[]);
+    assert_eq!(stop(server).await, Some(0));
+}
+
+#[test]
+fn every_mistake_in_the_configuration_is_reported_in_one_run() {
+    let output = Command::new(graspd())
+        .args(["--listen", "nowhere", "--workers", "0", "--drain-timeout", "-1", "--models", "/no/such/folder"])
+        .env("GRASPD_QUEUE", "many")
+        .env("GRASPD_LOG", "a=b=c")
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(2));
+    let text = String::from_utf8(output.stderr).unwrap();
+    for mistake in [
+        "--listen (GRASPD_LISTEN) is `nowhere`",
+        "--workers (GRASPD_WORKERS) is `0`",
+        "--drain-timeout (GRASPD_DRAIN_TIMEOUT) is `-1`",
+        "--models (GRASPD_MODELS) /no/such/folder: No such file",
+        "--queue (GRASPD_QUEUE) is `many`",
+        "--log (GRASPD_LOG) is `a=b=c`",
+    ] {
+        assert!(text.contains(mistake), "`{mistake}` is not in:\n{text}");
+    }
+    assert!(output.stdout.is_empty(), "nothing was bound");
+}
+
+#[test]
+fn an_address_that_is_taken_is_named() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let taken = server.grpc().to_string();
+    let output = Command::new(graspd())
+        .args(["--models".as_ref(), server.models().as_os_str()])
+        .args(["--listen", &taken, "--http", "127.0.0.1:0"])
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert!(text.contains(&format!("cannot listen on --listen {taken}")), "{text}");
+}
+
+/// The exit status after SIGTERM.
+async fn stop(mut server: Server) -> Option<i32> {
+    server.terminate().unwrap();
+    tokio::task::spawn_blocking(move || server.wait().unwrap().code()).await.unwrap()
+}

@@ -1,0 +1,96 @@
+//! More requests than can be answered.
+
+use grasp::Volume;
+use grasp_client::{Error, Options};
+use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
+use nalgebra::Isometry3;
+use tokio::task::JoinSet;
+use tokio_stream::StreamExt;
+use tonic::Code;
+
+fn volume() -> Volume {
+    blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]])
+}
+
+fn slow() -> TestModel {
+    TestModel::new("slow").convolutions(60)
+}
+
+#[tokio::test]
+async fn what_does_not_fit_the_queue_is_refused_at_once_and_the_rest_is_answered() {
+    let server = Server::run(&[slow()], &["--queue", "2"]);
+    let client = server.client().await;
+    let mut calls = JoinSet::new();
+    for _ in 0..40 {
+        let client = client.clone();
+        calls.spawn(async move { client.detect(&volume(), Options::default()).await });
+    }
+    let mut outcomes = Vec::new();
+    while let Some(outcome) = calls.join_next().await {
+        outcomes.push(outcome.unwrap());
+    }
+    assert_eq!(outcomes.len(), 40);
+    for outcome in &outcomes {
+        match outcome {
+            Ok(detection) => assert_eq!(detection.grasps.len(), 1),
+            Err(Error::Refused { code, message, retry_after }) => {
+                assert_eq!(*code, Code::ResourceExhausted, "{message}");
+                assert!(message.starts_with("the model `slow` has 2 requests waiting"), "{message}");
+                assert!(!retry_after.expect("a hint").is_zero());
+            }
+            Err(error) => panic!("{error}"),
+        }
+    }
+    let refused = outcomes.iter().filter(|outcome| outcome.is_err()).count();
+    assert!(refused > 0 && refused < 40, "{refused} of 40 refused");
+    assert!(outcomes[0].is_err(), "a refusal is told before the first answer is there");
+    assert_eq!(server.metric("graspd_requests_total{code=\"RESOURCE_EXHAUSTED\",model=\"slow 1\"}"), refused as f64);
+    assert_eq!(server.metric("graspd_requests_total{code=\"OK\",model=\"slow 1\"}"), (40 - refused) as f64);
+    assert_eq!(server.metric("graspd_queue_requests{model=\"slow 1\"}"), 0.0);
+}
+
+#[tokio::test]
+async fn a_stream_alone_is_never_refused() {
+    let server = Server::run(&[TestModel::new("mirror").convolutions(2)], &["--queue", "1"]);
+    let volumes = tokio_stream::iter((0..100).map(|_| (volume(), Options::default())));
+    let mut replies = server.client().await.detect_stream(volumes).await.unwrap();
+    let mut answered = 0;
+    while let Some(reply) = replies.next().await {
+        assert_eq!(reply.unwrap().grasps.len(), 1);
+        answered += 1;
+    }
+    assert_eq!(answered, 100);
+}
+
+#[tokio::test]
+async fn callers_that_have_gone_are_skipped_and_counted() {
+    let server = Server::run(&[slow()], &["--queue", "8"]);
+    let client = server.client().await;
+    let mut calls = JoinSet::new();
+    for _ in 0..5 {
+        let client = client.clone();
+        calls.spawn(async move { client.detect(&volume(), Options::default()).await });
+    }
+    server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 4.0).await;
+    calls.shutdown().await;
+    server.wait_for("graspd_requests_total{code=\"CANCELLED\",model=\"slow 1\"}", 5.0).await;
+    // The one that follows waits for the one that runs, and for none of the four that were queued.
+    let detection = client.detect(&volume(), Options::default()).await.unwrap();
+    assert!(detection.latency.queue < 2.0 * detection.latency.inference, "{:?}", detection.latency);
+}
+
+#[tokio::test]
+async fn every_worker_has_its_own_session() {
+    let server = Server::run(&[slow()], &["--queue", "8", "--workers", "2"]);
+    let client = server.client().await;
+    let mut calls = JoinSet::new();
+    for _ in 0..4 {
+        let client = client.clone();
+        calls.spawn(async move { client.detect(&volume(), Options::default()).await });
+    }
+    // Two of the four wait, so the other two run.
+    server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 2.0).await;
+    for outcome in calls.join_all().await {
+        assert_eq!(outcome.unwrap().grasps.len(), 1);
+    }
+}
