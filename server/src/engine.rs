@@ -1,7 +1,7 @@
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
@@ -11,7 +11,7 @@ use grasp_models::{Entry, LoadError, Network, Options, RuntimeError};
 use nalgebra::Isometry3;
 use prometheus::IntGauge;
 use thiserror::Error;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 use tracing::{Span, error, info};
 
 use crate::refusal::Refusal;
@@ -22,6 +22,9 @@ pub(crate) struct Engine {
     /// `name version`, as the log and the metrics have it.
     pub label: String,
     queue: SyncSender<Job>,
+    /// One for each request that may run or wait. Counting the queue alone would refuse a request for which a session
+    /// is free but has not woken up yet.
+    places: Arc<Semaphore>,
     capacity: usize,
     waiting: IntGauge,
     pace: Arc<Pace>,
@@ -52,6 +55,8 @@ pub(crate) enum EngineError {
     Decode(#[from] DecodeError),
     #[error("the session panicked: {0}")]
     Panic(String),
+    #[error("the session is gone")]
+    Gone,
 }
 
 pub(crate) type Reply = oneshot::Receiver<Result<Answer, EngineError>>;
@@ -61,6 +66,7 @@ struct Job {
     params: DecodeParams,
     span: Span,
     submitted: Instant,
+    place: OwnedSemaphorePermit,
     reply: oneshot::Sender<Result<Answer, EngineError>>,
 }
 
@@ -80,7 +86,9 @@ impl Engine {
         let label = format!("{} {}", entry.metadata.name, entry.metadata.version);
         let waiting = waiting(&label);
         let pace = Arc::new(Pace(AtomicU64::new(0)));
-        let (queue, jobs) = sync_channel(capacity);
+        let places = capacity + workers;
+        let (queue, jobs) = sync_channel(places);
+        let places = Arc::new(Semaphore::new(places));
         let jobs = Arc::new(Mutex::new(jobs));
         for worker in 0..workers {
             let session = Session {
@@ -92,25 +100,24 @@ impl Engine {
             sessions.spawn(format!("{} {worker}", entry.metadata.name), session);
         }
         info!(model = label, sha256 = entry.sha256, workers, threads, "loaded");
-        Ok(Self { entry, label, queue, capacity, waiting, pace })
+        Ok(Self { entry, label, queue, places, capacity, waiting, pace })
     }
 
     /// Queues a volume, or refuses at once. A caller that drops the reply has gone: its job is skipped.
     pub fn submit(&self, volume: Volume, params: DecodeParams, span: Span) -> Result<Reply, Refusal> {
+        let place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| Refusal::Overloaded {
+            model: self.entry.metadata.name.clone(),
+            waiting: self.capacity,
+            retry_after: self.pace.get(),
+        })?;
         let (reply, answer) = oneshot::channel();
-        let job = Job { volume, params, span, submitted: Instant::now(), reply };
         // Before the session can take it, or the gauge could fall below 0.
         self.waiting.inc();
-        self.queue.try_send(job).map_err(|refused| {
+        let job = Job { volume, params, span, submitted: Instant::now(), place, reply };
+        self.queue.try_send(job).map_err(|_| {
+            // Who has a place has room in the queue, so the sessions are gone.
             self.waiting.dec();
-            match refused {
-                TrySendError::Full(_) => Refusal::Overloaded {
-                    model: self.entry.metadata.name.clone(),
-                    waiting: self.capacity,
-                    retry_after: self.pace.get(),
-                },
-                TrySendError::Disconnected(_) => EngineError::Panic("it is gone".to_owned()).into(),
-            }
+            EngineError::Gone
         })?;
         Ok(answer)
     }
@@ -161,13 +168,15 @@ impl Session {
         // Nobody to report to: the server is stopping already, and the queue says so next.
         let _ = report.blocking_send(self.warm_up());
         while let Some(job) = self.next() {
-            let Job { volume, params, span, submitted, reply } = job;
+            let Job { volume, params, span, submitted, place, reply } = job;
             if reply.is_closed() {
                 continue;
             }
             let queue = submitted.elapsed();
             let answer = span.in_scope(|| self.answer(&volume, &params, queue));
-            // The caller may have gone meanwhile; that is theirs to count.
+            // First the place, so that whoever got this answer finds room for the next request.
+            drop(place);
+            // The caller may have gone meanwhile, which is counted on their side.
             let _ = reply.send(answer);
         }
     }

@@ -163,7 +163,7 @@ impl Call {
 
     async fn reply(&mut self, work: Work) -> Result<pb::DetectGraspsResponse, Refusal> {
         // A session that is gone drops what it had: that is told, too.
-        let answer = work.reply.await.unwrap_or_else(|_| Err(EngineError::Panic("it is gone".to_owned())))?;
+        let answer = work.reply.await.unwrap_or(Err(EngineError::Gone))?;
         let Answer { decoded, queue, inference, postprocessing } = answer;
 
         let sent = decoded.grasps.len().min(work.max_grasps);

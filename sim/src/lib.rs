@@ -4,6 +4,7 @@
 //! The task frame: origin at a corner of the 0.3 m workspace cube, z up, the table's top at [`TABLE_HEIGHT`].
 
 pub mod camera;
+pub mod dataset;
 pub mod label;
 pub mod mesh;
 pub mod objects;

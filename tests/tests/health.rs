@@ -3,6 +3,7 @@
 use grasp_client::{Health, Options};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
 use nalgebra::Isometry3;
+use tokio::task::JoinSet;
 use tokio_stream::StreamExt;
 use tonic::Code;
 use tonic::transport::Channel;
@@ -73,22 +74,20 @@ async fn a_service_that_there_is_not_is_unknown() {
 
 #[tokio::test]
 async fn while_it_drains_it_says_so() {
-    let mut server = Server::run(&[TestModel::new("slow").convolutions(600)], &[]);
+    let mut server = Server::run(&[TestModel::new("slow").convolutions(200)], &[]);
     let client = server.client().await;
-    let call = tokio::spawn({
+    let mut calls = JoinSet::new();
+    for _ in 0..2 {
         let client = client.clone();
         let volume = blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]]);
-        async move { client.detect(&volume, Options::default()).await }
-    });
+        calls.spawn(async move { client.detect(&volume, Options::default()).await });
+    }
     let mut watch = HealthClient::new(server.channel().await).watch(ask("")).await.unwrap().into_inner();
     assert_eq!(watch.next().await.unwrap().unwrap().status(), ServingStatus::Serving);
-    // Once the request is through the queue it is being answered.
-    while !call.is_finished() && server.metric("graspd_queue_requests{model=\"slow 1\"}") != 0.0 {
-        tokio::task::yield_now().await;
-    }
+    server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 1.0).await;
     server.terminate().unwrap();
     assert_eq!(watch.next().await.unwrap().unwrap().status(), ServingStatus::NotServing);
     assert_eq!(server.get("/readyz"), (503, "draining\n".to_owned()));
-    call.await.unwrap().unwrap();
+    assert!(calls.join_all().await.iter().all(Result::is_ok));
     assert_eq!(server.wait().unwrap().code(), Some(0));
 }

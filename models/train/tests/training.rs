@@ -1,0 +1,183 @@
+//! Runs of training, small enough to watch.
+
+mod support;
+
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use grasp::VoxelOrigin;
+use grasp_models::Architecture;
+use grasp_train::{
+    Augmentation, Checkpoint, CheckpointError, Dataset, Epoch, Execution, Outputs, Record, Settings, Targets, Trainer,
+};
+use nalgebra::UnitQuaternion;
+use tch::{Device, Tensor};
+
+const N: usize = 16;
+const EXECUTION: Execution = Execution { device: Device::Cpu, bf16: false, channels_last: true };
+
+fn settings() -> Settings {
+    Settings {
+        epochs: 3,
+        batch: 3,
+        learning_rate: 3e-3,
+        warmup: 0,
+        cosine: false,
+        seed: 5,
+        validation: 0.0,
+        augmentation: Augmentation::default(),
+        balance: false,
+        voxel_origin: VoxelOrigin::Center,
+        bf16: false,
+    }
+}
+
+fn trainer<'a>(dataset: &'a Dataset, settings: &Settings, execution: Execution) -> Trainer<'a> {
+    let model = Architecture::Vgn.build(N, 0).unwrap();
+    Trainer::new(model, dataset, settings.clone(), execution).unwrap()
+}
+
+fn epoch(trainer: &mut Trainer) -> Record {
+    match trainer.epoch(&AtomicBool::new(false), |_, _| {}).unwrap() {
+        Epoch::Done(record) => record,
+        Epoch::Interrupted => panic!("nobody interrupted"),
+    }
+}
+
+#[test]
+fn eight_scenes_are_learnt_by_heart() {
+    let dataset = support::dataset(8, N);
+    for bf16 in [false, true] {
+        let settings = Settings { batch: 8, ..settings() };
+        let mut trainer = trainer(&dataset, &settings, Execution { bf16, ..EXECUTION });
+        let first = epoch(&mut trainer);
+        let last = (0..250).map(|_| epoch(&mut trainer)).last().unwrap();
+        println!("bf16 {bf16}: loss {:.4} → {:.5}", first.loss, last.loss);
+        assert!(first.loss > 0.5, "{first:?}");
+        assert!(last.loss < 0.02, "{last:?}");
+    }
+}
+
+#[test]
+fn a_resumed_run_is_the_uninterrupted_run() {
+    let dataset = support::dataset(8, N);
+    let augmentation = Augmentation { turns: true, mirror: true, shift: 1 };
+    let settings = Settings { augmentation, validation: 0.5, cosine: true, warmup: 2, ..settings() };
+    let mut whole = trainer(&dataset, &settings, EXECUTION);
+    assert!(whole.scenes().1 > 0, "some are held out");
+    let records: Vec<_> = (0..3).map(|_| epoch(&mut whole)).collect();
+
+    // Interrupted after the first batch of the second epoch, and written to a file.
+    let mut part = trainer(&dataset, &settings, EXECUTION);
+    epoch(&mut part);
+    let stop = AtomicBool::new(false);
+    let ended = part.epoch(&stop, |_, _| stop.store(true, Ordering::Relaxed)).unwrap();
+    assert_eq!(ended, Epoch::Interrupted);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run.state");
+    part.checkpoint().write(&path).unwrap();
+    drop(part);
+
+    let mut resumed = trainer(&dataset, &settings, EXECUTION);
+    resumed.resume(&Checkpoint::read(&path).unwrap()).unwrap();
+    assert_eq!((resumed.epochs(), resumed.steps()), (1, whole.steps_per_epoch() + 1));
+    for expected in &records[1..] {
+        let got = epoch(&mut resumed);
+        let comparable = |record: &Record| Record { seconds: 0.0, volumes_per_second: 0.0, ..record.clone() };
+        assert_eq!(comparable(&got), comparable(expected));
+    }
+    assert_eq!(resumed.model(), whole.model(), "to the last bit");
+}
+
+#[test]
+fn a_checkpoint_of_another_run_is_refused() {
+    let dataset = support::dataset(4, N);
+    let checkpoint = trainer(&dataset, &settings(), EXECUTION).checkpoint();
+    let mut other = trainer(&dataset, &Settings { seed: 6, ..settings() }, EXECUTION);
+    assert!(matches!(other.resume(&checkpoint), Err(CheckpointError::Settings { .. })));
+    let mut longer = trainer(&dataset, &Settings { epochs: 9, ..settings() }, EXECUTION);
+    assert!(longer.resume(&checkpoint).is_ok(), "a run at a constant learning rate may be made longer");
+    let model = Architecture::TransformerSmall.build(N, 0).unwrap();
+    let mut other = Trainer::new(model, &dataset, settings(), EXECUTION).unwrap();
+    assert!(matches!(other.resume(&checkpoint), Err(CheckpointError::Weights(_))));
+}
+
+#[test]
+fn a_run_without_scenes_is_refused() {
+    let empty = Dataset { resolution: N, scenes: vec![] };
+    let model = Architecture::Vgn.build(N, 0).unwrap();
+    let error = Trainer::new(model, &empty, settings(), EXECUTION).err().unwrap();
+    assert!(error.to_string().contains("nothing to learn from"), "{error}");
+}
+
+/// Outputs with the same values in every voxel of two volumes of 2³.
+fn outputs(quality: f32, rotation: [f32; 4], width: f32) -> Outputs {
+    let fill = |values: &[f32]| {
+        let channels = values.len() as i64;
+        (Tensor::from_slice(values).reshape([1, channels, 1, 1, 1])
+            * Tensor::ones([2, 1, 2, 2, 2], (tch::Kind::Float, Device::Cpu)))
+        .contiguous()
+    };
+    Outputs { quality: fill(&[quality]), rotation: fill(&rotation), width: fill(&[width]) }
+}
+
+#[test]
+fn the_loss_is_the_papers() {
+    let n = 2;
+    let label = grasp_train::Label {
+        position: nalgebra::Point3::new(1.2, 0.7, 1.9),
+        rotation: UnitQuaternion::from_euler_angles(0.3, -0.8, 1.1),
+        width: 4.0,
+        success: true,
+    };
+    let mut targets = Targets::default();
+    targets.push(1, &label, n, VoxelOrigin::Center);
+    targets.push(0, &grasp_train::Label { success: false, ..label }, n, VoxelOrigin::Center);
+    assert_eq!(targets.len(), 2);
+
+    // The same rotation, turned by 180° about the approach, with either sign, costs nothing.
+    let half_turn = UnitQuaternion::from_axis_angle(&nalgebra::Vector3::z_axis(), std::f64::consts::PI);
+    for rotation in [label.rotation, label.rotation * half_turn] {
+        for sign in [1.0, -1.0] {
+            let rotation: [f32; 4] = (rotation.coords * sign).map(|c| c as f32).into();
+            let loss = targets.loss(&outputs(0.8, rotation, 6.0), [1.0, 1.0]).unwrap();
+            // −ln 0.8 for the success, −ln 0.2 for the failure; 0.01 · 2² for the width.
+            let expected = (-(0.8_f64.ln()) - 0.2_f64.ln() + 0.01 * 4.0) / 2.0;
+            assert!((loss.mean.double_value(&[]) - expected).abs() < 1e-5);
+            assert!((loss.sums.loss() - expected).abs() < 1e-5);
+            assert_eq!((loss.sums.accuracy(), loss.sums.precision(), loss.sums.recall()), (0.5, 0.5, 1.0));
+        }
+    }
+    let quarter = UnitQuaternion::from_axis_angle(&nalgebra::Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
+    let rotation: [f32; 4] = (label.rotation * quarter).coords.map(|c| c as f32).into();
+    let loss = targets.loss(&outputs(0.8, rotation, 4.0), [1.0, 3.0]).unwrap();
+    assert!((loss.sums.rotation - (1.0 - 0.5_f64.sqrt())).abs() < 1e-5, "a quarter turn is the worst about z");
+    assert!((loss.sums.quality - (-3.0 * 0.8_f64.ln() - 0.2_f64.ln())).abs() < 1e-5, "classes are weighted");
+}
+
+#[test]
+fn only_the_labelled_voxel_learns() {
+    for (origin, voxel) in [(VoxelOrigin::Center, [1, 0, 1]), (VoxelOrigin::Corner, [1, 1, 1])] {
+        let mut out = outputs(0.5, [0.0, 0.0, 0.0, 1.0], 1.0);
+        out.quality = out.quality.set_requires_grad(true);
+        out.rotation = out.rotation.set_requires_grad(true);
+        let label = grasp_train::Label {
+            position: nalgebra::Point3::new(1.2, 0.7, 1.4),
+            rotation: UnitQuaternion::from_euler_angles(0.3, -0.8, 1.1),
+            width: 4.0,
+            success: true,
+        };
+        let mut targets = Targets::default();
+        targets.push(1, &label, 2, origin);
+        targets.push(0, &grasp_train::Label { position: nalgebra::Point3::new(0.5, 0.5, 2.6), ..label }, 2, origin);
+        assert_eq!(targets.len(), 1, "the second lies outside the volume");
+        targets.loss(&out, [1.0, 1.0]).unwrap().mean.backward();
+        let [x, y, z] = voxel;
+        for gradient in [out.quality.grad(), out.rotation.grad()] {
+            assert_eq!(
+                gradient.abs().sum(None),
+                gradient.get(1).select(1, x).select(1, y).select(1, z).abs().sum(None)
+            );
+            assert!(gradient.abs().sum(None).double_value(&[]) > 0.0);
+        }
+    }
+}

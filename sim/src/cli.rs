@@ -1,0 +1,114 @@
+//! The command line, one file a command.
+
+mod label;
+
+use std::path::PathBuf;
+
+use anyhow::Context;
+use clap::{Args, Parser, ValueEnum};
+use grasp_sim::camera::Views;
+use grasp_sim::objects::{ObjectSet, Split};
+use grasp_sim::scene::SceneKind;
+
+/// Simulated clutter for grasp detection: scenes, labels, benchmarks.
+#[derive(Parser)]
+#[command(version)]
+pub enum Command {
+    /// Make scenes, try grasps in them, and write what came of it as training data.
+    Label(label::Label),
+}
+
+impl Command {
+    /// Does what was asked.
+    pub fn run(self) -> anyhow::Result<()> {
+        match self {
+            Self::Label(command) => command.run(),
+        }
+    }
+}
+
+/// What scenes are made of and seen with.
+#[derive(Args, Clone)]
+struct SceneArgs {
+    /// How objects are put on the table.
+    #[arg(long, value_enum, default_value = "packed")]
+    scene: Scene,
+
+    /// The objects: `train` or `test` (our own), or a folder of URDF files.
+    #[arg(long, default_value = "train")]
+    objects: String,
+
+    /// The cameras: `side[:DEGREES]` (the paper's one view, turned about the vertical), `circle` (six from above), or
+    /// `anywhere:MIN-MAX` (so many from any azimuth, 20–75° off the vertical).
+    #[arg(long, default_value = "side")]
+    views: String,
+
+    /// Leave out the depth noise of the benchmark.
+    #[arg(long)]
+    no_noise: bool,
+
+    /// Seed of everything random.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Scene {
+    Pile,
+    Packed,
+}
+
+impl SceneArgs {
+    fn kind(&self) -> SceneKind {
+        match self.scene {
+            Scene::Pile => SceneKind::Pile,
+            Scene::Packed => SceneKind::Packed,
+        }
+    }
+
+    fn objects(&self) -> anyhow::Result<ObjectSet> {
+        Ok(match (self.objects.as_str(), self.scene) {
+            ("train", _) => ObjectSet::procedural(Split::Train),
+            ("test", Scene::Pile) => ObjectSet::procedural(Split::PileTest),
+            ("test", Scene::Packed) => ObjectSet::procedural(Split::PackedTest),
+            (folder, _) => ObjectSet::load(&PathBuf::from(folder))?,
+        })
+    }
+
+    fn views(&self) -> anyhow::Result<Views> {
+        parse_views(&self.views)
+            .with_context(|| format!("--views is `{}`: use side, side:90, circle, or anywhere:1-6", self.views))
+    }
+}
+
+fn parse_views(text: &str) -> Option<Views> {
+    let (name, rest) = text.split_once(':').unwrap_or((text, ""));
+    match name {
+        "side" if rest.is_empty() => Some(Views::Side { azimuth: 0.0 }),
+        "side" => Some(Views::Side { azimuth: rest.parse::<f64>().ok()?.to_radians() }),
+        "circle" if rest.is_empty() => Some(Views::Circle),
+        "anywhere" => {
+            let (min, max) = rest.split_once('-').unwrap_or((rest, rest));
+            let (min, max) = (min.parse().ok()?, max.parse().ok()?);
+            (1 <= min && min <= max).then_some(Views::Anywhere(min..=max))
+        }
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn views_are_read_as_written() {
+        assert_eq!(parse_views("side"), Some(Views::Side { azimuth: 0.0 }));
+        assert_eq!(parse_views("side:180"), Some(Views::Side { azimuth: std::f64::consts::PI }));
+        assert_eq!(parse_views("circle"), Some(Views::Circle));
+        assert_eq!(parse_views("anywhere:1-6"), Some(Views::Anywhere(1..=6)));
+        assert_eq!(parse_views("anywhere:2"), Some(Views::Anywhere(2..=2)));
+        for wrong in ["", "top", "side:x", "anywhere", "anywhere:0-2", "anywhere:3-2", "circle:1"] {
+            assert_eq!(parse_views(wrong), None, "{wrong}");
+        }
+    }
+}
