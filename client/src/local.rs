@@ -44,10 +44,7 @@ impl LocalServer {
     ///
     /// # Errors
     /// [`LocalServerError`] when it cannot be run or ends before it is ready.
-    pub fn spawn<A: AsRef<OsStr>>(
-        binary: &Path,
-        args: impl IntoIterator<Item = A>,
-    ) -> Result<Self, LocalServerError> {
+    pub fn spawn<A: AsRef<OsStr>>(binary: &Path, args: impl IntoIterator<Item = A>) -> Result<Self, LocalServerError> {
         let mut server = Self::start(binary, args)?;
         server.wait_ready()?;
         Ok(server)
@@ -57,10 +54,7 @@ impl LocalServer {
     ///
     /// # Errors
     /// [`LocalServerError`] when it cannot be run or ends before it listens.
-    pub fn start<A: AsRef<OsStr>>(
-        binary: &Path,
-        args: impl IntoIterator<Item = A>,
-    ) -> Result<Self, LocalServerError> {
+    pub fn start<A: AsRef<OsStr>>(binary: &Path, args: impl IntoIterator<Item = A>) -> Result<Self, LocalServerError> {
         let mut process = Command::new(binary)
             .args(["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"])
             .args(args)

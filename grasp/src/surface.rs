@@ -21,8 +21,13 @@ impl Fusion {
         for index in 0..n.pow(3) {
             let Some(here) = self.near_surface(index) else { continue };
             let cell = [index / (n * n), index / n % n, index % n];
+            // At the faces of the cube there is nothing on one side to take a normal from.
+            let inner = 1..n - 1;
+            if !cell.iter().all(|c| inner.contains(c)) {
+                continue;
+            }
             for axis in 0..3 {
-                if cell[axis] + 1 == n {
+                if !inner.contains(&(cell[axis] + 1)) {
                     continue;
                 }
                 let Some(there) = self.near_surface(index + stride[axis]) else { continue };

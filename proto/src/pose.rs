@@ -24,8 +24,7 @@ pub(crate) fn decode(pose: &pb::Pose, fields: &PoseFields) -> Result<Isometry3<f
     let pb::Quaternion { x, y, z, w } = orientation;
     let quaternion = Quaternion::new(w, x, y, z);
     let length = quaternion.norm();
-    // Written so that NaN fails.
-    if !((length - 1.0).abs() <= UNIT_TOLERANCE) {
+    if length.is_nan() || (length - 1.0).abs() > UNIT_TOLERANCE {
         let value = format_args!("(x {x}, y {y}, z {z}, w {w}), of length {length}");
         return Err(FieldError::new(fields.orientation, value, "must be of unit length to within 0.001"));
     }

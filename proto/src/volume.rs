@@ -18,7 +18,9 @@ pub fn resolution(volume: &pb::Volume) -> Result<usize, FieldError> {
         pb::DataType::F32 => 4,
         pb::DataType::F16 => 2,
         pb::DataType::U8 => 1,
-        pb::DataType::Unspecified => return Err(FieldError::new("volume.dtype", volume.dtype, "must be 1 (f32), 2 (f16) or 3 (u8)")),
+        pb::DataType::Unspecified => {
+            return Err(FieldError::new("volume.dtype", volume.dtype, "must be 1 (f32), 2 (f16) or 3 (u8)"));
+        }
     };
     let resolution = volume.resolution as usize;
     if resolution == 0 || resolution > Volume::MAX_RESOLUTION {
@@ -78,9 +80,7 @@ pub fn encode(volume: &Volume, dtype: pb::DataType, frame_id: impl Into<String>)
             (pb::DataType::F32, values.flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>())
         }
         pb::DataType::F16 => (dtype, values.flat_map(|&v| f16::from_f32(v).to_le_bytes()).collect()),
-        pb::DataType::U8 => {
-            (dtype, values.map(|&v| ((v * 255.0).round() as u8).max(u8::from(v > 0.0))).collect())
-        }
+        pb::DataType::U8 => (dtype, values.map(|&v| ((v * 255.0).round() as u8).max(u8::from(v > 0.0))).collect()),
     };
     pb::Volume {
         data: data.into(),
@@ -102,5 +102,60 @@ impl From<VolumeError> for FieldError {
             _ => "volume.data",
         };
         Self { field, message: format!("volume.{error}") }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::collection::vec;
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// A volume of 9³, so that the half-precision blocks do not come out even.
+    fn volume() -> impl Strategy<Value = Volume> {
+        let pose = (-5.0..5.0, -3.0..3.0).prop_map(|(x, turn): (f64, f64)| {
+            Isometry3::new(nalgebra::Vector3::new(x, -x, 1.0), nalgebra::Vector3::new(0.0, turn, 0.4))
+        });
+        let values = vec(prop_oneof![Just(0.0_f32), 0.001_f32..=1.0], 729);
+        (pose, values).prop_filter_map("all zero", |(pose, values)| Volume::new(9, 0.01, pose, values).ok())
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_encoded_is_decoded(volume in volume()) {
+            for (dtype, error) in [(pb::DataType::F32, 0.0), (pb::DataType::F16, 0.00025), (pb::DataType::U8, 0.00393)] {
+                let message = encode(&volume, dtype, "base");
+                let decoded = Volume::try_from(&message).unwrap();
+                prop_assert!((decoded.pose().to_homogeneous() - volume.pose().to_homogeneous()).norm() < 1e-9);
+                prop_assert_eq!((decoded.resolution(), decoded.voxel_size()), (9, 0.01));
+                for (decoded, value) in decoded.values().iter().zip(volume.values()) {
+                    prop_assert!((decoded - value).abs() <= error, "{} became {}", value, decoded);
+                    prop_assert_eq!(*decoded == 0.0, *value == 0.0, "0 means unobserved, and nothing else does");
+                }
+            }
+        }
+
+        #[test]
+        fn bytes_need_not_be_aligned(volume in volume(), offset in 0..4_usize) {
+            for dtype in [pb::DataType::F32, pb::DataType::F16] {
+                let mut message = encode(&volume, dtype, "");
+                let wanted = Volume::try_from(&message).unwrap();
+                let shifted = [&[0xff; 4][..offset], &message.data].concat();
+                message.data = prost::bytes::Bytes::from(shifted).slice(offset..);
+                prop_assert_eq!(Volume::try_from(&message).unwrap(), wanted);
+            }
+        }
+    }
+
+    #[test]
+    fn the_length_is_checked_before_anything_is_converted() {
+        let message = pb::Volume { dtype: pb::DataType::F16.into(), resolution: 256, ..Default::default() };
+        let error = resolution(&message).unwrap_err();
+        assert_eq!(error.field, "volume.data");
+        assert_eq!(
+            error.to_string(),
+            "volume.data is 0 bytes, a resolution of 256 needs 256³ · 2 = 33554432 (DATA_TYPE_F16)"
+        );
     }
 }

@@ -78,7 +78,13 @@ struct Flags {
     max_message_bytes: String,
 
     /// After SIGTERM, how long requests that were taken may still run, seconds.
-    #[arg(long, env = "GRASPD_DRAIN_TIMEOUT", value_name = "SECONDS", default_value = "20", allow_negative_numbers = true)]
+    #[arg(
+        long,
+        env = "GRASPD_DRAIN_TIMEOUT",
+        value_name = "SECONDS",
+        default_value = "20",
+        allow_negative_numbers = true
+    )]
     drain_timeout: String,
 
     /// What is logged to stderr: a level, or tracing's directives such as `warn,graspd=debug`.

@@ -1,4 +1,3 @@
-use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -191,14 +190,12 @@ impl Session {
     fn answer(&mut self, volume: &Volume, params: &DecodeParams, queue: Duration) -> Result<Answer, EngineError> {
         let started = Instant::now();
         let network = &mut self.network;
-        // The network's buffers are written anew for each volume, so what a panic leaves in them does no harm.
-        let answer = catch_unwind(AssertUnwindSafe(|| {
+        let answer = caught(|| {
             let output = network.infer(&[volume])?;
             let inference = started.elapsed();
             let decoded = decode(volume, &output.maps(0), params)?;
             Ok(Answer { decoded, queue, inference, postprocessing: started.elapsed() - inference })
-        }))
-        .unwrap_or_else(|panic| Err(EngineError::Panic(message(&*panic))));
+        });
         self.pace.set(started.elapsed());
         if let Err(error) = &answer {
             error!(%error, "the session failed");
@@ -228,7 +225,26 @@ impl Pace {
     }
 }
 
-fn message(panic: &(dyn Any + Send)) -> String {
-    let text = panic.downcast_ref::<&str>().copied().or_else(|| panic.downcast_ref::<String>().map(String::as_str));
-    text.unwrap_or("without a message").to_owned()
+/// Turns a panic into an error of the one request that it happened in. The network's buffers are written anew for each
+/// volume, so what the panic leaves in them does no harm.
+fn caught<T>(work: impl FnOnce() -> Result<T, EngineError>) -> Result<T, EngineError> {
+    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| {
+        let text = panic.downcast_ref::<&str>().copied();
+        let text = text.or_else(|| panic.downcast_ref::<String>().map(String::as_str));
+        Err(EngineError::Panic(text.unwrap_or("without a message").to_owned()))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_panic_becomes_an_error_with_its_message() {
+        let message = |work: fn() -> Result<(), EngineError>| caught(work).unwrap_err().to_string();
+        assert_eq!(message(|| panic!("index {} of {}", 5, 4)), "the session panicked: index 5 of 4");
+        assert_eq!(message(|| panic!("plain")), "the session panicked: plain");
+        assert_eq!(message(|| std::panic::panic_any(7)), "the session panicked: without a message");
+        assert!(caught(|| Ok(())).is_ok());
+    }
 }

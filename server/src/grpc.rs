@@ -32,9 +32,6 @@ pub(crate) async fn serve(
             .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
-    // `Server::tcp_nodelay` does nothing for a listener that was bound before; without it replies wait 40 ms for
-    // the client's acknowledgements.
-    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
     Server::builder()
         .initial_stream_window_size(STREAM_WINDOW)
         .initial_connection_window_size(CONNECTION_WINDOW)
@@ -44,7 +41,29 @@ pub(crate) async fn serve(
         .add_service(HealthServer::new(Health(state.clone())))
         .add_service(reflection().build_v1()?)
         .add_service(reflection().build_v1alpha()?)
-        .serve_with_incoming_shutdown(incoming, draining(state))
+        .serve_with_incoming_shutdown(incoming(listener), draining(state))
         .await?;
     Ok(())
+}
+
+/// The connections. `Server::tcp_nodelay` does nothing for a listener that was bound before; without TCP_NODELAY a
+/// reply of several packets waits 40 ms for the client to acknowledge the first.
+fn incoming(listener: TcpListener) -> TcpIncoming {
+    TcpIncoming::from(listener).with_nodelay(Some(true))
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::net::TcpStream;
+    use tokio_stream::StreamExt;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn connections_do_not_wait_to_fill_packets() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let _client = TcpStream::connect(listener.local_addr().unwrap()).await.unwrap();
+        let connection = incoming(listener).next().await.unwrap().unwrap();
+        assert!(connection.nodelay().unwrap());
+    }
 }

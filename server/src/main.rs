@@ -71,12 +71,7 @@ fn run(config: &Config) -> anyhow::Result<()> {
 }
 
 /// From binding the listeners to the end of the drain.
-async fn serve(
-    config: &Config,
-    models: Models,
-    sessions: &mut Sessions,
-    metrics: &Arc<Metrics>,
-) -> anyhow::Result<()> {
+async fn serve(config: &Config, models: Models, sessions: &mut Sessions, metrics: &Arc<Metrics>) -> anyhow::Result<()> {
     let mut signals = Signals::new().context("cannot handle signals")?;
     let grpc = bind(config.listen, "--listen").await?;
     let http = bind(config.http, "--http").await?;

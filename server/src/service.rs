@@ -56,8 +56,14 @@ impl Grasps {
             id = self.ids.next();
         }
         let span = info_span!(
-            "detect", request_id = id, model = Empty, queue = Empty, preprocessing = Empty, inference = Empty,
-            postprocessing = Empty, total = Empty,
+            "detect",
+            request_id = id,
+            model = Empty,
+            queue = Empty,
+            preprocessing = Empty,
+            inference = Empty,
+            postprocessing = Empty,
+            total = Empty,
         );
         let mut call = Call {
             id,
@@ -247,10 +253,7 @@ impl GraspService for Grasps {
         Ok(Response::new(Box::pin(replies)))
     }
 
-    async fn list_models(
-        &self,
-        _: Request<pb::ListModelsRequest>,
-    ) -> Result<Response<pb::ListModelsResponse>, Status> {
+    async fn list_models(&self, _: Request<pb::ListModelsRequest>) -> Result<Response<pb::ListModelsResponse>, Status> {
         Ok(Response::new((&*self.models).into()))
     }
 }

@@ -87,8 +87,7 @@ pub fn look(world: &World, cameras: &[Isometry3<f64>]) -> Vec<View> {
     cameras
         .iter()
         .map(|camera_from_task| {
-            let frame =
-                render(&instances, Some(TABLE_HEIGHT), &Intrinsics::BENCHMARK, camera_from_task, NEAR, FAR);
+            let frame = render(&instances, Some(TABLE_HEIGHT), &Intrinsics::BENCHMARK, camera_from_task, NEAR, FAR);
             View { depth: frame.depth, camera_from_task: *camera_from_task }
         })
         .collect()

@@ -1,5 +1,7 @@
 //! The command line, one file a command.
 
+mod bench;
+mod demo;
 mod label;
 
 use std::path::PathBuf;
@@ -16,6 +18,10 @@ use grasp_sim::scene::SceneKind;
 pub enum Command {
     /// Make scenes, try grasps in them, and write what came of it as training data.
     Label(label::Label),
+    /// Clear tables with a planner and say how well it did.
+    Bench(bench::Bench),
+    /// One scene, from the depth camera through a server of its own to the lifted object.
+    Demo(demo::Demo),
 }
 
 impl Command {
@@ -23,6 +29,8 @@ impl Command {
     pub fn run(self) -> anyhow::Result<()> {
         match self {
             Self::Label(command) => command.run(),
+            Self::Bench(command) => command.run(),
+            Self::Demo(command) => command.run(),
         }
     }
 }

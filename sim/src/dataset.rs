@@ -171,8 +171,11 @@ fn last_scene(table: &File) -> io::Result<(u64, u64)> {
 fn write_volume(path: &Path, values: &[f32]) -> io::Result<()> {
     let mut archive = npyz::npz::NpzWriter::create(path)?;
     let n = RESOLUTION as u64;
-    let mut grid =
-        archive.array("grid", npyz::zip::write::FileOptions::default())?.default_dtype().shape(&[1, n, n, n]).begin_nd()?;
+    let mut grid = archive
+        .array("grid", npyz::zip::write::FileOptions::default())?
+        .default_dtype()
+        .shape(&[1, n, n, n])
+        .begin_nd()?;
     grid.extend(values.iter().copied())?;
     grid.finish()
 }
@@ -209,7 +212,9 @@ mod tests {
             writer.append(number, &scene()).unwrap();
         }
         let whole = fs::read_to_string(dir.path().join("grasps.csv")).unwrap();
-        assert!(whole.contains("\n00000001,0.0000000,0.0000000,0.0000000,1.0000000,10.00000,20.00000,5.00000,8.00000,1\n"));
+        assert!(
+            whole.contains("\n00000001,0.0000000,0.0000000,0.0000000,1.0000000,10.00000,20.00000,5.00000,8.00000,1\n")
+        );
 
         // Cut off in the middle of the last row.
         fs::write(dir.path().join("grasps.csv"), &whole[..whole.len() - 7]).unwrap();

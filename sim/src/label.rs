@@ -8,7 +8,7 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Poisson};
 
-use crate::camera::{Views, add_noise, fuse, look};
+use crate::camera::{View, Views, add_noise, fuse, look};
 use crate::objects::ObjectSet;
 use crate::physics::World;
 use crate::scene::{SceneKind, generate};
@@ -76,7 +76,8 @@ impl Recipe {
         }
         let volume = fuse(&views, RESOLUTION).volume(Isometry3::identity()).ok()?.values().to_vec();
 
-        let cloud = graspable_surface(&world, &mut rng);
+        // Labels cover what six clean views from above see, whatever the network will see.
+        let cloud = graspable(&look(&world, &Views::Circle.sample(&mut rng)));
         if cloud.is_empty() {
             return None;
         }
@@ -85,12 +86,12 @@ impl Recipe {
     }
 }
 
-/// The surface that six clean views from above see, without the table, the borders, and what faces down.
+/// The surface that these views see, without the table, the borders of the workspace, and what faces down.
 #[must_use]
-pub fn graspable_surface(world: &World, rng: &mut impl Rng) -> Vec<SurfacePoint> {
+pub fn graspable(views: &[View]) -> Vec<SurfacePoint> {
     const LOWER: [f64; 3] = [0.02, 0.02, 0.055];
     const UPPER: [f64; 3] = [0.28, 0.28, 0.30];
-    let mut surface = fuse(&look(world, &Views::Circle.sample(rng)), CLOUD_RESOLUTION).surface();
+    let mut surface = fuse(views, CLOUD_RESOLUTION).surface();
     surface.retain(|point| {
         (0..3).all(|axis| (LOWER[axis]..=UPPER[axis]).contains(&point.position[axis])) && point.normal.z > -0.1
     });
@@ -115,9 +116,8 @@ pub fn sample_pose(cloud: &[SurfacePoint], rng: &mut impl Rng) -> Isometry3<f64>
 
 fn try_point(world: &World, cloud: &[SurfacePoint], rng: &mut impl Rng) -> Trial {
     let pose = sample_pose(cloud, rng);
-    let turned = |yaw: usize| {
-        pose * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw as f64 * PI / (YAWS - 1) as f64)
-    };
+    let turned =
+        |yaw: usize| pose * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw as f64 * PI / (YAWS - 1) as f64);
     let widths: [Option<f64>; YAWS] = std::array::from_fn(|yaw| match trial::label(world, &turned(yaw)) {
         trial::Outcome::Lifted { width, .. } => Some(width),
         _ => None,

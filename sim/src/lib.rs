@@ -3,6 +3,7 @@
 //!
 //! The task frame: origin at a corner of the 0.3 m workspace cube, z up, the table's top at [`TABLE_HEIGHT`].
 
+pub mod benchmark;
 pub mod camera;
 pub mod dataset;
 pub mod label;
@@ -10,6 +11,7 @@ pub mod mesh;
 pub mod objects;
 pub mod physics;
 pub mod picture;
+pub mod planner;
 pub mod raster;
 pub mod scene;
 pub mod trial;

@@ -33,7 +33,10 @@ impl Server {
     /// When it does not start.
     #[must_use]
     pub fn start(models: &[TestModel], args: &[&str]) -> Self {
-        assert!(std::env::var_os("ORT_DYLIB_PATH").is_some(), "ORT_DYLIB_PATH is not set: run the tests by `make test`");
+        assert!(
+            std::env::var_os("ORT_DYLIB_PATH").is_some(),
+            "ORT_DYLIB_PATH is not set: run the tests by `make test`"
+        );
         let folder = tempfile::tempdir().expect("there is room for temporary files");
         for model in models {
             model.write(folder.path());

@@ -1,8 +1,8 @@
 //! Everything that can be wrong with a request gets its own clear status, and the connection goes on.
 
 use grasp::Volume;
-use grasp_proto::pb::{self, DataType};
 use grasp_proto::encode;
+use grasp_proto::pb::{self, DataType};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
 use nalgebra::Isometry3;
 use tonic::Code;
@@ -70,9 +70,7 @@ impl Case {
 async fn the_data_must_fit_the_resolution_and_the_dtype() {
     let mut case = Case::new().await;
     let length = |bytes: usize| {
-        format!(
-            "volume.data is {bytes} bytes, a resolution of 16 needs 16³ · 4 = 16384 (DATA_TYPE_F32)"
-        )
+        format!("volume.data is {bytes} bytes, a resolution of 16 needs 16³ · 4 = 16384 (DATA_TYPE_F32)")
     };
     case.refused_volume(|v| v.data = vec![0; 16_383].into(), &length(16_383)).await;
     case.refused_volume(|v| v.data = vec![0; 16_388].into(), &length(16_388)).await;
@@ -117,7 +115,8 @@ async fn the_values_must_be_finite_and_between_0_and_1() {
 async fn half_precision_is_checked_after_it_was_widened() {
     let mut case = Case::new().await;
     // 0x7e00 is NaN, 0x4000 is 2.
-    for (bits, message) in [(0x7e00_u16, "is NaN, every value must be finite"), (0x4000, "is 2, every value must lie")] {
+    for (bits, message) in [(0x7e00_u16, "is NaN, every value must be finite"), (0x4000, "is 2, every value must lie")]
+    {
         let mut request = request();
         let mut volume = encode(&volume(), DataType::F16, "");
         let mut data = volume.data.to_vec();
@@ -174,7 +173,9 @@ async fn the_pose_must_be_finite_with_a_unit_quaternion() {
         "volume.pose.position is (0, inf, 0), must be finite",
     )
     .await;
-    let half = |volume: &mut pb::Volume| volume.pose = Some(pb::Pose { position: Some(pb::Vector3::default()), orientation: None });
+    let half = |volume: &mut pb::Volume| {
+        volume.pose = Some(pb::Pose { position: Some(pb::Vector3::default()), orientation: None })
+    };
     case.refused_volume(half, "volume.pose.orientation is absent, must be given").await;
     let half = |volume: &mut pb::Volume| volume.pose = Some(pb::Pose::default());
     case.refused_volume(half, "volume.pose.position is absent, must be given").await;
@@ -212,7 +213,8 @@ async fn the_parameters_must_be_in_range() {
     }
     let bad = pb::DetectGraspsRequest { request_id: "x".repeat(257), ..request() };
     case.refused(bad, Code::InvalidArgument, "request_id is 257 bytes long, at most 256 are taken").await;
-    case.refused_volume(|v| v.frame_id = "x".repeat(300), "volume.frame_id is 300 bytes long, at most 256 are taken").await;
+    case.refused_volume(|v| v.frame_id = "x".repeat(300), "volume.frame_id is 300 bytes long, at most 256 are taken")
+        .await;
 }
 
 #[tokio::test]
@@ -236,7 +238,8 @@ async fn refusals_are_counted_by_their_code() {
     case.refused_volume(|v| v.voxel_size = 0.0, "volume.voxel_size is 0, must be a positive number of metres").await;
     let unknown = pb::DetectGraspsRequest { model: "vgn".to_owned(), ..request() };
     case.client.detect_grasps(unknown).await.unwrap_err();
-    let count = |code, model| case.server.metric(&format!("graspd_requests_total{{code=\"{code}\",model=\"{model}\"}}"));
+    let count =
+        |code, model| case.server.metric(&format!("graspd_requests_total{{code=\"{code}\",model=\"{model}\"}}"));
     assert_eq!(count("INVALID_ARGUMENT", "mirror 1"), 1.0);
     assert_eq!(count("NOT_FOUND", ""), 1.0);
     assert_eq!(count("OK", "mirror 1"), 1.0);

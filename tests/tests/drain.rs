@@ -3,7 +3,7 @@
 use std::process::Command;
 
 use grasp::Volume;
-use grasp_client::{Client, Options};
+use grasp_client::{Client, LocalServer, LocalServerError, Options};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs, graspd};
 use nalgebra::Isometry3;
 use tokio::sync::mpsc;
@@ -107,6 +107,14 @@ fn every_mistake_in_the_configuration_is_reported_in_one_run() {
         assert!(text.contains(mistake), "`{mistake}` is not in:\n{text}");
     }
     assert!(output.stdout.is_empty(), "nothing was bound");
+}
+
+#[test]
+fn a_client_that_starts_a_server_is_told_when_it_ends() {
+    let error = LocalServer::spawn(graspd(), ["--models", "/no/such/folder"]).unwrap_err();
+    assert!(matches!(error, LocalServerError::Ended(status) if status.code() == Some(2)), "{error}");
+    let error = LocalServer::spawn("/no/such/graspd".as_ref(), [""; 0]).unwrap_err();
+    assert!(error.to_string().starts_with("cannot run /no/such/graspd: No such file"), "{error}");
 }
 
 #[test]

@@ -1,6 +1,8 @@
 //! What the server says of itself, at each point of its life.
 
-use grasp_client::{Health, Options};
+use std::time::Duration;
+
+use grasp_client::{Client, Error, Health, Options};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
 use nalgebra::Isometry3;
 use tokio::task::JoinSet;
@@ -38,6 +40,10 @@ async fn it_serves_after_the_warm_up_and_not_before() {
     assert_eq!(error.code(), Some(Code::Unavailable), "{error}");
     assert!(error.to_string().contains("warming up"), "{error}");
 
+    let address = server.grpc().to_string();
+    let error = Client::wait_ready(address.clone(), Duration::ZERO).await.unwrap_err();
+    assert!(matches!(error, Error::NotReady { .. }), "{error}");
+    Client::wait_ready(address, Duration::from_mins(5)).await.unwrap();
     server.wait_ready().unwrap();
     assert_eq!(check(&mut health, "").await, ServingStatus::Serving);
     assert_eq!(check(&mut health, SERVICE).await, ServingStatus::Serving);

@@ -16,7 +16,8 @@ async fn every_answer_is_in_every_stages_histogram() {
         seconds += client.detect(&volume, Options::default()).await.unwrap().latency.total;
     }
     for stage in STAGES {
-        let series = |suffix, le| format!("graspd_stage_duration_seconds_{suffix}{{model=\"mirror 1\",stage=\"{stage}\"{le}}}");
+        let series =
+            |suffix, le| format!("graspd_stage_duration_seconds_{suffix}{{model=\"mirror 1\",stage=\"{stage}\"{le}}}");
         assert_eq!(server.metric(&series("count", "")), 7.0, "{stage}");
         assert_eq!(server.metric(&series("bucket", ",le=\"+Inf\"")), 7.0, "{stage}");
     }

@@ -1,7 +1,10 @@
 //! More requests than can be answered.
 
+use std::time::Duration;
+
 use grasp::Volume;
 use grasp_client::{Error, Options};
+use grasp_proto::pb::DetectGraspsRequest;
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
 use nalgebra::Isometry3;
 use tokio::task::JoinSet;
@@ -64,19 +67,19 @@ async fn a_stream_alone_is_never_refused() {
 
 #[tokio::test]
 async fn callers_that_have_gone_are_skipped_and_counted() {
-    let server = Server::run(&[slow()], &["--queue", "8"]);
+    let server = Server::run(&[slow()], &["--queue", "17"]);
     let client = server.client().await;
     let mut calls = JoinSet::new();
-    for _ in 0..5 {
+    for _ in 0..17 {
         let client = client.clone();
         calls.spawn(async move { client.detect(&volume(), Options::default()).await });
     }
-    server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 4.0).await;
+    server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 16.0).await;
     calls.shutdown().await;
-    server.wait_for("graspd_requests_total{code=\"CANCELLED\",model=\"slow 1\"}", 5.0).await;
-    // The one that follows waits for the one that runs, and for none of the four that were queued.
+    server.wait_for("graspd_requests_total{code=\"CANCELLED\",model=\"slow 1\"}", 17.0).await;
+    // The one that follows waits for the one that runs, and for none of the sixteen that were queued.
     let detection = client.detect(&volume(), Options::default()).await.unwrap();
-    assert!(detection.latency.queue < 2.0 * detection.latency.inference, "{:?}", detection.latency);
+    assert!(detection.latency.queue < 8.0 * detection.latency.inference, "{:?}", detection.latency);
 }
 
 #[tokio::test]
@@ -93,4 +96,18 @@ async fn every_worker_has_its_own_session() {
     for outcome in calls.join_all().await {
         assert_eq!(outcome.unwrap().grasps.len(), 1);
     }
+}
+
+#[tokio::test]
+async fn a_request_whose_deadline_passes_is_dropped_from_the_queue() {
+    let server = Server::run(&[slow()], &["--queue", "8"]);
+    let client = server.client().await;
+    let ahead = tokio::spawn(async move { client.detect(&volume(), Options::default()).await });
+    let volume = grasp_proto::encode(&volume(), grasp_client::DataType::F32, "");
+    let mut request = tonic::Request::new(DetectGraspsRequest { volume: Some(volume), ..Default::default() });
+    request.set_timeout(Duration::from_millis(1));
+    let status = server.raw().await.detect_grasps(request).await.unwrap_err();
+    assert!(matches!(status.code(), Code::Cancelled | Code::DeadlineExceeded), "{status}");
+    ahead.await.unwrap().unwrap();
+    assert_eq!(server.metric("graspd_stage_duration_seconds_count{model=\"slow 1\",stage=\"total\"}"), 1.0);
 }

@@ -1,5 +1,6 @@
 //! Whatever is thrown at the server, it answers, and stays up and ready.
 
+use std::cell::Cell;
 use std::io::Write;
 use std::net::TcpStream;
 
@@ -7,11 +8,11 @@ use grasp_proto::pb;
 use grasp_proto::pb::grasp_service_client::GraspServiceClient;
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
 use nalgebra::Isometry3;
-use prost::Message;
-use prost::bytes::{Buf, BufMut};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
+use prost::Message;
+use prost::bytes::{Buf, BufMut};
 use tokio::runtime::Runtime;
 use tonic::codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder};
 use tonic::codegen::http::uri::PathAndQuery;
@@ -158,17 +159,17 @@ impl Target {
 #[test]
 fn thousands_of_random_requests() {
     let target = Target::new();
-    let (mut answered, mut refused) = (0, 0);
+    let (answered, refused) = (Cell::new(0), Cell::new(0));
     let mut runner = TestRunner::new(Config { cases: 4000, failure_persistence: None, ..Config::default() });
     let outcome = runner.run(&request().no_shrink(), |request| {
         let mut client = GraspServiceClient::new(target.channel.clone());
         match target.runtime.block_on(client.detect_grasps(request.clone())) {
             Ok(response) => {
-                answered += 1;
+                answered.set(answered.get() + 1);
                 check(&request, response.get_ref());
             }
             Err(status) => {
-                refused += 1;
+                refused.set(refused.get() + 1);
                 prop_assert!(matches!(status.code(), Code::InvalidArgument | Code::NotFound), "{status}");
                 prop_assert!(status.message().contains(" is "), "names the field and the value: {status}");
             }
@@ -176,6 +177,7 @@ fn thousands_of_random_requests() {
         Ok(())
     });
     outcome.unwrap();
+    let (answered, refused) = (answered.get(), refused.get());
     assert!(answered > 500 && refused > 500, "{answered} answered, {refused} refused: the mixture is lopsided");
     target.assert_well();
 }

@@ -23,7 +23,7 @@ pub(crate) fn train(training: &Training) -> Result<()> {
         tch::set_num_threads(i32::try_from(threads).context("--threads")?);
     }
     ensure!((0.0..1.0).contains(&training.val), "--val is {}, must be at least 0 and below 1", training.val);
-    let files = Files::beside(&training.out);
+    let files = Files::beside(&training.out)?;
     let (model, mut metadata) = start_from(training)?;
     let settings = settings(training, &metadata);
     let dataset = Dataset::read(&training.data)?;
@@ -179,12 +179,15 @@ struct Files {
 }
 
 impl Files {
-    fn beside(model: &Path) -> Self {
-        Self {
+    /// Makes their folder, lest the first epoch be lost for want of it.
+    fn beside(model: &Path) -> Result<Self> {
+        let folder = model.parent().unwrap_or(Path::new(""));
+        fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
+        Ok(Self {
             state: model.with_extension("state"),
             log: model.with_extension("jsonl"),
             curves: model.with_extension("png"),
-        }
+        })
     }
 
     /// The first `epochs` lines of the log.

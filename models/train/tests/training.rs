@@ -32,6 +32,8 @@ fn settings() -> Settings {
 }
 
 fn trainer<'a>(dataset: &'a Dataset, settings: &Settings, execution: Execution) -> Trainer<'a> {
+    // More threads are no faster on volumes this small.
+    tch::set_num_threads(1);
     let model = Architecture::Vgn.build(N, 0).unwrap();
     Trainer::new(model, dataset, settings.clone(), execution).unwrap()
 }
@@ -47,13 +49,13 @@ fn epoch(trainer: &mut Trainer) -> Record {
 fn eight_scenes_are_learnt_by_heart() {
     let dataset = support::dataset(8, N);
     for bf16 in [false, true] {
-        let settings = Settings { batch: 8, ..settings() };
+        let settings = Settings { batch: 8, learning_rate: 1e-3, warmup: 20, bf16, ..settings() };
         let mut trainer = trainer(&dataset, &settings, Execution { bf16, ..EXECUTION });
         let first = epoch(&mut trainer);
-        let last = (0..250).map(|_| epoch(&mut trainer)).last().unwrap();
+        let last = (0..120).map(|_| epoch(&mut trainer)).last().unwrap();
         println!("bf16 {bf16}: loss {:.4} → {:.5}", first.loss, last.loss);
         assert!(first.loss > 0.5, "{first:?}");
-        assert!(last.loss < 0.02, "{last:?}");
+        assert!(last.loss < 0.01, "{last:?}");
     }
 }
 

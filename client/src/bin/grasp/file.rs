@@ -42,13 +42,18 @@ fn volume(array: NpyFile<impl Read>, voxel_size: Option<f64>) -> anyhow::Result<
     let &[resolution, y, z] = edges else { bail!("its shape is {shape:?}, N×N×N is needed") };
     ensure!(resolution == y && y == z, "its shape is {shape:?}, N×N×N is needed");
     let resolution = usize::try_from(resolution)?;
-    ensure!(resolution <= Volume::MAX_RESOLUTION, "its shape is {shape:?}, at most {}³ is taken", Volume::MAX_RESOLUTION);
+    ensure!(
+        resolution <= Volume::MAX_RESOLUTION,
+        "its shape is {shape:?}, at most {}³ is taken",
+        Volume::MAX_RESOLUTION
+    );
 
     let mut values = values(array)?;
     if order == Order::Fortran {
         values = (0..values.len())
             .map(|index| {
-                let (x, y, z) = (index / (resolution * resolution), index / resolution % resolution, index % resolution);
+                let (x, y, z) =
+                    (index / (resolution * resolution), index / resolution % resolution, index % resolution);
                 values[(z * resolution + y) * resolution + x]
             })
             .collect();

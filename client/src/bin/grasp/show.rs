@@ -35,7 +35,8 @@ pub(crate) fn detection_json(detection: &Detection) -> String {
             "width": grasp.width,
         })
     });
-    let object = |pairs: &[(&str, Value)]| -> Value { pairs.iter().map(|(k, v)| ((*k).to_owned(), v.clone())).collect() };
+    let object =
+        |pairs: &[(&str, Value)]| -> Value { pairs.iter().map(|(k, v)| ((*k).to_owned(), v.clone())).collect() };
     let value = json!({
         "request_id": detection.request_id,
         "frame_id": detection.frame_id,

@@ -1,0 +1,128 @@
+//! The program `grasp-train`.
+
+mod support;
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use grasp::VoxelOrigin;
+use grasp_models::onnx::ModelProto;
+use grasp_models::{Architecture, Metadata, Store};
+use grasp_train::{Checkpoint, Record};
+
+const N: usize = 16;
+
+/// A folder with `start.onnx`, a network for small volumes, and `data`.
+fn prepare() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let scenes: Vec<_> = (0..12).map(|seed| support::scene(seed, N)).collect();
+    support::write(&folder.path().join("data"), &scenes, N);
+    Architecture::Vgn.build(N, 0).unwrap().write(&folder.path().join("start.onnx")).unwrap();
+    folder
+}
+
+fn command(folder: &Path, arguments: &str) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_grasp-train"));
+    command.current_dir(folder).args(arguments.split_whitespace());
+    command
+}
+
+fn train(folder: &Path, arguments: &str) -> Output {
+    let fixed = "train --from start.onnx --data data --batch 4 --threads 1 --augment turns,mirror,shift";
+    command(folder, &format!("{fixed} {arguments}")).output().unwrap()
+}
+
+fn said(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+#[test]
+fn a_run_leaves_a_model_that_can_be_served() {
+    let folder = prepare();
+    let arguments = "--out models/pile.onnx --epochs 2 --val 0.3 --voxel-origin center --model-version 2.0 --seed 3";
+    let output = train(folder.path(), arguments);
+    assert!(output.status.success(), "{}", said(&output));
+    let models = folder.path().join("models");
+    let store = Store::open(&models).unwrap();
+    let metadata = &store.get("pile", Some("2.0")).unwrap().metadata;
+    assert_eq!((metadata.resolution, metadata.voxel_origin), (N, VoxelOrigin::Center));
+    let expected = [
+        ("architecture", "vgn"),
+        ("data", "data"),
+        ("scenes", "12"),
+        ("grasps", "24"),
+        ("seed", "3"),
+        ("epochs", "2"),
+        ("from", "start.onnx"),
+    ];
+    for (key, value) in expected {
+        assert_eq!(metadata.provenance.get(key).map(String::as_str), Some(value), "{key}");
+    }
+    let log = fs::read_to_string(models.join("pile.jsonl")).unwrap();
+    assert_eq!(log, String::from_utf8(output.stdout).unwrap(), "what is logged is printed");
+    let records: Vec<Record> = log.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(records.iter().map(|record| record.epoch).collect::<Vec<_>>(), [1, 2]);
+    assert!(records.iter().all(|record| record.validation.is_some() && record.volumes_per_second > 0.0));
+    assert_eq!(&fs::read(models.join("pile.png")).unwrap()[1..4], b"PNG");
+}
+
+#[test]
+fn a_run_goes_on_where_it_stopped() {
+    let folder = prepare();
+    assert!(train(folder.path(), "--out whole.onnx --epochs 3 --name x").status.success());
+    assert!(train(folder.path(), "--out parts.onnx --epochs 1 --name x").status.success());
+    let output = train(folder.path(), "--out parts.onnx --epochs 3 --name x --resume");
+    assert!(output.status.success(), "{}", said(&output));
+    let weights = |name: &str| ModelProto::read(&folder.path().join(name)).unwrap().graph.unwrap().initializer;
+    assert_eq!(weights("whole.onnx"), weights("parts.onnx"));
+    let lines = |name: &str| fs::read_to_string(folder.path().join(name)).unwrap().lines().count();
+    assert_eq!((lines("whole.jsonl"), lines("parts.jsonl")), (3, 3));
+}
+
+#[test]
+fn ctrl_c_leaves_a_checkpoint() {
+    let folder = prepare();
+    let arguments = "train --from start.onnx --data data --batch 1 --threads 1 --epochs 100000 --out out.onnx";
+    let mut run = command(folder.path(), arguments).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let start = Instant::now();
+    while !folder.path().join("out.state").exists() {
+        assert!(start.elapsed() < Duration::from_secs(60), "no checkpoint after the first epoch");
+        sleep(Duration::from_millis(20));
+    }
+    assert!(Command::new("kill").args(["-INT", &run.id().to_string()]).status().unwrap().success());
+    assert_eq!(run.wait().unwrap().code(), Some(0));
+    let checkpoint = Checkpoint::read(&folder.path().join("out.state")).unwrap();
+    assert!(checkpoint.epoch >= 1 && checkpoint.epoch < 100_000);
+    let path = folder.path().join("out.onnx");
+    let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
+    assert_eq!(metadata.provenance["steps"], checkpoint.steps.to_string(), "both are of the same step");
+}
+
+#[test]
+fn a_network_is_written_with_random_weights() {
+    let folder = tempfile::tempdir().unwrap();
+    let output = command(folder.path(), "init --network vgn --seed 4 --out vgn.onnx").output().unwrap();
+    assert!(output.status.success(), "{}", said(&output));
+    let written = ModelProto::read(&folder.path().join("vgn.onnx")).unwrap();
+    assert_eq!(written, Architecture::Vgn.build(40, 4).unwrap());
+}
+
+#[test]
+fn what_cannot_be_done_is_said() {
+    let folder = prepare();
+    for (arguments, expected) in [
+        ("train --network vng --data data --out x.onnx", "there is no network `vng`"),
+        ("train --network vgn --data data --out x.onnx", "the data have 16³ voxels, the network reads 40³"),
+        ("train --network vgn --data nowhere --out x.onnx", "nowhere/grasps.csv: No such file"),
+        ("train --network vgn --data data --out x.onnx --val 1", "--val is 1"),
+        ("train --from start.onnx --data data --out x.onnx --resume", "x.state: No such file"),
+        ("train --data data --out x.onnx", "--network"),
+    ] {
+        let output = command(folder.path(), arguments).output().unwrap();
+        assert!(!output.status.success());
+        assert!(said(&output).contains(expected), "{arguments}: {}", said(&output));
+    }
+}

@@ -1,0 +1,165 @@
+//! What the executor understands of ONNX, beyond what the networks here use, and what it refuses.
+
+use grasp_models::Architecture;
+use grasp_models::onnx::{AttributeProto, GraphProto, ModelProto, NodeProto, TensorProto};
+use grasp_train::{ExecuteError, Execution, Executor, Outputs};
+use tch::{Device, Kind, Tensor, no_grad};
+
+const N: usize = 16;
+const EXECUTION: Execution = Execution { device: Device::Cpu, bf16: false, channels_last: false };
+
+fn vgn() -> ModelProto {
+    Architecture::Vgn.build(N, 0).unwrap()
+}
+
+fn run(model: ModelProto, execution: Execution) -> Result<Outputs, ExecuteError> {
+    tch::manual_seed(0);
+    let edge = N as i64;
+    let volumes = Tensor::rand([2, 1, edge, edge, edge], (Kind::Float, Device::Cpu));
+    let executor = Executor::new(model, execution)?;
+    no_grad(|| executor.forward(&volumes))
+}
+
+fn difference(a: &Outputs, b: &Outputs) -> f64 {
+    let pairs = [(&a.quality, &b.quality), (&a.rotation, &b.rotation), (&a.width, &b.width)];
+    pairs.iter().map(|(a, b)| (*a - *b).abs().max().double_value(&[])).fold(0.0, f64::max)
+}
+
+fn node(op: &str, inputs: &[&str], output: &str, attribute: Vec<AttributeProto>) -> NodeProto {
+    NodeProto {
+        input: inputs.iter().map(|&input| input.to_owned()).collect(),
+        output: vec![output.to_owned()],
+        name: Some(output.to_owned()),
+        op_type: Some(op.to_owned()),
+        attribute,
+        domain: None,
+    }
+}
+
+fn whole(name: &str, values: &[i64]) -> NodeProto {
+    let value = TensorProto::from_i64("", &[values.len() as i64], values);
+    node("Constant", &[], name, vec![AttributeProto::tensor("value", value)])
+}
+
+/// The same network as PyTorch exports VGN: three heads, sizes computed from shapes, lengths expanded.
+fn as_exported(mut model: ModelProto) -> ModelProto {
+    let graph = model.graph.as_mut().unwrap();
+    unfuse_heads(graph);
+    let mut nodes = vec![whole("zero", &[0]), whole("two", &[2])];
+    let mut size = N as i64 / 8;
+    for mut it in std::mem::take(&mut graph.node) {
+        let output = it.output[0].clone();
+        let name = |suffix: &str| format!("{output}.{suffix}");
+        match it.op_type() {
+            "Resize" => {
+                size *= 2;
+                nodes.push(node("Shape", &[&it.input[0]], &name("shape"), vec![]));
+                nodes.push(node("Slice", &[&name("shape"), "zero", "two", "zero"], &name("first"), vec![]));
+                nodes.push(whole(&name("edges"), &[size; 3]));
+                let axis = AttributeProto::int("axis", 0);
+                nodes.push(node("Concat", &[&name("first"), &name("edges")], &name("size"), vec![axis]));
+                it.input = vec![it.input[0].clone(), String::new(), String::new(), name("size")];
+                it.attribute.push(AttributeProto::float("cubic_coeff_a", -0.75));
+            }
+            "Div" => {
+                nodes.push(node("Shape", &[&it.input[0]], &name("shape"), vec![]));
+                nodes.push(node("Expand", &[&it.input[1], &name("shape")], &name("length"), vec![]));
+                it.input[1] = name("length");
+            }
+            _ => {}
+        }
+        nodes.push(it);
+    }
+    graph.node = nodes;
+    model
+}
+
+fn unfuse_heads(graph: &mut GraphProto) {
+    let split = graph.node.iter().position(|node| node.op_type() == "Split").unwrap();
+    let outputs = graph.node[split].output.clone();
+    let fused = graph.node.iter().position(|node| node.op_type() == "Conv" && node.input[1] == "heads.weight").unwrap();
+    let [weight, bias] = ["heads.weight", "heads.bias"].map(|name| {
+        let index = graph.initializer.iter().position(|tensor| tensor.name() == name).unwrap();
+        graph.initializer.remove(index)
+    });
+    let (weights, biases) = (weight.to_f32().unwrap(), bias.to_f32().unwrap());
+    let per_channel = weights.len() / 6;
+    let mut heads = Vec::new();
+    for (output, channels) in outputs.iter().zip([0..1, 1..5, 5..6]) {
+        let mut dims = weight.dims.clone();
+        dims[0] = channels.len() as i64;
+        let (weight, bias) = (format!("{output}.weight"), format!("{output}.bias"));
+        let part = &weights[channels.start * per_channel..channels.end * per_channel];
+        graph.initializer.push(TensorProto::from_f32(&weight, &dims, part));
+        graph.initializer.push(TensorProto::from_f32(&bias, &[channels.len() as i64], &biases[channels]));
+        let mut attributes = graph.node[fused].attribute.clone();
+        attributes.push(AttributeProto::ints("dilations", &[1; 3]));
+        attributes.push(AttributeProto::int("group", 1));
+        heads.push(node("Conv", &[&graph.node[fused].input[0], &weight, &bias], output, attributes));
+    }
+    graph.node.splice(split..=split, heads);
+    graph.node.remove(fused);
+}
+
+#[test]
+fn a_graph_in_pytorchs_style_is_the_same_network() {
+    let exported = as_exported(vgn());
+    assert_eq!(exported.parameters(), vgn().parameters());
+    let (ours, theirs) = (run(vgn(), EXECUTION).unwrap(), run(exported, EXECUTION).unwrap());
+    let worst = difference(&ours, &theirs);
+    assert!(worst < 1e-5, "differs by {worst}");
+}
+
+#[test]
+fn bf16_changes_little() {
+    for architecture in [Architecture::Vgn, Architecture::TransformerSmall] {
+        let model = || architecture.build(N, 0).unwrap();
+        let full = run(model(), EXECUTION).unwrap();
+        let half = run(model(), Execution { bf16: true, channels_last: true, ..EXECUTION }).unwrap();
+        let worst = (&full.quality - &half.quality).abs().max().double_value(&[]);
+        println!("{architecture}: bf16 moves the quality by {worst:.4}");
+        assert!(worst > 0.0 && worst < 0.03, "{architecture}: by {worst}");
+    }
+}
+
+#[test]
+fn a_model_is_given_back_as_it_came() {
+    for channels_last in [false, true] {
+        let executor = Executor::new(vgn(), Execution { channels_last, ..EXECUTION }).unwrap();
+        assert_eq!(executor.to_model(), vgn());
+    }
+}
+
+fn refusal(change: impl FnOnce(&mut GraphProto)) -> String {
+    let mut model = vgn();
+    change(model.graph.as_mut().unwrap());
+    run(model, EXECUTION).err().expect("it cannot be executed").to_string()
+}
+
+#[test]
+fn what_is_not_understood_is_refused_by_name() {
+    let error = refusal(|graph| graph.node[1].op_type = Some("Tan".to_owned()));
+    assert!(error.contains("Relu_1") && error.contains("`Tan`"), "{error}");
+    let error = refusal(|graph| graph.node[1].domain = Some("com.example".to_owned()));
+    assert!(error.contains("Relu_1"), "{error}");
+    let error = refusal(|graph| graph.node[0].attribute.push(AttributeProto::string("auto_pad", "SAME_UPPER")));
+    assert!(error.contains("Conv_0") && error.contains("`auto_pad`"), "{error}");
+    let error = refusal(|graph| {
+        let pads = graph.node[0].attribute.iter_mut().find(|a| a.name() == "pads").unwrap();
+        pads.ints = vec![2, 2, 2, 1, 1, 1];
+    });
+    assert!(error.contains("[2, 2, 2] before and [1, 1, 1] after"), "{error}");
+    let error = refusal(|graph| {
+        let resize = graph.node.iter_mut().find(|node| node.op_type() == "Resize").unwrap();
+        resize.attribute[1] = AttributeProto::string("coordinate_transformation_mode", "align_corners");
+    });
+    assert!(error.contains("Resize") && error.contains("`align_corners`"), "{error}");
+    let error = refusal(|graph| graph.node[1].input[0] = "nowhere".to_owned());
+    assert!(error.contains("Relu_1") && error.contains("`nowhere`"), "{error}");
+    let error = refusal(|graph| graph.initializer[0].dims = vec![16, 1, 125]);
+    assert!(error.contains("Conv_0"), "{error}");
+    let error = refusal(|graph| {
+        graph.node.pop();
+    });
+    assert!(error.contains("`rotation`"), "{error}");
+}

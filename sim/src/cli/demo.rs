@@ -1,0 +1,130 @@
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use clap::Args;
+use comfy_table::{CellAlignment, Table, presets};
+use grasp::Grasp;
+use grasp_client::{Client, Detection, LocalServer, Options};
+use grasp_sim::TABLE_HEIGHT;
+use grasp_sim::benchmark::Benchmark;
+use grasp_sim::physics::World;
+use grasp_sim::picture::{Picture, object_color, quality_color};
+use grasp_sim::trial::{Outcome, execute};
+use nalgebra::{UnitQuaternion, Vector3};
+
+use super::SceneArgs;
+
+/// Rows of the table of grasps.
+const SHOWN: usize = 8;
+
+/// Starts graspd, shows it a simulated scene, and executes the best of the grasps it answers with.
+#[derive(Args)]
+pub struct Demo {
+    /// The server's binary.
+    #[arg(long)]
+    graspd: PathBuf,
+
+    /// The server's models.
+    #[arg(long)]
+    models: PathBuf,
+
+    #[command(flatten)]
+    scene: SceneArgs,
+
+    /// Where the picture goes.
+    #[arg(long, default_value = "demo.png")]
+    picture: PathBuf,
+}
+
+impl Demo {
+    pub fn run(self) -> anyhow::Result<()> {
+        let benchmark = Benchmark {
+            kind: self.scene.kind(),
+            objects: self.scene.objects()?,
+            count: 5,
+            views: self.scene.views()?,
+            noise: !self.scene.no_noise,
+            rounds: 1,
+            seed: self.scene.seed,
+        };
+        let (world, mut rng) = benchmark.scene(0);
+        let observation = benchmark
+            .observe(&world, &mut rng)
+            .context("the cameras see nothing of this scene; another --seed makes another one")?;
+        println!("a {:?} scene of {} objects, seed {}", self.scene.kind(), world.objects().len(), self.scene.seed);
+        println!("seen in {} depth image(s), fused into 40×40×40 voxels of 7.5 mm", observation.views.len());
+
+        let server = LocalServer::spawn(&self.graspd, [Path::new("--models"), &self.models])?;
+        println!("graspd listens on {}", server.grpc());
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let detection = runtime.block_on(async {
+            let client = Client::connect(server.grpc().to_string()).await?;
+            // The best voxel down to 0.5 where nothing reaches the threshold: a demo should try something.
+            let options = Options { force: Some(0.5), ..Options::default() };
+            client.detect(&observation.volume, options).await
+        })?;
+        print_detection(&detection);
+
+        let best = detection.grasps.first().context("no grasp was found; another --seed makes another scene")?;
+        let outcome = execute(&mut world.clone(), &best.pose);
+        match outcome {
+            Outcome::Lifted { object, width } => {
+                let name = world.objects().iter().find(|body| body.id == object).map(|body| body.object.name.as_str());
+                println!("the best one, executed: lifted {} ({:.0} mm wide)", name.unwrap_or("it"), width * 1e3);
+            }
+            failure => println!("the best one, executed: not lifted ({failure:?})"),
+        }
+
+        draw(&world, &detection.grasps).save(&self.picture)?;
+        println!("drawn in {}", self.picture.display());
+
+        let status = server.stop()?;
+        anyhow::ensure!(status.success(), "graspd did not stop cleanly: {status}");
+        println!("graspd stopped cleanly");
+        Ok(())
+    }
+}
+
+fn print_detection(detection: &Detection) {
+    let mut table = Table::new();
+    table.load_style(presets::UTF8_HORIZONTAL_ONLY);
+    table.set_header(["quality", "x mm", "y mm", "z mm", "approach", "width mm"]);
+    for column in table.column_iter_mut() {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    for grasp in detection.grasps.iter().take(SHOWN) {
+        let p = grasp.pose.translation.vector * 1e3;
+        let off_vertical = angle_off_vertical(&grasp.pose.rotation).to_degrees();
+        table.add_row([
+            format!("{:.3}", grasp.quality),
+            format!("{:.1}", p.x),
+            format!("{:.1}", p.y),
+            format!("{:.1}", p.z),
+            format!("{off_vertical:.0}° off vertical"),
+            format!("{:.1}", grasp.width * 1e3),
+        ]);
+    }
+    println!("{} grasps from {} version {}:", detection.grasps.len(), detection.model, detection.version);
+    println!("{table}");
+}
+
+fn angle_off_vertical(rotation: &UnitQuaternion<f64>) -> f64 {
+    (rotation * Vector3::z()).angle(&-Vector3::z())
+}
+
+/// The scene, every proposal coloured by its quality, and the one that was executed as a solid hand.
+fn draw(world: &World, grasps: &[Grasp]) -> Picture {
+    let mut picture = Picture::of_workspace(1200, 900, TABLE_HEIGHT);
+    for (index, body) in world.objects().iter().enumerate() {
+        picture.mesh(&body.object.visual, &world.pose(body.id), body.scale, object_color(index));
+    }
+    for (index, grasp) in grasps.iter().enumerate() {
+        let color = quality_color(f64::from(grasp.quality));
+        if index == 0 {
+            picture.hand(&grasp.pose, grasp.width, color);
+        } else {
+            picture.gripper(&grasp.pose, grasp.width, color);
+        }
+    }
+    picture
+}
