@@ -74,13 +74,11 @@ fn widen_f16(data: &[u8]) -> Vec<f32> {
 /// above 0, for 0 means unobserved. An unspecified type is written as F32.
 #[must_use]
 pub fn encode(volume: &Volume, dtype: pb::DataType, frame_id: impl Into<String>) -> pb::Volume {
-    let values = volume.values().iter();
+    let values = volume.values();
     let (dtype, data) = match dtype {
-        pb::DataType::F32 | pb::DataType::Unspecified => {
-            (pb::DataType::F32, values.flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>())
-        }
-        pb::DataType::F16 => (dtype, values.flat_map(|&v| f16::from_f32(v).to_le_bytes()).collect()),
-        pb::DataType::U8 => (dtype, values.map(|&v| ((v * 255.0).round() as u8).max(u8::from(v > 0.0))).collect()),
+        pb::DataType::F32 | pb::DataType::Unspecified => (pb::DataType::F32, to_bytes(values, f32::to_le_bytes)),
+        pb::DataType::F16 => (dtype, to_bytes(values, |v| f16::from_f32(v).to_le_bytes())),
+        pb::DataType::U8 => (dtype, to_bytes(values, |v| [((v * 255.0).round() as u8).max(u8::from(v > 0.0))])),
     };
     pb::Volume {
         data: data.into(),
@@ -92,6 +90,15 @@ pub fn encode(volume: &Volume, dtype: pb::DataType, frame_id: impl Into<String>)
         frame_id: frame_id.into(),
         stamp: None,
     }
+}
+
+/// Into a buffer of the final size, which the compiler turns into wide copies.
+fn to_bytes<const N: usize>(values: &[f32], encode: impl Fn(f32) -> [u8; N]) -> Vec<u8> {
+    let mut data = vec![0; N * values.len()];
+    for (bytes, &value) in data.as_chunks_mut().0.iter_mut().zip(values) {
+        *bytes = encode(value);
+    }
+    data
 }
 
 impl From<VolumeError> for FieldError {

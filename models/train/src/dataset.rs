@@ -171,7 +171,7 @@ impl Row {
             }
         }
         let rotation = Quaternion::new(qw, qx, qy, qz);
-        if !((rotation.norm() - 1.0).abs() < 1e-3) {
+        if !(0.999..1.001).contains(&rotation.norm()) {
             return Err(format!("the quaternion has length {}", rotation.norm()));
         }
         let success = match label {

@@ -18,5 +18,5 @@ pub use augment::{Augmentation, Transform};
 pub use checkpoint::{Checkpoint, CheckpointError};
 pub use dataset::{Dataset, DatasetError, Label, Scene};
 pub use execute::{ExecuteError, Execution, Executor, Outputs};
-pub use loss::{Loss, Sums, Targets};
+pub use loss::{Loss, LossError, Sums, Targets};
 pub use trainer::{Epoch, Record, Settings, TrainError, Trainer, Validation};

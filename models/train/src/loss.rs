@@ -3,6 +3,7 @@
 
 use grasp::VoxelOrigin;
 use tch::{Kind, Reduction, TchError, Tensor};
+use thiserror::Error;
 
 use crate::dataset::Label;
 use crate::execute::Outputs;
@@ -50,6 +51,17 @@ pub struct Sums {
     pub false_negatives: f64,
 }
 
+/// Why there is no loss.
+#[derive(Debug, Error)]
+pub enum LossError {
+    /// The network has lost its way.
+    #[error("the network's quality is not a number")]
+    NotANumber,
+    /// libtorch refused, because the outputs are of another batch.
+    #[error(transparent)]
+    Torch(#[from] TchError),
+}
+
 impl Targets {
     /// Adds a grasp in the volume number `index` of the batch; without effect when it lies outside the volume.
     pub fn push(&mut self, index: usize, label: &Label, n: usize, origin: VoxelOrigin) {
@@ -78,14 +90,17 @@ impl Targets {
     /// labelled voxels. `class_weights` weigh the cross-entropy of failures and successes.
     ///
     /// # Errors
-    /// When libtorch refuses, because the outputs are of another batch.
-    pub fn loss(&self, outputs: &Outputs, class_weights: [f64; 2]) -> Result<Loss, TchError> {
+    /// [`LossError`] when the outputs are not numbers, or of another batch.
+    pub fn loss(&self, outputs: &Outputs, class_weights: [f64; 2]) -> Result<Loss, LossError> {
         let device = outputs.quality.device();
         let voxels = outputs.quality.size()[2..].iter().product::<i64>();
         let cells = Tensor::f_from_slice(&self.cells)?.to_device(device);
         let labels = Tensor::f_from_slice(&self.labels)?.to_device(device);
 
         let quality = outputs.quality.f_flatten(0, -1)?.f_index_select(0, &cells)?;
+        if quality.isnan().any().int64_value(&[]) != 0 {
+            return Err(LossError::NotANumber);
+        }
         let [failure, success] = class_weights;
         let weights = &labels * (success - failure) + failure;
         let quality_loss = quality.f_binary_cross_entropy(&labels, Some(&weights), Reduction::Sum)?;

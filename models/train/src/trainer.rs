@@ -15,7 +15,7 @@ use crate::augment::{Augmentation, Transform};
 use crate::checkpoint::{Checkpoint, CheckpointError};
 use crate::dataset::Dataset;
 use crate::execute::{ExecuteError, Execution, Executor, Outputs};
-use crate::loss::{Loss, Sums, Targets};
+use crate::loss::{Loss, LossError, Sums, Targets};
 
 /// Everything that decides the outcome of a run, besides the network it starts from and the data.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -113,11 +113,12 @@ pub enum TrainError {
     /// The checkpoint cannot be continued.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
+    /// The loss cannot be computed.
+    #[error(transparent)]
+    Loss(#[from] LossError),
     /// The loss is no number any more.
-    #[error("the loss became {loss} at step {step}; use a smaller learning rate or a warm-up")]
+    #[error("the loss is no number any more at step {step}; use a smaller learning rate or a warm-up")]
     Diverged {
-        /// What it became.
-        loss: f64,
         /// When.
         step: u64,
     },
@@ -264,7 +265,7 @@ impl<'a> Trainer<'a> {
             learning_rate = self.learning_rate();
             if let Some(Loss { mean, sums }) = self.loss(batch)? {
                 if !sums.loss().is_finite() {
-                    return Err(TrainError::Diverged { loss: sums.loss(), step: self.steps() });
+                    return Err(self.diverged());
                 }
                 mean.f_backward()?;
                 self.adam.step(self.executor.parameters(), learning_rate);
@@ -355,7 +356,14 @@ impl<'a> Trainer<'a> {
         let edge = n as i64;
         let volumes = Tensor::f_from_slice(&values)?.f_reshape([batch.len() as i64, 1, edge, edge, edge])?;
         let outputs: Outputs = self.executor.forward(&volumes.to_device(self.executor.device()))?;
-        Ok(Some(targets.loss(&outputs, self.class_weights)?))
+        match targets.loss(&outputs, self.class_weights) {
+            Err(LossError::NotANumber) => Err(self.diverged()),
+            loss => Ok(Some(loss?)),
+        }
+    }
+
+    fn diverged(&self) -> TrainError {
+        TrainError::Diverged { step: self.steps() }
     }
 }
 

@@ -92,19 +92,25 @@ fn points(label: &Label) -> [Point3<f64>; 3] {
     [label.position, tips[0], tips[1]]
 }
 
+/// Where a point of a scene goes when the scene is changed.
+type Move<'a> = &'a dyn Fn(Point3<f64>) -> Point3<f64>;
+
 #[test]
 fn a_changed_label_is_the_label_of_the_changed_scene() {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let edge = N as f64;
+    let turned = |p: Point3<f64>| Point3::new(edge - p.y, p.x, p.z);
+    let mirrored = |p: Point3<f64>| Point3::new(edge - p.x, p.y, p.z);
+    let shifted = |p: Point3<f64>| Point3::new(p.x, p.y, p.z - 2.0);
+    let moves: [(Transform, Move); 3] = [
+        (Transform { turns: 1, ..Transform::default() }, &turned),
+        (Transform { mirror: true, ..Transform::default() }, &mirrored),
+        (Transform { shift: -2, ..Transform::default() }, &shifted),
+    ];
     for _ in 0..50 {
         let label = random_label(&mut rng);
-        let moves: [(Transform, fn(Point3<f64>, f64) -> Point3<f64>); 3] = [
-            (Transform { turns: 1, ..Transform::default() }, |p, edge| Point3::new(edge - p.y, p.x, p.z)),
-            (Transform { mirror: true, ..Transform::default() }, |p, edge| Point3::new(edge - p.x, p.y, p.z)),
-            (Transform { shift: -2, ..Transform::default() }, |p, _| Point3::new(p.x, p.y, p.z - 2.0)),
-        ];
         for (transform, expected) in moves {
-            let mut moved = points(&label).map(|point| expected(point, edge));
+            let mut moved = points(&label).map(expected);
             moved[1..].sort_by(|a, b| a.x.total_cmp(&b.x));
             for (got, expected) in points(&transform.label(&label, N)).iter().zip(&moved) {
                 assert!((got - expected).norm() < 1e-9, "{transform:?}: {got} instead of {expected}");

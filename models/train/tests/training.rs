@@ -111,6 +111,14 @@ fn a_run_without_scenes_is_refused() {
     assert!(error.to_string().contains("nothing to learn from"), "{error}");
 }
 
+#[test]
+fn a_run_that_diverges_says_so() {
+    let dataset = support::dataset(8, N);
+    let mut trainer = trainer(&dataset, &Settings { learning_rate: 1e30, ..settings() }, EXECUTION);
+    let error = (0..5).find_map(|_| trainer.epoch(&AtomicBool::new(false), |_, _| {}).err()).unwrap();
+    assert!(error.to_string().contains("smaller learning rate"), "{error}");
+}
+
 /// Outputs with the same values in every voxel of two volumes of 2³.
 fn outputs(quality: f32, rotation: [f32; 4], width: f32) -> Outputs {
     let fill = |values: &[f32]| {

@@ -107,7 +107,7 @@ fn reasons(dropped: &Dropped) -> [(&'static str, u32); 6] {
 
 fn numbers(header: &[&str]) -> Table {
     let mut table = Table::new();
-    table.load_style(presets::UTF8_HORIZONTAL_ONLY).set_header(right(header));
+    table.load_style(presets::NOTHING).set_header(right(header));
     table
 }
 
