@@ -1,4 +1,3 @@
-use nalgebra::{Point2, Point3};
 use thiserror::Error;
 
 /// A pinhole camera: pixels, with pixel centres at whole numbers. Optical axes: z forward, x right, y down.
@@ -21,12 +20,6 @@ pub struct Intrinsics {
 impl Intrinsics {
     /// The camera of the benchmark: 640×480, f = 540.
     pub const BENCHMARK: Self = Self { width: 640, height: 480, fx: 540.0, fy: 540.0, cx: 320.0, cy: 240.0 };
-
-    /// Projects a point of the camera frame (metres, z > 0) to pixels.
-    #[must_use]
-    pub fn project(&self, point: &Point3<f64>) -> Point2<f64> {
-        Point2::new(point.x / point.z * self.fx + self.cx, point.y / point.z * self.fy + self.cy)
-    }
 }
 
 /// A depth image: metres along the optical axis, row by row; 0, negative or NaN where there is no reading.

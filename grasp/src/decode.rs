@@ -172,7 +172,7 @@ pub fn decode(volume: &Volume, maps: &Maps, params: &DecodeParams) -> Result<Dec
     let floor = params.force.map_or(params.threshold, |force| force.min(params.threshold));
     for (index, &q) in smooth.iter().enumerate() {
         let width = maps.width[index];
-        if q < floor {
+        if q < floor || q <= 0.0 {
             dropped.below_threshold += 1;
         } else if !near_surface[index] {
             dropped.mask += 1;

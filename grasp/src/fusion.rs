@@ -43,13 +43,6 @@ impl Fusion {
         }
     }
 
-    /// Sets the truncation distance in metres, for a field that must agree with one of another resolution.
-    #[must_use]
-    pub fn with_truncation(mut self, truncation: f64) -> Self {
-        self.truncation = truncation as f32;
-        self
-    }
-
     /// Adds one view. `camera_from_task` (`T_camera_task`) maps points of the cube's frame into the camera.
     pub fn integrate(&mut self, image: &DepthImage, camera_from_task: &Isometry3<f64>) {
         let camera = image.intrinsics();
@@ -95,11 +88,6 @@ impl Fusion {
                 }
             }
         }
-    }
-
-    /// Forgets every view, keeping the memory.
-    pub fn clear(&mut self) {
-        self.voxels.fill(Voxel::default());
     }
 
     /// The values a network reads: `(tsdf + 1) / 2` near a surface that was seen, else 0. Indexed `[x][y][z]`.

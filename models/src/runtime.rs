@@ -91,7 +91,7 @@ pub enum LoadReason {
     Io(#[from] std::io::Error),
     /// ONNX Runtime refuses it.
     #[error("ONNX Runtime refuses it: {0}; if the file was cut short, fetch or export it again")]
-    Model(#[from] ort::Error),
+    Model(String),
     /// Its metadata cannot be.
     #[error(transparent)]
     Metadata(#[from] MetadataError),
@@ -104,6 +104,12 @@ pub enum LoadReason {
         /// What is different.
         what: String,
     },
+}
+
+impl From<ort::Error> for LoadReason {
+    fn from(error: ort::Error) -> Self {
+        Self::Model(error.to_string())
+    }
 }
 
 /// Loads ONNX Runtime, once: the library that `ORT_DYLIB_PATH` names, or else the system's.

@@ -115,8 +115,8 @@ impl Picture {
 
     /// An empty picture of the 0.3 m task cube from a good corner, with its table.
     pub fn of_workspace(width: usize, height: usize, table: f64) -> Picture {
-        let (eye, target) = (Point3::new(0.52, -0.34, 0.5), Point3::new(0.15, 0.15, 0.085));
-        let mut picture = Picture::looking_at(width, height, 0.56, eye, target);
+        let (eye, target) = (Point3::new(0.50, -0.30, 0.52), Point3::new(0.15, 0.15, 0.10));
+        let mut picture = Picture::looking_at(width, height, 0.48, eye, target);
         picture.table(table);
         picture
     }

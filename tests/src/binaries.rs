@@ -27,11 +27,21 @@ pub fn grasp() -> &'static Path {
     &BINARIES["grasp"]
 }
 
+/// The simulator.
+///
+/// # Panics
+/// When it does not build.
+#[must_use]
+pub fn grasp_sim() -> &'static Path {
+    &BINARIES["grasp-sim"]
+}
+
 fn build() -> HashMap<String, PathBuf> {
     let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let mut command = Command::new(env!("CARGO"));
     // From the workspace's root, as a relative CARGO_TARGET_DIR is meant.
-    command.current_dir(workspace).args(["build", "--bins", "--package", "graspd", "--package", "grasp-client"]);
+    // All of the workspace at once, as `make test` tests it: a package alone would want its dependencies built anew.
+    command.current_dir(workspace).args(["build", "--bins", "--workspace", "--exclude", "grasp-train"]);
     command.args(["--locked", "--message-format", "json-render-diagnostics"]);
     if !cfg!(debug_assertions) {
         command.arg("--release");

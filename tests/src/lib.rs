@@ -7,7 +7,7 @@ mod models;
 mod server;
 mod volumes;
 
-pub use binaries::{grasp, graspd};
+pub use binaries::{grasp, grasp_sim, graspd};
 pub use models::{RESOLUTION, TestModel, WIDTH};
 pub use server::Server;
 pub use volumes::{blobs, expected};

@@ -37,7 +37,7 @@ fn main() -> anyhow::Result<()> {
             let mut times: Vec<f64> = Vec::new();
             for _ in 0..STEPS {
                 let start = Instant::now();
-                let loss = targets.loss(&executor.forward(&volumes)?, [1.0, 1.0])?;
+                let loss = targets.loss(&executor.forward_at(&volumes, targets.cells())?, [1.0, 1.0])?;
                 loss.mean.backward();
                 adam.step(executor.parameters(), 1e-4);
                 times.push(start.elapsed().as_secs_f64());

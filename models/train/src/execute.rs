@@ -4,11 +4,13 @@
 //! floating-point initialiser a tensor that learns. Only what grasp networks use is here, and anything else is refused
 //! when the graph is loaded, by its name: an operator or a setting that was skipped would train another network.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use grasp_models::onnx::{AttributeProto, ModelProto, NodeProto, TensorError, TensorProto};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 use thiserror::Error;
+
+use crate::heads::{cubes, heads};
 
 /// An operator as ONNX names it, with the settings of it that are understood.
 const OPERATORS: &[(&str, &[&str])] = &[
@@ -85,6 +87,9 @@ pub enum ExecuteError {
     /// The graph does not compute this output.
     #[error("the graph has no output `{0}`")]
     Output(&'static str),
+    /// The voxels asked for are not in the batch.
+    #[error("these voxels cannot be taken from the maps: {0}")]
+    Cells(TchError),
     /// An initialiser's values cannot be used.
     #[error(transparent)]
     Tensor(#[from] TensorError),
@@ -99,7 +104,8 @@ fn supported() -> String {
 pub struct Execution {
     /// Where.
     pub device: Device,
-    /// Convolutions and matrix products in bfloat16, everything else in f32 (as PyTorch's autocast does).
+    /// Convolutions and matrix products in bfloat16, and what follows them as far as it does no harm (as in PyTorch's
+    /// autocast); weights, sums, softmax, layer norms and outputs in f32.
     pub bf16: bool,
     /// The channels of a voxel next to each other in memory.
     pub channels_last: bool,
@@ -112,9 +118,11 @@ pub struct Executor {
     /// In the order of the initialisers.
     parameters: Vec<(String, Tensor)>,
     constants: HashMap<String, Tensor>,
+    /// The nodes from which on single voxels can be computed.
+    heads: HashSet<usize>,
 }
 
-/// What a grasp network computes over a batch, f32.
+/// What a grasp network computes, f32: over a batch of volumes, or at single voxels, which are then volumes of 1³.
 pub struct Outputs {
     /// `[batch, 1, N, N, N]`, in [0, 1].
     pub quality: Tensor,
@@ -153,7 +161,8 @@ impl Executor {
                 constants.insert(output_name(node, 0), value.to_device(device));
             }
         }
-        Ok(Self { model, execution, parameters, constants })
+        let heads = heads(graph);
+        Ok(Self { model, execution, parameters, constants, heads })
     }
 
     /// The weights, by the names of their initialisers.
@@ -183,6 +192,28 @@ impl Executor {
     /// # Errors
     /// [`ExecuteError`] names the node at which it failed.
     pub fn forward(&self, volumes: &Tensor) -> Result<Outputs, ExecuteError> {
+        self.execute(volumes, None)
+    }
+
+    /// Runs the network as far as some voxels need it, which are given as flat indices into `[batch, N, N, N]`.
+    ///
+    /// # Errors
+    /// [`ExecuteError`] names the node at which it failed.
+    pub fn forward_at(&self, volumes: &Tensor, cells: &[i64]) -> Result<Outputs, ExecuteError> {
+        if !self.heads.is_empty() {
+            return self.execute(volumes, Some(cells));
+        }
+        let Outputs { quality, rotation, width } = self.forward(volumes)?;
+        let at = |map: &Tensor, channels: i64| {
+            cubes(map, cells, 1)
+                .and_then(|values| values.f_reshape([-1, channels, 1, 1, 1]))
+                .map_err(ExecuteError::Cells)
+        };
+        Ok(Outputs { quality: at(&quality, 1)?, rotation: at(&rotation, 4)?, width: at(&width, 1)? })
+    }
+
+    /// The nodes in order; the heads at `cells` alone, if any are given.
+    fn execute(&self, volumes: &Tensor, cells: Option<&[i64]>) -> Result<Outputs, ExecuteError> {
         let graph = self.model.graph.as_ref().ok_or(ExecuteError::NoGraph)?;
         let mut values: HashMap<String, Tensor> = HashMap::with_capacity(graph.node.len());
         if let Some(input) = graph.input.first() {
@@ -191,7 +222,7 @@ impl Executor {
         for (name, tensor) in self.constants.iter().chain(self.parameters.iter().map(|(name, weight)| (name, weight))) {
             values.insert(name.clone(), tensor.shallow_clone());
         }
-        for node in graph.node.iter().filter(|node| node.op_type() != "Constant") {
+        for (index, node) in graph.node.iter().enumerate().filter(|(_, node)| node.op_type() != "Constant") {
             let inputs = node
                 .input
                 .iter()
@@ -206,7 +237,10 @@ impl Executor {
                 })
                 .collect::<Result<Vec<_>, _>>()?;
             let step = Step { node, inputs, execution: self.execution };
-            let outputs = step.run()?;
+            let outputs = match cells.filter(|_| self.heads.contains(&index)) {
+                Some(cells) => vec![step.convolution_at(cells)?],
+                None => step.run()?,
+            };
             values.extend(node.output.iter().cloned().zip(outputs));
         }
         let mut output = |name| match values.remove(name) {
@@ -282,7 +316,7 @@ impl Step<'_> {
             "Erf" => one(self.input(0)?.f_erf()),
             "Expand" => one(self.input(0)?.f_broadcast_to(self.whole(1)?)),
             "InstanceNormalization" => {
-                let [x, scale, bias] = [self.full(0)?, self.full(1)?, self.full(2)?];
+                let [x, scale, bias] = [self.input(0)?, self.input(1)?, self.input(2)?];
                 let epsilon = self.float("epsilon", 1e-5);
                 one(x.f_instance_norm(Some(scale), Some(bias), None, None, true, 0.0, epsilon, false))
             }
@@ -352,6 +386,19 @@ impl Step<'_> {
             self.int("group", 1),
         );
         Ok(vec![y.map_err(|source| self.torch(source))?])
+    }
+
+    /// A convolution that keeps the size, at some voxels: `[voxels, channels, 1, 1, 1]`. In f32, there are few of them.
+    fn convolution_at(&self, cells: &[i64]) -> Result<Tensor, ExecuteError> {
+        let (x, weight) = (self.input(0)?, self.input(1)?);
+        let edge = weight.size().last().copied().unwrap_or(1);
+        // Channels fastest, as in the cubes.
+        let compute = || {
+            let weight = weight.f_permute([0, 2, 3, 4, 1])?.f_reshape([weight.size()[0], -1])?;
+            let y = cubes(x, cells, edge)?.f_linear(&weight, self.optional(2))?;
+            y.f_reshape([cells.len() as i64, -1, 1, 1, 1])
+        };
+        compute().map_err(|source| self.torch(source))
     }
 
     /// Repeats voxels: `Resize` as far as it agrees with libtorch's `nearest`.

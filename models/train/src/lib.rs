@@ -10,6 +10,7 @@ mod checkpoint;
 pub mod curves;
 mod dataset;
 mod execute;
+mod heads;
 mod loss;
 mod trainer;
 

@@ -57,7 +57,7 @@ pub enum LossError {
     /// The network has lost its way.
     #[error("the network's quality is not a number")]
     NotANumber,
-    /// libtorch refused, because the outputs are of another batch.
+    /// libtorch refused, because the outputs are of other voxels.
     #[error(transparent)]
     Torch(#[from] TchError),
 }
@@ -80,24 +80,28 @@ impl Targets {
         self.cells.len()
     }
 
+    /// Which: flat indices into `[batch, N, N, N]`.
+    #[must_use]
+    pub fn cells(&self) -> &[i64] {
+        &self.cells
+    }
+
     /// Whether none is.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.cells.is_empty()
     }
 
-    /// The loss of a network's outputs: L = w·BCE(q, q*) + q*·(1 − max |r·r*| + 0.01·(w − w*)²), averaged over the
-    /// labelled voxels. `class_weights` weigh the cross-entropy of failures and successes.
+    /// The loss of a network's outputs at [these voxels](Self::cells): L = w·BCE(q, q*) + q*·(1 − max |r·r*| +
+    /// 0.01·(w − w*)²), averaged over them. `class_weights` weigh the cross-entropy of failures and successes.
     ///
     /// # Errors
-    /// [`LossError`] when the outputs are not numbers, or of another batch.
+    /// [`LossError`] when the outputs are not numbers, or of other voxels.
     pub fn loss(&self, outputs: &Outputs, class_weights: [f64; 2]) -> Result<Loss, LossError> {
         let device = outputs.quality.device();
-        let voxels = outputs.quality.size()[2..].iter().product::<i64>();
-        let cells = Tensor::f_from_slice(&self.cells)?.to_device(device);
         let labels = Tensor::f_from_slice(&self.labels)?.to_device(device);
 
-        let quality = outputs.quality.f_flatten(0, -1)?.f_index_select(0, &cells)?;
+        let quality = outputs.quality.f_reshape_as(&labels)?;
         if quality.isnan().any().int64_value(&[]) != 0 {
             return Err(LossError::NotANumber);
         }
@@ -105,17 +109,13 @@ impl Targets {
         let weights = &labels * (success - failure) + failure;
         let quality_loss = quality.f_binary_cross_entropy(&labels, Some(&weights), Reduction::Sum)?;
 
-        // Channel c of voxel v of volume b lies at (4 b + c) · voxels + v.
-        let first = cells.divide_scalar_mode(voxels, "floor") * (3 * voxels) + &cells;
-        let channels = Tensor::arange(4, (Kind::Int64, device)) * voxels;
-        let channels = (first.unsqueeze(1) + channels).flatten(0, 1);
-        let rotation = outputs.rotation.f_flatten(0, -1)?.f_index_select(0, &channels)?.f_reshape([-1, 1, 4])?;
-        let both = Tensor::f_from_slice(self.rotations.as_flattened().as_flattened())?;
-        let cosines = (rotation * both.to_device(device).f_reshape([-1, 2, 4])?).sum_dim_intlist(-1, false, None).abs();
+        let both = Tensor::f_from_slice(self.rotations.as_flattened().as_flattened())?.to_device(device);
+        let rotation = outputs.rotation.f_reshape([-1, 1, 4])?;
+        let cosines = rotation.f_mul(&both.f_reshape([-1, 2, 4])?)?.sum_dim_intlist(-1, false, None).abs();
         let rotation_loss: Tensor = &labels * (1.0 - cosines.amax([1], false));
         let rotation_loss = rotation_loss.sum(None);
 
-        let width = outputs.width.f_flatten(0, -1)?.f_index_select(0, &cells)?;
+        let width = outputs.width.f_reshape_as(&labels)?;
         let expected = Tensor::f_from_slice(&self.widths)?.to_device(device);
         let width_loss: Tensor = &labels * (width - expected).square();
         let width_loss = width_loss.sum(None) * WIDTH_WEIGHT;

@@ -14,7 +14,7 @@ use crate::adam::Adam;
 use crate::augment::{Augmentation, Transform};
 use crate::checkpoint::{Checkpoint, CheckpointError};
 use crate::dataset::Dataset;
-use crate::execute::{ExecuteError, Execution, Executor, Outputs};
+use crate::execute::{ExecuteError, Execution, Executor};
 use crate::loss::{Loss, LossError, Sums, Targets};
 
 /// Everything that decides the outcome of a run, besides the network it starts from and the data.
@@ -355,7 +355,7 @@ impl<'a> Trainer<'a> {
         }
         let edge = n as i64;
         let volumes = Tensor::f_from_slice(&values)?.f_reshape([batch.len() as i64, 1, edge, edge, edge])?;
-        let outputs: Outputs = self.executor.forward(&volumes.to_device(self.executor.device()))?;
+        let outputs = self.executor.forward_at(&volumes.to_device(self.executor.device()), targets.cells())?;
         match targets.loss(&outputs, self.class_weights) {
             Err(LossError::NotANumber) => Err(self.diverged()),
             loss => Ok(Some(loss?)),

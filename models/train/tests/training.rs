@@ -7,9 +7,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use grasp::VoxelOrigin;
 use grasp_models::Architecture;
 use grasp_train::{
-    Augmentation, Checkpoint, CheckpointError, Dataset, Epoch, Execution, Outputs, Record, Settings, Targets, Trainer,
+    Augmentation, Checkpoint, CheckpointError, Dataset, Epoch, Execution, Label, Outputs, Record, Settings, Targets,
+    Trainer,
 };
-use nalgebra::UnitQuaternion;
+use nalgebra::{Point3, UnitQuaternion, Vector3};
 use tch::{Device, Tensor};
 
 const N: usize = 16;
@@ -119,33 +120,28 @@ fn a_run_that_diverges_says_so() {
     assert!(error.to_string().contains("smaller learning rate"), "{error}");
 }
 
-/// Outputs with the same values in every voxel of two volumes of 2³.
+/// The same outputs at two voxels.
 fn outputs(quality: f32, rotation: [f32; 4], width: f32) -> Outputs {
-    let fill = |values: &[f32]| {
-        let channels = values.len() as i64;
-        (Tensor::from_slice(values).reshape([1, channels, 1, 1, 1])
-            * Tensor::ones([2, 1, 2, 2, 2], (tch::Kind::Float, Device::Cpu)))
-        .contiguous()
-    };
+    let fill = |values: &[f32]| Tensor::from_slice(values).reshape([1, -1, 1, 1, 1]).repeat([2, 1, 1, 1, 1]);
     Outputs { quality: fill(&[quality]), rotation: fill(&rotation), width: fill(&[width]) }
 }
 
 #[test]
 fn the_loss_is_the_papers() {
     let n = 2;
-    let label = grasp_train::Label {
-        position: nalgebra::Point3::new(1.2, 0.7, 1.9),
+    let label = Label {
+        position: Point3::new(1.2, 0.7, 1.9),
         rotation: UnitQuaternion::from_euler_angles(0.3, -0.8, 1.1),
         width: 4.0,
         success: true,
     };
     let mut targets = Targets::default();
     targets.push(1, &label, n, VoxelOrigin::Center);
-    targets.push(0, &grasp_train::Label { success: false, ..label }, n, VoxelOrigin::Center);
+    targets.push(0, &Label { success: false, ..label }, n, VoxelOrigin::Center);
     assert_eq!(targets.len(), 2);
 
     // The same rotation, turned by 180° about the approach, with either sign, costs nothing.
-    let half_turn = UnitQuaternion::from_axis_angle(&nalgebra::Vector3::z_axis(), std::f64::consts::PI);
+    let half_turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI);
     for rotation in [label.rotation, label.rotation * half_turn] {
         for sign in [1.0, -1.0] {
             let rotation: [f32; 4] = (rotation.coords * sign).map(|c| c as f32).into();
@@ -157,7 +153,7 @@ fn the_loss_is_the_papers() {
             assert_eq!((loss.sums.accuracy(), loss.sums.precision(), loss.sums.recall()), (0.5, 0.5, 1.0));
         }
     }
-    let quarter = UnitQuaternion::from_axis_angle(&nalgebra::Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
+    let quarter = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
     let rotation: [f32; 4] = (label.rotation * quarter).coords.map(|c| c as f32).into();
     let loss = targets.loss(&outputs(0.8, rotation, 4.0), [1.0, 3.0]).unwrap();
     assert!((loss.sums.rotation - (1.0 - 0.5_f64.sqrt())).abs() < 1e-5, "a quarter turn is the worst about z");
@@ -165,29 +161,22 @@ fn the_loss_is_the_papers() {
 }
 
 #[test]
-fn only_the_labelled_voxel_learns() {
-    for (origin, voxel) in [(VoxelOrigin::Center, [1, 0, 1]), (VoxelOrigin::Corner, [1, 1, 1])] {
-        let mut out = outputs(0.5, [0.0, 0.0, 0.0, 1.0], 1.0);
-        out.quality = out.quality.set_requires_grad(true);
-        out.rotation = out.rotation.set_requires_grad(true);
-        let label = grasp_train::Label {
-            position: nalgebra::Point3::new(1.2, 0.7, 1.4),
-            rotation: UnitQuaternion::from_euler_angles(0.3, -0.8, 1.1),
-            width: 4.0,
-            success: true,
-        };
+fn a_grasp_stands_for_the_voxel_of_its_convention() {
+    let at = |x: f64, y: f64, z: f64| Label {
+        position: Point3::new(x, y, z),
+        rotation: UnitQuaternion::identity(),
+        width: 4.0,
+        success: true,
+    };
+    let cell = |x: i64, y: i64, z: i64| (x * 4 + y) * 4 + z;
+    let cells = |label: &Label, origin| {
         let mut targets = Targets::default();
-        targets.push(1, &label, 2, origin);
-        targets.push(0, &grasp_train::Label { position: nalgebra::Point3::new(0.5, 0.5, 2.6), ..label }, 2, origin);
-        assert_eq!(targets.len(), 1, "the second lies outside the volume");
-        targets.loss(&out, [1.0, 1.0]).unwrap().mean.backward();
-        let [x, y, z] = voxel;
-        for gradient in [out.quality.grad(), out.rotation.grad()] {
-            assert_eq!(
-                gradient.abs().sum(None),
-                gradient.get(1).select(1, x).select(1, y).select(1, z).abs().sum(None)
-            );
-            assert!(gradient.abs().sum(None).double_value(&[]) > 0.0);
-        }
-    }
+        targets.push(2, label, 4, origin);
+        targets.cells().iter().map(|cell| cell - 2 * 64).collect::<Vec<_>>()
+    };
+    assert_eq!(cells(&at(1.2, 0.7, 3.4), VoxelOrigin::Center), [cell(1, 0, 3)]);
+    assert_eq!(cells(&at(1.2, 0.7, 3.4), VoxelOrigin::Corner), [cell(1, 1, 3)]);
+    assert_eq!(cells(&at(1.2, 0.7, 3.6), VoxelOrigin::Center), [cell(1, 0, 3)]);
+    assert!(cells(&at(1.2, 0.7, 3.6), VoxelOrigin::Corner).is_empty(), "the nearest index is outside");
+    assert!(cells(&at(1.2, -0.7, 3.6), VoxelOrigin::Center).is_empty());
 }

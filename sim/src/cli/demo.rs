@@ -1,4 +1,4 @@
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Context;
 use clap::Args;
@@ -54,7 +54,8 @@ impl Demo {
         println!("a {:?} scene of {} objects, seed {}", self.scene.kind(), world.objects().len(), self.scene.seed);
         println!("seen in {} depth image(s), fused into 40×40×40 voxels of 7.5 mm", observation.views.len());
 
-        let server = LocalServer::spawn(&self.graspd, [Path::new("--models"), &self.models])?;
+        let arguments = ["--log".as_ref(), "warn".as_ref(), "--models".as_ref(), self.models.as_os_str()];
+        let server = LocalServer::spawn(&self.graspd, arguments)?;
         println!("graspd listens on {}", server.grpc());
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let detection = runtime.block_on(async {
@@ -63,6 +64,8 @@ impl Demo {
             let options = Options { force: Some(0.5), ..Options::default() };
             client.detect(&observation.volume, options).await
         })?;
+        // With its runtime the client's connection closes, which the server would wait for when it is told to stop.
+        drop(runtime);
         print_detection(&detection);
 
         let best = detection.grasps.first().context("no grasp was found; another --seed makes another scene")?;
@@ -106,6 +109,16 @@ fn print_detection(detection: &Detection) {
     }
     println!("{} grasps from {} version {}:", detection.grasps.len(), detection.model, detection.version);
     println!("{table}");
+    let ms = |seconds: f64| format!("{:.2} ms", seconds * 1e3);
+    let latency = &detection.latency;
+    println!(
+        "latency: queue {}, pre-processing {}, inference {}, post-processing {}, total {}",
+        ms(latency.queue),
+        ms(latency.preprocessing),
+        ms(latency.inference),
+        ms(latency.postprocessing),
+        ms(latency.total)
+    );
 }
 
 fn angle_off_vertical(rotation: &UnitQuaternion<f64>) -> f64 {

@@ -1,0 +1,89 @@
+//! Which part of a graph can be computed at single voxels.
+//!
+//! Only labelled voxels, a few dozen of 64,000, enter the loss. Behind its last convolutions, the heads, a grasp network
+//! treats every voxel on its own, so while training the heads are computed where there are labels: the same numbers for
+//! a small part of the work, which for VGN is most of a step.
+
+use std::collections::HashSet;
+
+use grasp_models::onnx::{GraphProto, NodeProto};
+use tch::{Kind, TchError, Tensor};
+
+/// Indices of the convolutions from which on every voxel is on its own; none if the graph is not of that kind.
+pub(crate) fn heads(graph: &GraphProto) -> HashSet<usize> {
+    // From the outputs backwards: values of which a node needs more than the voxel it computes.
+    let mut whole: HashSet<&str> = HashSet::new();
+    let (mut heads, mut behind) = (HashSet::new(), HashSet::new());
+    for (index, node) in graph.node.iter().enumerate().rev() {
+        let single = !node.output.iter().any(|output| whole.contains(output.as_str()));
+        if single && is_pointwise(node) {
+            behind.insert(index);
+            continue;
+        }
+        if single && is_head(node) {
+            heads.insert(index);
+        }
+        whole.extend(node.input.iter().map(String::as_str));
+    }
+    // Whatever lies behind the heads, and every output, must come from them alone, or from constants.
+    let mut known: HashSet<&str> = graph.initializer.iter().map(|tensor| tensor.name()).collect();
+    for (index, node) in graph.node.iter().enumerate() {
+        let fits = !behind.contains(&index) || node.input.iter().all(|input| known.contains(input.as_str()));
+        if fits && (behind.contains(&index) || heads.contains(&index) || node.op_type() == "Constant") {
+            known.extend(node.output.iter().map(String::as_str));
+        }
+    }
+    let all = graph.output.iter().all(|output| known.contains(output.name()));
+    if all { heads } else { HashSet::new() }
+}
+
+fn ints<'a>(node: &'a NodeProto, name: &str) -> &'a [i64] {
+    node.attribute(name).map_or(&[], |attribute| &attribute.ints)
+}
+
+/// A convolution that gives a voxel from the cube around it.
+fn is_head(node: &NodeProto) -> bool {
+    let kernel = ints(node, "kernel_shape");
+    node.op_type() == "Conv"
+        && kernel.len() == 3
+        && kernel.iter().all(|&edge| edge == kernel[0] && edge % 2 == 1)
+        && ints(node, "pads").iter().all(|&pad| pad == kernel[0] / 2)
+        && ["strides", "dilations"].iter().all(|name| ints(node, name).iter().all(|&step| step == 1))
+        && node.attribute("group").is_none_or(|group| group.i() == 1)
+}
+
+/// An operation that treats every voxel on its own.
+fn is_pointwise(node: &NodeProto) -> bool {
+    match node.op_type() {
+        "Add" | "Clip" | "Div" | "Expand" | "LeakyRelu" | "Mul" | "Relu" | "Shape" | "Sigmoid" => true,
+        "ReduceL2" => ints(node, "axes") == [1],
+        "Split" => node.attribute("axis").is_some_and(|axis| axis.i() == 1),
+        _ => false,
+    }
+}
+
+/// The cubes of `edge`³ voxels around some voxels of `x` `[batch, channels, N, N, N]`, zeros beyond its faces:
+/// `[voxels, edge³ · channels]`, channels fastest. `cells` are flat indices into `[batch, N, N, N]`.
+pub(crate) fn cubes(x: &Tensor, cells: &[i64], edge: i64) -> Result<Tensor, TchError> {
+    let (_, channels, depth, height, width) = x.size5()?;
+    let reach = edge / 2;
+    let size = cells.len() * edge.pow(3) as usize;
+    let (mut rows, mut inside) = (Vec::with_capacity(size), Vec::with_capacity(size));
+    for &cell in cells {
+        let (volume, [cx, cy, cz]) =
+            (cell / (depth * height * width), [cell / (height * width) % depth, cell / width % height, cell % width]);
+        for x in cx - reach..=cx + reach {
+            for y in cy - reach..=cy + reach {
+                for z in cz - reach..=cz + reach {
+                    let there = (0..depth).contains(&x) && (0..height).contains(&y) && (0..width).contains(&z);
+                    rows.push(if there { ((volume * depth + x) * height + y) * width + z } else { 0 });
+                    inside.push(there);
+                }
+            }
+        }
+    }
+    let rows = Tensor::f_from_slice(&rows)?.f_to_device(x.device())?;
+    let inside = Tensor::f_from_slice(&inside)?.f_to_device(x.device())?.to_kind(Kind::Float).f_unsqueeze(1)?;
+    let voxels = x.f_permute([0, 2, 3, 4, 1])?.f_reshape([-1, channels])?;
+    (voxels.f_index_select(0, &rows)? * inside).f_reshape([cells.len() as i64, -1])
+}
