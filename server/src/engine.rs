@@ -13,8 +13,6 @@ use thiserror::Error;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 use tracing::{Span, error, info};
 
-use crate::refusal::Refusal;
-
 /// One model: its queue, and what is said of it. The sessions that take from the queue end when the engine is dropped.
 pub(crate) struct Engine {
     pub entry: Entry,
@@ -35,6 +33,16 @@ pub(crate) struct Sessions {
     warm: mpsc::Receiver<Result<(), EngineError>>,
     /// Held for the sessions that are still to be started.
     report: mpsc::Sender<Result<(), EngineError>>,
+}
+
+/// Why a volume was not taken.
+#[derive(Debug, Error)]
+#[error("the model `{model}` has {waiting} requests waiting, no more are taken; come back in {retry_after:?}")]
+pub(crate) struct Overloaded {
+    model: String,
+    waiting: usize,
+    /// When a place in the queue should be free again.
+    pub retry_after: Duration,
 }
 
 /// What a session made of a volume.
@@ -103,8 +111,8 @@ impl Engine {
     }
 
     /// Queues a volume, or refuses at once. A caller that drops the reply has gone: its job is skipped.
-    pub fn submit(&self, volume: Volume, params: DecodeParams, span: Span) -> Result<Reply, Refusal> {
-        let place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| Refusal::Overloaded {
+    pub fn submit(&self, volume: Volume, params: DecodeParams, span: Span) -> Result<Reply, Overloaded> {
+        let place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| Overloaded {
             model: self.entry.metadata.name.clone(),
             waiting: self.capacity,
             retry_after: self.pace.get(),
@@ -113,11 +121,10 @@ impl Engine {
         // Before the session can take it, or the gauge could fall below 0.
         self.waiting.inc();
         let job = Job { volume, params, span, submitted: Instant::now(), place, reply };
-        self.queue.try_send(job).map_err(|_| {
-            // Who has a place has room in the queue, so the sessions are gone.
+        if self.queue.try_send(job).is_err() {
+            // Who has a place has room in the queue, so the sessions are gone: the reply says so, for the job is dropped.
             self.waiting.dec();
-            EngineError::Gone
-        })?;
+        }
         Ok(answer)
     }
 }

@@ -5,7 +5,7 @@ use thiserror::Error;
 use tonic::metadata::MetadataValue;
 use tonic::{Code, Status};
 
-use crate::engine::EngineError;
+use crate::engine::{EngineError, Overloaded};
 
 /// Why a request gets no grasps.
 #[derive(Debug, Error)]
@@ -14,8 +14,8 @@ pub(crate) enum Refusal {
     Field(#[from] FieldError),
     #[error("model is `{wanted}`, there is no such; there are {available}")]
     UnknownModel { wanted: String, available: String },
-    #[error("the model `{model}` has {waiting} requests waiting, no more are taken; come back in {retry_after:?}")]
-    Overloaded { model: String, waiting: usize, retry_after: Duration },
+    #[error(transparent)]
+    Overloaded(#[from] Overloaded),
     #[error("the server is warming up; come back in {0:?}")]
     Starting(Duration),
     #[error("the server is shutting down; another one may answer")]
@@ -32,7 +32,7 @@ impl Refusal {
         match self {
             Self::Field(_) => Code::InvalidArgument,
             Self::UnknownModel { .. } => Code::NotFound,
-            Self::Overloaded { .. } => Code::ResourceExhausted,
+            Self::Overloaded(_) => Code::ResourceExhausted,
             Self::Starting(_) | Self::Draining => Code::Unavailable,
             Self::Failed(_) => Code::Internal,
         }
@@ -41,7 +41,8 @@ impl Refusal {
     /// When it is worth coming back, where it is.
     fn retry_after(&self) -> Option<Duration> {
         match self {
-            Self::Overloaded { retry_after, .. } | Self::Starting(retry_after) => Some(*retry_after),
+            Self::Overloaded(overloaded) => Some(overloaded.retry_after),
+            Self::Starting(retry_after) => Some(*retry_after),
             Self::Field(_) | Self::UnknownModel { .. } | Self::Draining | Self::Failed(_) => None,
         }
     }

@@ -1,0 +1,78 @@
+//! Every command of the README, in its order, as someone new would type it.
+
+use std::fs;
+use std::net::TcpListener;
+use std::path::Path;
+use std::process::Command;
+
+use grasp_tests::{grasp, grasp_sim, graspd};
+
+const ROOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
+
+/// The lines of the README's blocks of one language, in order.
+fn blocks(language: &str) -> Vec<String> {
+    let readme = fs::read_to_string(format!("{ROOT}/README.md")).unwrap();
+    let fence = format!("```{language}\n");
+    readme.split(&fence).skip(1).map(|rest| rest.split("```").next().unwrap().to_owned()).collect()
+}
+
+/// What other recipes run: `make` itself, and training, which its own crate's tests run from this same page.
+fn is_run_elsewhere(line: &str) -> bool {
+    ["make ", "cargo ", "export PATH", "export LIBTORCH", "grasp-train "].iter().any(|prefix| line.starts_with(prefix))
+}
+
+#[test]
+fn every_make_target_of_the_readme_exists() {
+    let makefile = fs::read_to_string(format!("{ROOT}/Makefile")).unwrap();
+    let lines = blocks("sh").join("\n");
+    let targets: Vec<&str> =
+        lines.lines().filter_map(|line| line.strip_prefix("make ")?.split_whitespace().next()).collect();
+    assert!(targets.len() >= 3, "{targets:?}");
+    for target in targets {
+        assert!(makefile.contains(&format!("\n{target}:")), "the Makefile has no target {target}");
+    }
+}
+
+#[test]
+fn every_command_of_the_readme_works() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["models", "deploy", "proto"] {
+        std::os::unix::fs::symlink(Path::new(ROOT).join(name), folder.path().join(name)).unwrap();
+    }
+    // The page's ports may be taken on this machine.
+    let [grpc, http] = [50051, 9090].map(|_| TcpListener::bind("127.0.0.1:0").unwrap());
+    let [grpc, http] = [grpc, http].map(|listener| listener.local_addr().unwrap().port().to_string());
+    let mut script = String::from("set -eu\n");
+    for line in blocks("sh").iter().flat_map(|block| block.lines()).filter(|line| !is_run_elsewhere(line)) {
+        if line.starts_with("graspd ") {
+            // Whoever types this waits for `ready` before the next line.
+            script += &format!("{} > server.log\n", line.trim_end_matches('&'));
+            script = script.replace("> server.log\n", "> server.log & server=$!\ntrap 'kill $server' EXIT\n");
+            script += "until grep -q ready server.log; do kill -0 $server; sleep 0.1; done\n";
+        } else {
+            script += &format!("echo '$ {}'\n{line}\n", line.replace('\'', ""));
+        }
+    }
+    script += &format!("cat > client.py <<'END'\n{}END\n", blocks("python").concat());
+    script +=
+        "$GRASPD_PYTHON -m grpc_tools.protoc -Iproto/proto --python_out=. --grpc_python_out=. grasp/v1/grasp.proto\n";
+    script += "$GRASPD_PYTHON client.py\n";
+    script += "trap - EXIT; kill $server; wait $server\n";
+    let script = script.replace("50051", &grpc).replace("9090", &http);
+
+    let directories = [graspd(), grasp(), grasp_sim()].map(|binary| binary.parent().unwrap().to_owned());
+    let path = std::env::var_os("PATH").unwrap();
+    let path = std::env::join_paths(directories.into_iter().chain(std::env::split_paths(&path))).unwrap();
+    let mut command = Command::new("sh");
+    command
+        .args(["-c", &script])
+        .current_dir(folder.path())
+        .env("PATH", path)
+        .env("GRASPD_SERVER", format!("127.0.0.1:{grpc}"));
+    let output = command.output().unwrap();
+    let (stdout, stderr) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{stdout}\n{stderr}");
+    for said in ["vgn-packed", "graspd_", "\"gsr\"", "\"planner\":\"random\""] {
+        assert!(stdout.contains(said), "`{said}` is missing from:\n{stdout}\n{stderr}");
+    }
+}
