@@ -18,7 +18,7 @@ with_python = GRASPD_PYTHON="$$($(PYTHON) deploy/native.py python)" && export GR
 with_libtorch = LIBTORCH="$$($(PYTHON) deploy/native.py libtorch)" && export LIBTORCH && \
 	LD_LIBRARY_PATH="$$LIBTORCH/lib$${LD_LIBRARY_PATH:+:$$LD_LIBRARY_PATH}" && export LD_LIBRARY_PATH &&
 
-.PHONY: help demo build test fmt fmt-check lint doc test-rust test-train test-python clean
+.PHONY: help demo build test fmt fmt-check lint doc deny test-rust test-train test-python clean
 # The order of test's parts is the order in which they fail fastest, also under `make -j`.
 .NOTPARALLEL:
 
@@ -46,6 +46,10 @@ lint: ## clippy, every warning an error
 
 doc: ## build the documentation, every broken link an error
 	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --no-deps $(WORKSPACE)
+	$(with_libtorch) RUSTDOCFLAGS="-D warnings" $(CARGO) doc --no-deps $(TRAIN)
+
+deny: ## check licences, advisories and sources of the dependencies (needs cargo-deny)
+	$(CARGO) deny check
 
 test-rust: ## test all but training, the Python client's end-to-end tests included
 	$(with_onnxruntime) $(with_python) $(CARGO) test $(WORKSPACE)

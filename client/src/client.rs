@@ -4,7 +4,7 @@ use grasp::Volume;
 use grasp_proto::pb;
 use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::grasp_service_client::GraspServiceClient;
-use tokio::time::{Instant, sleep};
+use tokio::time::{Instant, sleep, timeout_at};
 use tokio_stream::{Stream, StreamExt};
 use tonic::Code;
 use tonic::transport::{Channel, Endpoint};
@@ -59,13 +59,15 @@ impl Client {
         let address = address.into();
         let deadline = Instant::now() + timeout;
         loop {
-            let last = match Self::connect(address.clone()).await {
-                Ok(client) => match client.health().await {
-                    Ok(Health::Serving) => return Ok(client),
-                    Ok(Health::NotServing) => "it says that it is not serving".to_owned(),
-                    Err(error) => error.to_string(),
-                },
-                Err(error) => error.to_string(),
+            let ask = async {
+                let client = Self::connect(address.clone()).await?;
+                Ok::<_, Error>((client.health().await?, client))
+            };
+            let last = match timeout_at(deadline, ask).await {
+                Ok(Ok((Health::Serving, client))) => return Ok(client),
+                Ok(Ok((Health::NotServing, _))) => "it says that it is not serving".to_owned(),
+                Ok(Err(error)) => error.to_string(),
+                Err(_) => "it does not answer".to_owned(),
             };
             if Instant::now() >= deadline {
                 return Err(Error::NotReady { address, timeout, last });

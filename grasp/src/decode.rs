@@ -166,56 +166,53 @@ pub fn decode(volume: &Volume, maps: &Maps, params: &DecodeParams) -> Result<Dec
     let smooth = gaussian(maps.quality, n, params.sigma, params.radius);
     let near_surface = near_surface(volume, params);
 
-    // The threshold falls to the floor only when forced; which voxels pass it then is the best one alone.
-    let mut dropped = Dropped::default();
-    let mut quality = vec![0.0; smooth.len()];
-    let floor = params.force.map_or(params.threshold, |force| force.min(params.threshold));
-    for (index, &q) in smooth.iter().enumerate() {
-        let width = maps.width[index];
-        if q < floor || q <= 0.0 {
-            dropped.below_threshold += 1;
-        } else if !near_surface[index] {
-            dropped.mask += 1;
-        } else if !(width >= params.min_width && width <= params.max_width) {
-            dropped.width += 1;
-        } else if params.border.is_some_and(|border| border.holds(index, n)) {
-            dropped.border += 1;
-        } else {
-            quality[index] = q;
-        }
-    }
-    let best = quality.iter().copied().fold(0.0, f32::max);
-    let forced = best < params.threshold;
-    if !forced {
-        for q in &mut quality {
-            if *q > 0.0 && *q < params.threshold {
-                *q = 0.0;
-                dropped.below_threshold += 1;
-            }
-        }
-    }
-
-    let mut cells: Vec<usize> = Vec::new();
-    for index in 0..quality.len() {
-        if quality[index] > 0.0 {
-            if is_window_maximum(&quality, n, index, params.nms_size) {
-                cells.push(index);
-            } else {
-                dropped.suppressed += 1;
-            }
-        }
-    }
-    cells.sort_by(|&a, &b| quality[b].total_cmp(&quality[a]).then(a.cmp(&b)));
-    if forced && cells.len() > 1 {
-        dropped.below_threshold += cells.len() - 1;
+    // Only when nothing reaches the threshold is the floor asked, and then for the best voxel alone.
+    let select = |threshold| candidates(&smooth, maps.width, &near_surface, n, threshold, params);
+    let (mut cells, mut dropped) = select(params.threshold);
+    if let (true, Some(floor)) = (cells.is_empty(), params.force) {
+        (cells, dropped) = select(floor.min(params.threshold));
+        dropped.suppressed += cells.len().saturating_sub(1);
         cells.truncate(1);
     }
 
     let grasps = cells
         .iter()
-        .map(|&index| grasp_at(volume, maps, index, quality[index], params.origin))
+        .map(|&index| grasp_at(volume, maps, index, smooth[index], params.origin))
         .collect::<Result<_, _>>()?;
     Ok(Decoded { grasps, dropped })
+}
+
+/// The voxels that hold a grasp of at least `threshold`, best first, and why the others do not.
+fn candidates(
+    smooth: &[f32],
+    width: &[f32],
+    near_surface: &[bool],
+    n: usize,
+    threshold: f32,
+    params: &DecodeParams,
+) -> (Vec<usize>, Dropped) {
+    let mut dropped = Dropped::default();
+    let mut quality = vec![0.0; smooth.len()];
+    let mut passed = Vec::new();
+    for (index, &q) in smooth.iter().enumerate() {
+        if q < threshold || q <= 0.0 {
+            dropped.below_threshold += 1;
+        } else if !near_surface[index] {
+            dropped.mask += 1;
+        } else if !(width[index] >= params.min_width && width[index] <= params.max_width) {
+            dropped.width += 1;
+        } else if params.border.is_some_and(|border| border.holds(index, n)) {
+            dropped.border += 1;
+        } else {
+            quality[index] = q;
+            passed.push(index);
+        }
+    }
+    let all = passed.len();
+    passed.retain(|&index| is_window_maximum(&quality, n, index, params.nms_size));
+    dropped.suppressed = all - passed.len();
+    passed.sort_by(|&a, &b| quality[b].total_cmp(&quality[a]).then(a.cmp(&b)));
+    (passed, dropped)
 }
 
 fn check(maps: &Maps, n: usize) -> Result<(), DecodeError> {

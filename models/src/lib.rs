@@ -14,6 +14,6 @@ mod transformer;
 mod vgn;
 
 pub use metadata::{Metadata, MetadataError, ValueConvention};
-pub use networks::{Architecture, BuildError, UnknownArchitecture, UnsupportedResolution, build};
+pub use networks::{Architecture, BuildError, build};
 pub use runtime::{LoadError, LoadReason, Network, Options, Output, RuntimeError, RuntimeInfo, init};
-pub use store::{Entry, Store, StoreError};
+pub use store::{Entry, EntryError, Store, StoreError};

@@ -2,7 +2,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::str::FromStr;
 
-use grasp::{DecodeParams, RESOLUTION, VoxelOrigin, WORKSPACE_SIZE};
+use grasp::{DecodeParams, RESOLUTION, Volume, VoxelOrigin, WORKSPACE_SIZE};
 use thiserror::Error;
 
 use crate::onnx::{DimensionValue, ModelProto, StringStringEntryProto, ValueInfoProto};
@@ -34,16 +34,25 @@ pub enum ValueConvention {
     Vgn,
 }
 
-/// A property that cannot be what it says.
+/// Metadata that cannot be.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
-#[error("the model's property `graspd.{key}` is `{value}`, it must be {expected}")]
-pub struct MetadataError {
-    /// Which property, without `graspd.`.
-    pub key: &'static str,
-    /// Its value.
-    pub value: String,
-    /// What it may be.
-    pub expected: &'static str,
+pub enum MetadataError {
+    /// A property cannot be what it says.
+    #[error("the model's property `graspd.{key}` is `{value}`, it must be {expected}")]
+    Property {
+        /// Which property, without `graspd.`.
+        key: &'static str,
+        /// Its value.
+        value: String,
+        /// What it may be.
+        expected: &'static str,
+    },
+    /// No volume has as many voxels as the network reads, by its property or by its input's shape.
+    #[error(
+        "the model's resolution is {0}, it must be from 1 to {max}; export it for a volume of at most {max}³ voxels",
+        max = Volume::MAX_RESOLUTION
+    )]
+    Resolution(usize),
 }
 
 const PREFIX: &str = "graspd.";
@@ -82,14 +91,15 @@ impl Metadata {
         properties: impl IntoIterator<Item = (String, String)>,
         defaults: Self,
     ) -> Result<Self, MetadataError> {
-        let mut metadata = defaults;
+        let mut metadata = Self { resolution: check_resolution(defaults.resolution)?, ..defaults };
         for (key, value) in properties {
             let Some(key) = key.strip_prefix(PREFIX) else { continue };
             match key {
                 "name" => metadata.name = value,
                 "version" => metadata.version = value,
                 "resolution" => {
-                    metadata.resolution = parse("resolution", &value, "a whole number of voxels above 0", |&n| n > 0)?;
+                    let resolution = parse("resolution", &value, "a whole number of voxels above 0", |&n| n > 0)?;
+                    metadata.resolution = check_resolution(resolution)?;
                 }
                 "voxel_size" => {
                     let valid = |&size: &f64| size.is_finite() && size > 0.0;
@@ -98,7 +108,7 @@ impl Metadata {
                 "value_convention" => {
                     metadata.value_convention = match value.as_str() {
                         "vgn" => ValueConvention::Vgn,
-                        _ => return Err(MetadataError { key: "value_convention", value, expected: "`vgn`" }),
+                        _ => return Err(MetadataError::Property { key: "value_convention", value, expected: "`vgn`" }),
                     }
                 }
                 "voxel_origin" => {
@@ -106,7 +116,8 @@ impl Metadata {
                         "corner" => VoxelOrigin::Corner,
                         "center" => VoxelOrigin::Center,
                         _ => {
-                            return Err(MetadataError { key: "voxel_origin", value, expected: "`corner` or `center`" });
+                            let expected = "`corner` or `center`";
+                            return Err(MetadataError::Property { key: "voxel_origin", value, expected });
                         }
                     }
                 }
@@ -159,11 +170,21 @@ fn fixed_resolution(input: &ValueInfoProto) -> Option<usize> {
     }
 }
 
+/// Refused when the file is read, lest a server starts with a network that no request can fit.
+fn check_resolution(resolution: usize) -> Result<usize, MetadataError> {
+    if (1..=Volume::MAX_RESOLUTION).contains(&resolution) {
+        Ok(resolution)
+    } else {
+        Err(MetadataError::Resolution(resolution))
+    }
+}
+
 fn parse<T: FromStr>(
     key: &'static str,
     value: &str,
     expected: &'static str,
     valid: impl Fn(&T) -> bool,
 ) -> Result<T, MetadataError> {
-    value.parse().ok().filter(valid).ok_or_else(|| MetadataError { key, value: value.to_owned(), expected })
+    let wrong = || MetadataError::Property { key, value: value.to_owned(), expected };
+    value.parse().ok().filter(valid).ok_or_else(wrong)
 }

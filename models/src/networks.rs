@@ -2,7 +2,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::str::FromStr;
 
-use grasp::{RESOLUTION, VoxelOrigin};
+use grasp::{RESOLUTION, Volume, VoxelOrigin};
 use thiserror::Error;
 
 use crate::onnx::ModelProto;
@@ -21,25 +21,18 @@ pub enum Architecture {
     TransformerSmall,
 }
 
-/// The name is no network's.
-#[derive(Clone, Debug, Error, PartialEq, Eq)]
-#[error("there is no network `{0}`; there are vgn, transformer and transformer-small")]
-pub struct UnknownArchitecture(String);
-
-/// The network cannot read volumes of this size.
-#[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
-#[error("resolution is {0}, a network halves it three times, so it must be a positive multiple of 8")]
-pub struct UnsupportedResolution(usize);
-
 /// Why no network was built.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum BuildError {
     /// The name is no network's.
-    #[error(transparent)]
-    Name(#[from] UnknownArchitecture),
-    /// The resolution does not fit.
-    #[error(transparent)]
-    Resolution(#[from] UnsupportedResolution),
+    #[error("there is no network `{0}`; there are vgn, transformer and transformer-small")]
+    Name(String),
+    /// The network cannot read volumes of this size.
+    #[error(
+        "resolution is {0}, a network halves it three times, so it must be a multiple of 8, from 8 to {max}",
+        max = Volume::MAX_RESOLUTION
+    )]
+    Resolution(usize),
 }
 
 /// The network of that name with random weights, reading the paper's 40³ volumes.
@@ -47,7 +40,7 @@ pub enum BuildError {
 /// # Errors
 /// [`BuildError::Name`] when there is none.
 pub fn build(name: &str, seed: u64) -> Result<ModelProto, BuildError> {
-    Ok(name.parse::<Architecture>()?.build(RESOLUTION, seed)?)
+    name.parse::<Architecture>()?.build(RESOLUTION, seed)
 }
 
 impl Architecture {
@@ -67,10 +60,10 @@ impl Architecture {
     /// The network with random weights for volumes of `resolution`³ voxels. The same seed gives the same bytes.
     ///
     /// # Errors
-    /// [`UnsupportedResolution`] unless the resolution is a multiple of 8.
-    pub fn build(self, resolution: usize, seed: u64) -> Result<ModelProto, UnsupportedResolution> {
-        if resolution == 0 || !resolution.is_multiple_of(8) {
-            return Err(UnsupportedResolution(resolution));
+    /// [`BuildError::Resolution`] unless the resolution is a multiple of 8 that a [`Volume`] can have.
+    pub fn build(self, resolution: usize, seed: u64) -> Result<ModelProto, BuildError> {
+        if !(8..=Volume::MAX_RESOLUTION).contains(&resolution) || !resolution.is_multiple_of(8) {
+            return Err(BuildError::Resolution(resolution));
         }
         let mut model = match self {
             Self::Vgn => vgn(resolution, seed),
@@ -99,9 +92,9 @@ impl fmt::Display for Architecture {
 }
 
 impl FromStr for Architecture {
-    type Err = UnknownArchitecture;
+    type Err = BuildError;
 
     fn from_str(name: &str) -> Result<Self, Self::Err> {
-        Self::ALL.into_iter().find(|a| a.name() == name).ok_or_else(|| UnknownArchitecture(name.to_owned()))
+        Self::ALL.into_iter().find(|a| a.name() == name).ok_or_else(|| BuildError::Name(name.to_owned()))
     }
 }

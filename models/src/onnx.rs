@@ -330,12 +330,6 @@ impl ModelProto {
             .and_then(|()| fs::rename(&part, path))
             .map_err(|source| FileError::Io { path: path.to_owned(), source })
     }
-
-    /// How many numbers are learnt: the elements of all floating-point initialisers.
-    #[must_use]
-    pub fn parameters(&self) -> usize {
-        self.graph.iter().flat_map(|graph| &graph.initializer).filter(|t| t.is_float()).map(TensorProto::elements).sum()
-    }
 }
 
 impl NodeProto {

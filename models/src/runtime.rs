@@ -30,8 +30,6 @@ pub struct RuntimeInfo {
     pub library: PathBuf,
     /// Its version, such as `1.24.1`.
     pub version: String,
-    /// What it says of how it was built.
-    pub build: String,
 }
 
 /// Why ONNX Runtime is not there or did not compute.
@@ -140,8 +138,7 @@ fn load_library() -> Result<Runtime, RuntimeError> {
     let builder = ort::init_from(&library).map_err(|error| refuse(&error))?;
     let environment = builder.with_name("graspd").with_telemetry(false).build().map_err(|error| refuse(&error))?;
     environment.set_log_level(LogLevel::Warning);
-    let build = ort::info().to_owned();
-    let info = RuntimeInfo { version: version(&build, &library), build, library };
+    let info = RuntimeInfo { version: version(ort::info(), &library), library };
     Ok(Runtime { info, environment })
 }
 

@@ -1,11 +1,11 @@
 use std::cmp::Ordering;
-use std::fs;
 use std::path::{Path, PathBuf};
+use std::{fs, io};
 
 use sha2::{Digest, Sha256};
 use thiserror::Error;
 
-use crate::onnx::ModelProto;
+use crate::onnx::{FileError, ModelProto};
 use crate::{Metadata, MetadataError};
 
 /// The models in a folder, as their files describe themselves. Nothing is loaded into ONNX Runtime yet.
@@ -24,53 +24,29 @@ pub struct Entry {
     pub metadata: Metadata,
     /// SHA-256 of the file, in hexadecimal.
     pub sha256: String,
-    /// Size of the file, bytes.
-    pub bytes: u64,
-    /// Learnt numbers.
-    pub parameters: usize,
 }
 
-/// Why a folder of models, or a model in it, cannot be used.
+/// Why a folder of models cannot be served.
 #[derive(Debug, Error)]
 pub enum StoreError {
-    /// The folder or a file in it cannot be read.
+    /// The folder cannot be read.
     #[error("{}: {source}", path.display())]
     Io {
         /// Which.
         path: PathBuf,
         /// What the file system said.
-        source: std::io::Error,
+        source: io::Error,
     },
     /// The folder holds no model.
     #[error("{}: holds no .onnx file; train one with `grasp-train` or put one there", .0.display())]
     Empty(PathBuf),
-    /// A file is no ONNX model.
-    #[error("{}: not an ONNX model, or cut short: {reason}; fetch or export the file again", path.display())]
-    Model {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
-    /// A file's metadata cannot be.
-    #[error("{}: {source}", path.display())]
-    Metadata {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        source: MetadataError,
-    },
-    /// Two files claim to be the same model.
-    #[error("{} and {} are both `{name}` version {version}; remove one", first.display(), second.display())]
-    Duplicate {
-        /// One file.
-        first: PathBuf,
-        /// The other.
-        second: PathBuf,
-        /// Their name.
-        name: String,
-        /// Their version.
-        version: String,
+    /// Files in it cannot be used: all of them are listed, so that they are mended in one go.
+    #[error("{}: these files cannot be served:{}", directory.display(), lines(files))]
+    Files {
+        /// The folder.
+        directory: PathBuf,
+        /// What is wrong with which.
+        files: Vec<EntryError>,
     },
     /// No model has that name and version.
     #[error("{}: no model `{wanted}`; there are {available}", directory.display())]
@@ -84,27 +60,64 @@ pub enum StoreError {
     },
 }
 
+/// Why a file of a folder cannot be served.
+#[derive(Debug, Error)]
+pub enum EntryError {
+    /// It cannot be read, or is no ONNX model.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// Its metadata cannot be.
+    #[error("{}: {source}", path.display())]
+    Metadata {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: MetadataError,
+    },
+    /// It claims to be the same model as another.
+    #[error("{} and {} are both `{name}` version {version}; remove one", first.display(), second.display())]
+    Duplicate {
+        /// One file.
+        first: PathBuf,
+        /// The other.
+        second: PathBuf,
+        /// Their name.
+        name: String,
+        /// Their version.
+        version: String,
+    },
+}
+
+/// A line each, indented below the heading.
+fn lines(files: &[EntryError]) -> String {
+    files.iter().map(|error| format!("\n    {error}")).collect()
+}
+
 impl Store {
     /// Reads every `*.onnx` file of a folder.
     ///
     /// # Errors
-    /// [`StoreError`] names the file that cannot be used, or the folder if there is none.
+    /// [`StoreError`] names every file that cannot be used, or the folder if there is none.
     pub fn open(directory: &Path) -> Result<Self, StoreError> {
-        let io = |source| StoreError::Io { path: directory.to_owned(), source };
-        let mut entries = Vec::new();
-        for file in fs::read_dir(directory).map_err(io)? {
-            let path = file.map_err(io)?.path();
-            if path.extension().is_some_and(|extension| extension == "onnx") {
-                entries.push(Entry::read(path)?);
-            }
-        }
-        if entries.is_empty() {
+        let files = fs::read_dir(directory).and_then(|files| files.map(|file| Ok(file?.path())).collect());
+        let mut paths: Vec<PathBuf> = files.map_err(|source| StoreError::Io { path: directory.to_owned(), source })?;
+        paths.retain(|path| path.extension().is_some_and(|extension| extension == "onnx"));
+        if paths.is_empty() {
             return Err(StoreError::Empty(directory.to_owned()));
+        }
+        // A folder has no order of its own.
+        paths.sort();
+        let (mut entries, mut files) = (Vec::new(), Vec::new());
+        for path in paths {
+            match Entry::read(path) {
+                Ok(entry) => entries.push(entry),
+                Err(error) => files.push(error),
+            }
         }
         entries.sort_by(|a, b| a.order(b));
         for pair in entries.windows(2) {
             if pair[0].order(&pair[1]).is_eq() {
-                return Err(StoreError::Duplicate {
+                files.push(EntryError::Duplicate {
                     first: pair[0].path.clone(),
                     second: pair[1].path.clone(),
                     name: pair[0].metadata.name.clone(),
@@ -112,7 +125,8 @@ impl Store {
                 });
             }
         }
-        Ok(Self { directory: directory.to_owned(), entries })
+        let directory = directory.to_owned();
+        if files.is_empty() { Ok(Self { directory, entries }) } else { Err(StoreError::Files { directory, files }) }
     }
 
     /// All models, by name, the versions of a name from the oldest to the newest.
@@ -143,21 +157,17 @@ impl Store {
 }
 
 impl Entry {
-    fn read(path: PathBuf) -> Result<Self, StoreError> {
-        let bytes = match fs::read(&path) {
-            Ok(bytes) => bytes,
-            Err(source) => return Err(StoreError::Io { path, source }),
-        };
-        let model = match ModelProto::from_bytes(&bytes) {
-            Ok(model) => model,
-            Err(reason) => return Err(StoreError::Model { path, reason }),
-        };
+    fn read(path: PathBuf) -> Result<Self, EntryError> {
+        // Once for both, so that the hash is that of the model.
+        let bytes = fs::read(&path).map_err(|source| FileError::Io { path: path.clone(), source })?;
+        let model =
+            ModelProto::from_bytes(&bytes).map_err(|reason| FileError::Decode { path: path.clone(), reason })?;
         let metadata = match Metadata::of(&model, &path) {
             Ok(metadata) => metadata,
-            Err(source) => return Err(StoreError::Metadata { path, source }),
+            Err(source) => return Err(EntryError::Metadata { path, source }),
         };
         let sha256 = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
-        Ok(Self { path, metadata, sha256, bytes: bytes.len() as u64, parameters: model.parameters() })
+        Ok(Self { path, metadata, sha256 })
     }
 
     fn order(&self, other: &Self) -> Ordering {

@@ -8,7 +8,10 @@ use prost::Message;
 
 #[test]
 fn parameters_are_those_of_the_publications() {
-    let parameters = |name| build(name, 0).unwrap().parameters();
+    let parameters = |name| {
+        let initializers = build(name, 0).unwrap().graph.unwrap().initializer;
+        initializers.iter().filter(|tensor| tensor.is_float()).map(TensorProto::elements).sum::<usize>()
+    };
     assert_eq!(parameters("vgn"), 313_238, "VGN's released weights have as many");
     // ViT-B's twelve blocks (85,026,816), its final norm, the patches and their positions, and the decoder.
     let blocks = 12 * (3 * 768 * 768 + (768 + 1) * 768 + (768 + 1) * 3072 + (3072 + 1) * 768 + 4 * 768);
@@ -49,6 +52,9 @@ fn what_cannot_be_built_is_named() {
     assert!(matches!(error, BuildError::Name(_)));
     assert!(error.to_string().contains("`vng`") && error.to_string().contains("transformer-small"), "{error}");
     assert!(Architecture::Vgn.build(42, 0).unwrap_err().to_string().contains("42"));
+    for resolution in [0, 264] {
+        assert_eq!(Architecture::Vgn.build(resolution, 0), Err(BuildError::Resolution(resolution)));
+    }
 }
 
 #[test]

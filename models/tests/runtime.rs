@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use grasp::Volume;
-use grasp_models::onnx::ModelProto;
+use grasp_models::onnx::{Dimension, ModelProto, ValueInfoProto};
 use grasp_models::{Architecture, Network, Options, RuntimeError, build, init};
 use nalgebra::Isometry3;
 use tempfile::TempDir;
@@ -136,6 +136,15 @@ fn a_file_that_is_no_grasp_network_is_refused() {
         property.value = Some("16".to_owned());
     };
     assert!(refusal(lying).contains("says N = 16, its input has N = 8"));
+    let large = |model: &mut ModelProto| {
+        let graph = model.graph.as_mut().unwrap();
+        for (value, channels) in graph.input.iter_mut().chain(&mut graph.output).zip([1, 1, 4, 1]) {
+            let edges = [264; 3].map(Dimension::size);
+            let shape = [Dimension::named("batch"), Dimension::size(channels)].into_iter().chain(edges).collect();
+            *value = ValueInfoProto::tensor(value.name(), shape);
+        }
+    };
+    assert!(refusal(large).contains("resolution is 264, it must be from 1 to 256"));
 }
 
 #[test]

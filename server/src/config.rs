@@ -108,19 +108,20 @@ impl Config {
 
     fn new(flags: Flags) -> Result<Self, ConfigErrors> {
         const ADDRESS: &str = "an address and a port, such as 127.0.0.1:50051";
-        const COUNT: &str = "a whole number above 0";
+        const COUNT: &str = "a whole number from 1 to 1024";
+        const BYTES: &str = "a whole number of bytes above 0";
         let cpus = available_parallelism().map_or(1, NonZeroUsize::get);
         let mut errors = ConfigErrors::default();
 
         let listen = errors.parse("listen", &flags.listen, ADDRESS);
         let http = errors.parse("http", &flags.http, ADDRESS);
-        let workers = errors.parse("workers", &flags.workers, COUNT).map(NonZeroUsize::get);
+        let workers = errors.parse("workers", &flags.workers, COUNT).map(|Count(workers)| workers);
         let threads = match &flags.threads {
-            Some(threads) => errors.parse("threads", threads, COUNT).map(NonZeroUsize::get),
+            Some(threads) => errors.parse("threads", threads, COUNT).map(|Count(threads)| threads),
             None => workers.map(|workers| (cpus / workers).max(1)),
         };
-        let queue = errors.parse("queue", &flags.queue, COUNT).map(NonZeroUsize::get);
-        let max_message_bytes = errors.parse("max-message-bytes", &flags.max_message_bytes, COUNT);
+        let queue = errors.parse("queue", &flags.queue, COUNT).map(|Count(queue)| queue);
+        let max_message_bytes = errors.parse("max-message-bytes", &flags.max_message_bytes, BYTES);
         let drain_timeout = errors
             .parse("drain-timeout", &flags.drain_timeout, "a number of seconds, 0 or more")
             .map(|Seconds(duration)| duration);
@@ -178,6 +179,17 @@ impl Display for ConfigErrors {
         writeln!(f, "graspd: {} in the configuration:", if self.0.len() == 1 { "a mistake" } else { "mistakes" })?;
         self.0.iter().try_for_each(|error| writeln!(f, "  {error}"))?;
         writeln!(f, "`graspd --help` says what each flag means.")
+    }
+}
+
+/// Of threads, or of requests that wait: a thousand volumes are more than anyone waits for.
+struct Count(usize);
+
+impl FromStr for Count {
+    type Err = ();
+
+    fn from_str(text: &str) -> Result<Self, ()> {
+        text.parse().ok().filter(|count| (1..=1024).contains(count)).map(Self).ok_or(())
     }
 }
 

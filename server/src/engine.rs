@@ -154,7 +154,10 @@ impl Sessions {
 
     /// Waits for the sessions to end, which they do once their engine is dropped.
     pub fn join(self) {
-        for thread in self.threads {
+        let Self { threads, warm, report: _ } = self;
+        // Nobody listens any more: a session that has still to report that it is warm must not wait for it.
+        drop(warm);
+        for thread in threads {
             // A session catches its panics, and one that did not has nothing left to be waited for.
             let _ = thread.join();
         }

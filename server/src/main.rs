@@ -54,20 +54,23 @@ fn run(config: &Config) -> anyhow::Result<()> {
     info!(version = onnxruntime.version, library = %onnxruntime.library.display(), "ONNX Runtime");
 
     let metrics = Arc::new(Metrics::new());
-    let (models, mut sessions) = Models::load(config, &metrics)?;
+    let mut sessions = Sessions::none();
+    let served = load_and_serve(config, &metrics, &mut sessions);
+    // Whatever happened, no session may still be inside ONNX Runtime when the process ends.
+    sessions.join();
+    served
+}
 
+/// From loading the models to the end of the runtime, and with it of the last way to reach the sessions.
+fn load_and_serve(config: &Config, metrics: &Arc<Metrics>, sessions: &mut Sessions) -> anyhow::Result<()> {
+    let models = Models::load(config, metrics, sessions)?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(config.io_threads)
         .thread_name("grpc")
         .enable_all()
         .build()
         .context("cannot start the runtime's threads")?;
-    let served = runtime.block_on(serve(config, models, &mut sessions, &metrics));
-
-    // What is still connected goes with the runtime, and with it the last way to reach the sessions, which then end.
-    drop(runtime);
-    sessions.join();
-    served
+    runtime.block_on(serve(config, models, sessions, metrics))
 }
 
 /// From binding the listeners to the end of the drain.

@@ -11,8 +11,8 @@ use crate::refusal::Refusal;
 pub(crate) struct Models(Vec<Engine>);
 
 impl Models {
-    /// Loads what the store holds. The sessions run until the models are dropped.
-    pub fn load(config: &Config, metrics: &Metrics) -> Result<(Self, Sessions), LoadError> {
+    /// Loads what the store holds and starts `sessions`, which run until the models are dropped.
+    pub fn load(config: &Config, metrics: &Metrics, sessions: &mut Sessions) -> Result<Self, LoadError> {
         let mut entries = config.store.entries().to_vec();
         // The store has the oldest version of a name first; the sort is stable.
         entries.reverse();
@@ -20,13 +20,11 @@ impl Models {
             let name = entry.metadata.name.clone();
             (config.default_model.as_ref() != Some(&name), name)
         });
-        let mut sessions = Sessions::none();
         let engines = entries.into_iter().map(|entry| {
             let gauge = |label: &str| metrics.waiting(label);
-            Engine::start(entry, config.workers, config.threads, config.queue, gauge, &mut sessions)
+            Engine::start(entry, config.workers, config.threads, config.queue, gauge, sessions)
         });
-        let engines = engines.collect::<Result<_, _>>()?;
-        Ok((Self(engines), sessions))
+        Ok(Self(engines.collect::<Result<_, _>>()?))
     }
 
     /// The model that a request asks for, if it takes volumes of that resolution.

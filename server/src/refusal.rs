@@ -18,9 +18,7 @@ pub(crate) enum Refusal {
     Overloaded(#[from] Overloaded),
     #[error("the server is warming up; come back in {0:?}")]
     Starting(Duration),
-    #[error("the server is shutting down; another one may answer")]
-    Draining,
-    #[error("{0}; the server goes on")]
+    #[error(transparent)]
     Failed(#[from] EngineError),
 }
 
@@ -33,7 +31,7 @@ impl Refusal {
             Self::Field(_) => Code::InvalidArgument,
             Self::UnknownModel { .. } => Code::NotFound,
             Self::Overloaded(_) => Code::ResourceExhausted,
-            Self::Starting(_) | Self::Draining => Code::Unavailable,
+            Self::Starting(_) => Code::Unavailable,
             Self::Failed(_) => Code::Internal,
         }
     }
@@ -43,7 +41,7 @@ impl Refusal {
         match self {
             Self::Overloaded(overloaded) => Some(overloaded.retry_after),
             Self::Starting(retry_after) => Some(*retry_after),
-            Self::Field(_) | Self::UnknownModel { .. } | Self::Draining | Self::Failed(_) => None,
+            Self::Field(_) | Self::UnknownModel { .. } | Self::Failed(_) => None,
         }
     }
 }

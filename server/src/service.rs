@@ -47,8 +47,8 @@ impl Grasps {
         Self { models, metrics, state, ids: Arc::new(RequestIds::new()) }
     }
 
-    /// Checks a request and queues its volume. What is wrong with it comes out of [`Call::finish`], like the answer.
-    fn begin(&self, mut request: pb::DetectGraspsRequest) -> Call {
+    /// Checks a request and queues its volume. What is wrong with it comes out of [`Begun::finish`], like the answer.
+    fn begin(&self, mut request: pb::DetectGraspsRequest) -> Begun {
         let started = Instant::now();
         let mut id = std::mem::take(&mut request.request_id);
         let checked = check_id("request_id", &id);
@@ -73,11 +73,10 @@ impl Grasps {
             model: String::new(),
             version: String::new(),
             label: String::new(),
-            work: Err(Refusal::Draining),
             ended: false,
         };
-        call.work = checked.map_err(Refusal::from).and_then(|()| self.submit(request, &mut call));
-        call
+        let work = checked.map_err(Refusal::from).and_then(|()| self.submit(request, &mut call));
+        Begun { call, work }
     }
 
     fn submit(&self, request: pb::DetectGraspsRequest, call: &mut Call) -> Result<Work, Refusal> {
@@ -128,7 +127,13 @@ fn decode_params(request: &pb::DetectGraspsRequest, own: DecodeParams) -> Result
     Ok(DecodeParams { threshold, force, ..own })
 }
 
-/// A request on its way. Dropped before [`finish`](Self::finish), it counts as cancelled by its caller.
+/// A request that was taken, or refused without anyone having been told yet.
+struct Begun {
+    call: Call,
+    work: Result<Work, Refusal>,
+}
+
+/// A request on its way. Dropped before its end, it counts as cancelled by its caller.
 struct Call {
     id: String,
     started: Instant,
@@ -138,7 +143,6 @@ struct Call {
     version: String,
     /// The model's, empty as long as none is chosen.
     label: String,
-    work: Result<Work, Refusal>,
     ended: bool,
 }
 
@@ -152,21 +156,24 @@ struct Work {
     stamp: Option<prost_types::Timestamp>,
 }
 
-impl Call {
+impl Begun {
     /// Waits for the session, and says in the log and the metrics how it went.
-    async fn finish(mut self) -> Result<pb::DetectGraspsResponse, Refusal> {
-        let outcome = match std::mem::replace(&mut self.work, Err(Refusal::Draining)) {
-            Ok(work) => self.reply(work).await,
+    async fn finish(self) -> Result<pb::DetectGraspsResponse, Refusal> {
+        let Self { mut call, work } = self;
+        let outcome = match work {
+            Ok(work) => call.reply(work).await,
             Err(refusal) => Err(refusal),
         };
-        self.ended = true;
+        call.ended = true;
         if let Err(refusal) = &outcome {
-            self.metrics.ended(&self.label, refusal.code());
-            self.span.in_scope(|| info!(code = ?refusal.code(), %refusal, "refused"));
+            call.metrics.ended(&call.label, refusal.code());
+            call.span.in_scope(|| info!(code = ?refusal.code(), %refusal, "refused"));
         }
         outcome
     }
+}
 
+impl Call {
     async fn reply(&mut self, work: Work) -> Result<pb::DetectGraspsResponse, Refusal> {
         // A session that is gone drops what it had: that is told, too.
         let answer = work.reply.await.unwrap_or(Err(EngineError::Gone))?;
@@ -241,10 +248,10 @@ impl GraspService for Grasps {
                 }
             }
         });
-        let replies = ReceiverStream::new(calls).then(async |call: Result<Call, Status>| {
-            let call = call?;
-            let request_id = call.id.clone();
-            let outcome = match call.finish().await {
+        let replies = ReceiverStream::new(calls).then(async |begun: Result<Begun, Status>| {
+            let begun = begun?;
+            let request_id = begun.call.id.clone();
+            let outcome = match begun.finish().await {
                 Ok(response) => Outcome::Response(response),
                 Err(refusal) => Outcome::Error(refusal.into()),
             };

@@ -1,7 +1,9 @@
 //! The clutter-removal benchmark: grasp after grasp until a table is empty, or nothing works any more.
 
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use grasp::DecodeParams;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -105,18 +107,25 @@ impl Benchmark {
     ///
     /// # Errors
     /// The first error of a planner.
-    pub fn run(&self, planner: &PlannerSpec, progress: impl Fn() + Sync) -> anyhow::Result<Vec<Round>> {
+    pub fn run(
+        &self,
+        planner: &PlannerSpec,
+        params: &DecodeParams,
+        progress: impl Fn() + Sync,
+    ) -> anyhow::Result<Vec<Round>> {
+        // Planners that wait for the next round: there are as many as threads, however the rounds are dealt out.
+        let idle = Mutex::new(Vec::new());
+        let idle = || idle.lock().unwrap_or_else(PoisonError::into_inner);
         (0..self.rounds)
             .into_par_iter()
-            .map_init(
-                || planner.build(),
-                |planner, number| {
-                    let planner = planner.as_mut().map_err(|error| anyhow::anyhow!("{error:#}"))?;
-                    let round = self.play(number, planner.as_mut());
-                    progress();
-                    round
-                },
-            )
+            .map(|number| {
+                let waiting = idle().pop();
+                let mut player = waiting.map_or_else(|| planner.build(params), Ok)?;
+                let round = self.play(number, player.as_mut());
+                idle().push(player);
+                progress();
+                round
+            })
             .collect()
     }
 

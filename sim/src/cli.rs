@@ -42,9 +42,9 @@ struct SceneArgs {
     #[arg(long, value_enum, default_value = "packed")]
     scene: Scene,
 
-    /// The objects: `train` or `test` (our own), or a folder of URDF files.
-    #[arg(long, default_value = "train")]
-    objects: String,
+    /// The objects: `train` or `test` (our own), or a folder of URDF files [default: train to label, else test].
+    #[arg(long)]
+    objects: Option<String>,
 
     /// The cameras: `side[:DEGREES]` (the paper's one view, turned about the vertical), `circle` (six from above), or
     /// `anywhere:MIN-MAX` (so many from any azimuth, 20–75° off the vertical).
@@ -74,8 +74,8 @@ impl SceneArgs {
         }
     }
 
-    fn objects(&self) -> anyhow::Result<ObjectSet> {
-        Ok(match (self.objects.as_str(), self.scene) {
+    fn objects(&self, default: &str) -> anyhow::Result<ObjectSet> {
+        Ok(match (self.objects.as_deref().unwrap_or(default), self.scene) {
             ("train", _) => ObjectSet::procedural(Split::Train),
             ("test", Scene::Pile) => ObjectSet::procedural(Split::PileTest),
             ("test", Scene::Packed) => ObjectSet::procedural(Split::PackedTest),

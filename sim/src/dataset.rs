@@ -23,7 +23,7 @@ const HEADER: &str = "scene_id,qx,qy,qz,qw,i,j,k,width,label\n";
 pub struct Setup {
     /// `pile` or `packed`.
     pub scene: String,
-    /// `procedural`, or the folder the objects came from.
+    /// `train` or `test`, our own objects, or the folder they came from.
     pub objects: String,
     /// Grasp points a scene.
     pub points: usize,
@@ -156,7 +156,9 @@ fn last_scene(table: &File) -> io::Result<(u64, u64)> {
     let mut line = String::new();
     let (mut offset, mut start, mut last) = (0, 0, None);
     while reader.read_line(&mut line)? > 0 {
-        if let Some(number) = line.split(',').next().and_then(|id| id.parse::<u64>().ok())
+        // A row without its end may be cut anywhere, even in its scene's number: it goes with the scene before it.
+        if line.ends_with('\n')
+            && let Some(number) = line.split(',').next().and_then(|id| id.parse::<u64>().ok())
             && last != Some(number)
         {
             last = Some(number);
@@ -189,14 +191,7 @@ mod tests {
     use crate::label::Trial;
 
     fn setup() -> Setup {
-        Setup {
-            scene: "pile".into(),
-            objects: "procedural".into(),
-            points: 2,
-            views: "side".into(),
-            noise: false,
-            seed: 1,
-        }
+        Setup { scene: "pile".into(), objects: "train".into(), points: 2, views: "side".into(), noise: false, seed: 1 }
     }
 
     fn scene() -> LabelledScene {
@@ -216,12 +211,16 @@ mod tests {
             whole.contains("\n00000001,0.0000000,0.0000000,0.0000000,1.0000000,10.00000,20.00000,5.00000,8.00000,1\n")
         );
 
-        // Cut off in the middle of the last row.
-        fs::write(dir.path().join("grasps.csv"), &whole[..whole.len() - 7]).unwrap();
-        let mut writer = DatasetWriter::open(dir.path(), &setup()).unwrap();
-        assert_eq!(writer.next(), 3);
-        writer.append(3, &scene()).unwrap();
-        assert_eq!(fs::read_to_string(dir.path().join("grasps.csv")).unwrap(), whole);
+        // Cut off anywhere: in a row, between two, or in a scene's number.
+        for length in HEADER.len()..whole.len() {
+            fs::write(dir.path().join("grasps.csv"), &whole[..length]).unwrap();
+            let mut writer = DatasetWriter::open(dir.path(), &setup()).unwrap();
+            let next = writer.next();
+            for number in [0, 1, 3].into_iter().filter(|&number| number >= next) {
+                writer.append(number, &scene()).unwrap();
+            }
+            assert_eq!(fs::read_to_string(dir.path().join("grasps.csv")).unwrap(), whole, "cut after {length} bytes");
+        }
     }
 
     #[test]

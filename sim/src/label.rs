@@ -89,13 +89,17 @@ impl Recipe {
 /// The surface that these views see, without the table, the borders of the workspace, and what faces down.
 #[must_use]
 pub fn graspable(views: &[View]) -> Vec<SurfacePoint> {
+    let mut surface = fuse(views, CLOUD_RESOLUTION).surface();
+    surface.retain(is_graspable);
+    surface
+}
+
+/// Whether a point is above the table, away from the borders, and does not face down (the bounds of GIGA's code).
+#[must_use]
+pub fn is_graspable(point: &SurfacePoint) -> bool {
     const LOWER: [f64; 3] = [0.02, 0.02, 0.055];
     const UPPER: [f64; 3] = [0.28, 0.28, 0.30];
-    let mut surface = fuse(views, CLOUD_RESOLUTION).surface();
-    surface.retain(|point| {
-        (0..3).all(|axis| (LOWER[axis]..=UPPER[axis]).contains(&point.position[axis])) && point.normal.z > -0.1
-    });
-    surface
+    (0..3).all(|axis| (LOWER[axis]..=UPPER[axis]).contains(&point.position[axis])) && point.normal.z > -0.1
 }
 
 /// Draws a grasp point (VGN's `sample_grasp_point`): somewhere on the surface, at a random depth of the fingers.

@@ -373,7 +373,7 @@ fn refined(camera: &Intrinsics) -> Intrinsics {
 
 /// Two fingers, the bar between them and a stem, in the grasp frame.
 fn fork(width: f64, breadth: f64, thickness: f64) -> Mesh {
-    const FINGER: f64 = 0.05;
+    const FINGER: f64 = grasp::FINGER_DEPTH;
     let part =
         |size: [f64; 3], y: f64, z: f64| Mesh::cuboid(size.into()).transformed(&Isometry3::translation(0.0, y, z));
     let apart = (width + thickness) / 2.0;

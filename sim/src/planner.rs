@@ -12,7 +12,7 @@ use rand_chacha::ChaCha8Rng;
 use tokio::runtime::Runtime;
 
 use crate::camera::{View, fuse};
-use crate::label::{graspable, sample_pose};
+use crate::label::{graspable, is_graspable, sample_pose};
 
 /// What a planner is given: depth images, and the volume fused from them.
 pub struct Observation {
@@ -23,10 +23,14 @@ pub struct Observation {
 }
 
 impl Observation {
-    /// Fuses the views; `None` if they see nothing of the workspace.
+    /// Fuses the views; `None` if they see nothing in the workspace but the table.
     #[must_use]
     pub fn new(views: Vec<View>) -> Option<Self> {
-        let volume = fuse(&views, RESOLUTION).volume(Isometry3::identity()).ok()?;
+        let fusion = fuse(&views, RESOLUTION);
+        if !fusion.surface().iter().any(is_graspable) {
+            return None;
+        }
+        let volume = fusion.volume(Isometry3::identity()).ok()?;
         Some(Self { views, volume })
     }
 }
@@ -62,15 +66,15 @@ impl From<&str> for PlannerSpec {
 }
 
 impl PlannerSpec {
-    /// Makes the planner.
+    /// Makes the planner. A server decodes with its model's own parameters but for the threshold and `force`.
     ///
     /// # Errors
     /// When the network cannot be loaded or the server cannot be reached.
-    pub fn build(&self) -> anyhow::Result<Box<dyn Planner>> {
+    pub fn build(&self, params: &DecodeParams) -> anyhow::Result<Box<dyn Planner + Send>> {
         Ok(match self {
             Self::Random => Box::new(Random),
-            Self::Network(path) => Box::new(Onnx::load(path)?),
-            Self::Server(address) => Box::new(Server::connect(address)?),
+            Self::Network(path) => Box::new(Onnx::load(path, params)?),
+            Self::Server(address) => Box::new(Server::connect(address, params)?),
         })
     }
 }
@@ -95,9 +99,9 @@ struct Onnx {
 }
 
 impl Onnx {
-    fn load(path: &Path) -> anyhow::Result<Self> {
+    fn load(path: &Path, params: &DecodeParams) -> anyhow::Result<Self> {
         let network = Network::load(path, &Options::default())?;
-        let params = DecodeParams { origin: network.metadata().voxel_origin, ..DecodeParams::benchmark() };
+        let params = DecodeParams { origin: network.metadata().voxel_origin, ..*params };
         Ok(Self { network, params })
     }
 }
@@ -112,20 +116,22 @@ impl Planner for Onnx {
 struct Server {
     runtime: Runtime,
     client: Client,
+    params: DecodeParams,
 }
 
 impl Server {
-    fn connect(address: &str) -> anyhow::Result<Self> {
+    fn connect(address: &str, params: &DecodeParams) -> anyhow::Result<Self> {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let client =
             runtime.block_on(Client::connect(address)).with_context(|| format!("no graspd answers at {address}"))?;
-        Ok(Self { runtime, client })
+        Ok(Self { runtime, client, params: *params })
     }
 }
 
 impl Planner for Server {
     fn plan(&mut self, observation: &Observation, _: &mut ChaCha8Rng) -> anyhow::Result<Vec<Grasp>> {
-        let options = grasp_client::Options { force: DecodeParams::benchmark().force, ..Default::default() };
+        let DecodeParams { threshold, force, .. } = self.params;
+        let options = grasp_client::Options { threshold: Some(threshold), force, ..Default::default() };
         Ok(self.runtime.block_on(self.client.detect(&observation.volume, options))?.grasps)
     }
 }

@@ -35,9 +35,10 @@ pub fn generate(kind: SceneKind, objects: &ObjectSet, count: usize, rng: &mut im
         SceneKind::Pile => pile(objects, count, rng),
         SceneKind::Packed => packed(objects, count, rng),
     };
-    wait_for_rest(&mut world, 5.0);
     // The contacts need a while longer than the eye before nothing creeps.
+    wait_for_rest(&mut world, 5.0);
     (0..STEPS_PER_SECOND).for_each(|_| world.step());
+    settle(&mut world);
     world
 }
 

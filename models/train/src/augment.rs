@@ -74,8 +74,9 @@ impl Transform {
         let Label { mut position, mut rotation, .. } = *label;
         if self.mirror {
             position.x = edge - position.x;
-            // The mirror image of a rotation about an axis is the opposite rotation about the mirrored axis. This
-            // also swaps the two fingers, which are alike.
+            // The mirror image of a rotation about an axis is the opposite rotation about the mirrored axis. Of the
+            // hand, which is the mirror image of itself in x, this flips the x axis against the mirrored one; the
+            // approach (z) and the axis along which the fingers close (y) are the mirrored ones.
             let [x, y, z, w]: [f64; 4] = rotation.coords.into();
             rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, x, -y, -z));
         }

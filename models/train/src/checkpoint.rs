@@ -1,4 +1,7 @@
-//! Where a training run stands, so that it can go on exactly as if it had not been interrupted.
+//! Where a training run stands, so that it can go on as if it had not been interrupted.
+//!
+//! To the last bit that holds on the CPU with the same number of threads: with another, and on a GPU at all, libtorch adds
+//! in another order, and what it computes differs in the last digits.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -16,7 +19,8 @@ use crate::loss::Sums;
 /// the epoch, so no generator has to be kept.
 #[derive(Clone, PartialEq, Message)]
 pub struct Checkpoint {
-    /// The settings it was started with, as JSON: another run must not go on from here.
+    /// The settings it was started with, as JSON, and what tells its data from others: another run must not go on from
+    /// here.
     #[prost(string, tag = "1")]
     pub settings: String,
     /// Epochs completed.
@@ -61,14 +65,17 @@ pub enum CheckpointError {
         /// What is wrong.
         reason: String,
     },
-    /// It belongs to a run with other settings.
-    #[error("the checkpoint was made with {theirs}, this run is {ours}; give the same options, or start anew")]
+    /// It belongs to a run with other settings or data.
+    #[error("the checkpoint was made with {theirs}, this run is {ours}; give the same options and data, or start anew")]
     Settings {
         /// The checkpoint's.
         theirs: String,
         /// This run's.
         ours: String,
     },
+    /// It does not hold the losses of the epoch it was made in.
+    #[error("the checkpoint holds {0} sums of losses, it must hold 7: it is another version's; start without --resume")]
+    Sums(usize),
     /// Its weights are not those of this network.
     #[error("the checkpoint is of another network: {0}")]
     Weights(String),

@@ -1,16 +1,22 @@
 //! Executes an ONNX graph with libtorch, under autograd.
 //!
-//! What is trained is what is served: each node becomes the libtorch operation of the same meaning, each
-//! floating-point initialiser a tensor that learns. Only what grasp networks use is here, and anything else is refused
-//! when the graph is loaded, by its name: an operator or a setting that was skipped would train another network.
+//! What is trained is what is served: each node becomes the libtorch operation of the same meaning, each weight a tensor
+//! that learns. Weights are the floating-point initialisers, except numbers (rank 0) and those that say how an operator
+//! works, such as the bounds of a `Clip`. Only what grasp networks use is here, and anything else is refused when the
+//! graph is loaded, by its name: an operator or a setting that was skipped would train another network.
 
 use std::collections::{HashMap, HashSet};
+use std::ops::RangeInclusive;
 
-use grasp_models::onnx::{AttributeProto, ModelProto, NodeProto, TensorError, TensorProto};
+use grasp_models::onnx::{AttributeProto, ModelProto, NodeProto, OperatorSetIdProto, TensorError, TensorProto};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 use thiserror::Error;
 
 use crate::heads::{cubes, heads};
+
+/// The versions of ONNX's operators that are understood. `Split`, `Softmax` and others meant something else before, or
+/// took as settings what are inputs now; later ones were never tried.
+const OPSETS: RangeInclusive<i64> = 13..=20;
 
 /// An operator as ONNX names it, with the settings of it that are understood.
 const OPERATORS: &[(&str, &[&str])] = &[
@@ -28,7 +34,7 @@ const OPERATORS: &[(&str, &[&str])] = &[
     ("LeakyRelu", &["alpha"]),
     ("MatMul", &[]),
     ("Mul", &[]),
-    ("ReduceL2", &["axes", "keepdims"]),
+    ("ReduceL2", &["axes", "keepdims", "noop_with_empty_axes"]),
     ("Relu", &[]),
     ("Reshape", &[]),
     ("Resize", &["coordinate_transformation_mode", "cubic_coeff_a", "mode", "nearest_mode"]),
@@ -46,6 +52,13 @@ pub enum ExecuteError {
     /// The file holds no graph.
     #[error("the model holds no graph")]
     NoGraph,
+    /// The model is written in operators of another version.
+    #[error(
+        "the model is of opset {0}, it must be from {first} to {last} to be trained; export it again with one of these",
+        first = OPSETS.start(),
+        last = OPSETS.end()
+    )]
+    Opset(i64),
     /// The operator is not implemented.
     #[error("node `{node}`: the operator `{op}` cannot be trained; there are {}", supported())]
     Operator {
@@ -115,7 +128,7 @@ pub struct Execution {
 pub struct Executor {
     model: ModelProto,
     execution: Execution,
-    /// In the order of the initialisers.
+    /// The weights, in the order of the initialisers.
     parameters: Vec<(String, Tensor)>,
     constants: HashMap<String, Tensor>,
     /// The nodes from which on single voxels can be computed.
@@ -136,18 +149,25 @@ impl Executor {
     /// Takes over a model: checks that every node can be executed and makes its weights trainable.
     ///
     /// # Errors
-    /// [`ExecuteError`] names the node that cannot be executed.
+    /// [`ExecuteError`] names the node that cannot be executed, or the opset.
     pub fn new(model: ModelProto, execution: Execution) -> Result<Self, ExecuteError> {
         let graph = model.graph.as_ref().ok_or(ExecuteError::NoGraph)?;
+        let standard = model.opset_import.iter().find(|opset| matches!(opset.domain(), "" | "ai.onnx"));
+        // A file that does not say is of the first.
+        let opset = standard.map_or(1, OperatorSetIdProto::version);
+        if !OPSETS.contains(&opset) {
+            return Err(ExecuteError::Opset(opset));
+        }
+        let settings: HashSet<&str> = graph.node.iter().flat_map(settings_of).map(String::as_str).collect();
         let mut parameters = Vec::new();
         let mut constants = HashMap::new();
         for initializer in &graph.initializer {
             let name = initializer.name().to_owned();
-            if initializer.is_float() {
+            if initializer.is_float() && !initializer.dims.is_empty() && !settings.contains(initializer.name()) {
                 let weight = tensor_of(initializer)?.to_device(execution.device);
                 parameters.push((name, execution.arrange(&weight).set_requires_grad(true)));
             } else {
-                constants.insert(name, tensor_of(initializer)?);
+                constants.insert(name, constant(initializer, execution.device)?);
             }
         }
         for node in &graph.node {
@@ -155,10 +175,7 @@ impl Executor {
             if node.op_type() == "Constant"
                 && let Some(value) = node.attribute("value").and_then(|value| value.t.as_ref())
             {
-                let value = tensor_of(value)?;
-                // Whole numbers are shapes and sizes, which are read on the CPU.
-                let device = if value.kind() == Kind::Float { execution.device } else { Device::Cpu };
-                constants.insert(output_name(node, 0), value.to_device(device));
+                constants.insert(output_name(node, 0), constant(value, execution.device)?);
             }
         }
         let heads = heads(graph);
@@ -181,8 +198,11 @@ impl Executor {
     pub fn to_model(&self) -> ModelProto {
         let mut model = self.model.clone();
         let initializers = model.graph.iter_mut().flat_map(|graph| &mut graph.initializer);
-        for (initializer, (_, weight)) in initializers.filter(|tensor| tensor.is_float()).zip(&self.parameters) {
-            initializer.set_f32(&values_of(weight));
+        let weights: HashMap<&str, &Tensor> = self.parameters.iter().map(|(name, w)| (name.as_str(), w)).collect();
+        for initializer in initializers {
+            if let Some(weight) = weights.get(initializer.name()) {
+                initializer.set_f32(&values_of(weight));
+            }
         }
         model
     }
@@ -277,6 +297,20 @@ pub(crate) fn tensor_of(tensor: &TensorProto) -> Result<Tensor, TensorError> {
     Ok(flat.reshape(&tensor.dims))
 }
 
+/// A tensor that does not learn. Whole numbers are shapes and sizes, which are read on the CPU.
+fn constant(tensor: &TensorProto, device: Device) -> Result<Tensor, TensorError> {
+    let device = if tensor.is_float() { device } else { Device::Cpu };
+    Ok(tensor_of(tensor)?.to_device(device))
+}
+
+/// The inputs of a node that say how it works, rather than being worked on: a network must not learn them.
+fn settings_of(node: &NodeProto) -> &[String] {
+    match node.op_type() {
+        "Clip" | "Resize" => node.input.get(1..).unwrap_or_default(),
+        _ => &[],
+    }
+}
+
 fn output_name(node: &NodeProto, index: usize) -> String {
     node.output.get(index).cloned().unwrap_or_default()
 }
@@ -338,7 +372,11 @@ impl Step<'_> {
             "MatMul" => one(self.reduced(0)?.f_matmul(&self.reduced(1)?)),
             "Mul" => one(self.input(0)?.f_mul(self.input(1)?)),
             "ReduceL2" => {
-                let axes = self.ints("axes", &[]);
+                // A setting until opset 17, an input since.
+                let axes = if self.optional(1).is_some() { self.whole(1)? } else { self.ints("axes", &[]) };
+                if axes.is_empty() && self.int("noop_with_empty_axes", 0) != 0 {
+                    return Err(self.setting("`noop_with_empty_axes`".to_owned()));
+                }
                 one(self.full(0)?.f_norm_scalaropt_dim(2, axes, self.int("keepdims", 1) != 0))
             }
             "Relu" => one(self.input(0)?.f_relu()),

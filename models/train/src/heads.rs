@@ -16,7 +16,7 @@ pub(crate) fn heads(graph: &GraphProto) -> HashSet<usize> {
     let (mut heads, mut behind) = (HashSet::new(), HashSet::new());
     for (index, node) in graph.node.iter().enumerate().rev() {
         let single = !node.output.iter().any(|output| whole.contains(output.as_str()));
-        if single && is_pointwise(node) {
+        if single && is_pointwise(graph, node) {
             behind.insert(index);
             continue;
         }
@@ -41,6 +41,14 @@ fn ints<'a>(node: &'a NodeProto, name: &str) -> &'a [i64] {
     node.attribute(name).map_or(&[], |attribute| &attribute.ints)
 }
 
+/// The whole numbers that the graph holds under a name.
+fn constant(graph: &GraphProto, name: &str) -> Option<Vec<i64>> {
+    let initializer = || graph.initializer.iter().find(|tensor| tensor.name() == name);
+    let node = graph.node.iter().find(|node| node.op_type() == "Constant" && node.output.iter().any(|o| o == name));
+    let value = node.and_then(|node| node.attribute("value")?.t.as_ref()).or_else(initializer)?;
+    value.to_i64().ok()
+}
+
 /// A convolution that gives a voxel from the cube around it.
 fn is_head(node: &NodeProto) -> bool {
     let kernel = ints(node, "kernel_shape");
@@ -53,10 +61,13 @@ fn is_head(node: &NodeProto) -> bool {
 }
 
 /// An operation that treats every voxel on its own.
-fn is_pointwise(node: &NodeProto) -> bool {
+fn is_pointwise(graph: &GraphProto, node: &NodeProto) -> bool {
     match node.op_type() {
         "Add" | "Clip" | "Div" | "Expand" | "LeakyRelu" | "Mul" | "Relu" | "Shape" | "Sigmoid" => true,
-        "ReduceL2" => ints(node, "axes") == [1],
+        "ReduceL2" => match node.input.get(1) {
+            Some(axes) => constant(graph, axes).is_some_and(|axes| axes == [1]),
+            None => ints(node, "axes") == [1],
+        },
         "Split" => node.attribute("axis").is_some_and(|axis| axis.i() == 1),
         _ => false,
     }

@@ -106,9 +106,11 @@ fn start_from(training: &Training) -> Result<(ModelProto, Metadata)> {
     Ok((model, metadata))
 }
 
-/// VGN's released code trains with Adam at 3e-4 in batches of 32 for 30 epochs; the paper with 1e-4, 64 and 21.
+/// VGN's released code trains with Adam at 3e-4 in batches of 32 for 30 epochs; the paper with 1e-4, 64 and 21. A model
+/// that is fine-tuned notes which it is; one that does not is taken for VGN.
 fn settings(training: &Training, metadata: &Metadata) -> Settings {
-    let of_paper = training.network.as_deref().is_some_and(|network| network.starts_with("transformer"));
+    let network = training.network.as_ref().or_else(|| metadata.provenance.get("architecture"));
+    let of_paper = network.is_some_and(|network| network.starts_with("transformer"));
     let (epochs, batch, learning_rate) = if of_paper { (21, 64, 1e-4) } else { (30, 32, 3e-4) };
     let allows = |change| training.augment.contains(&change);
     Settings {

@@ -140,6 +140,8 @@ pub struct Trainer<'a> {
     training: Vec<usize>,
     validation: Vec<usize>,
     class_weights: [f64; 2],
+    /// What must be the same for a run to go on.
+    fingerprint: String,
     executor: Executor,
     adam: Adam,
     /// Epochs completed, batches done of the next, and their losses.
@@ -172,8 +174,20 @@ impl<'a> Trainer<'a> {
         let class_weights = if settings.balance { class_weights(dataset, &training)? } else { [1.0; 2] };
         let executor = Executor::new(model, execution)?;
         let adam = Adam::new(executor.parameters());
-        let sums = Sums::default();
-        Ok(Self { settings, dataset, training, validation, class_weights, executor, adam, epoch: 0, batch: 0, sums })
+        let fingerprint = fingerprint(&settings, dataset, training.len(), validation.len());
+        Ok(Self {
+            settings,
+            dataset,
+            training,
+            validation,
+            class_weights,
+            fingerprint,
+            executor,
+            adam,
+            epoch: 0,
+            batch: 0,
+            sums: Sums::default(),
+        })
     }
 
     /// Scenes learnt from and held out.
@@ -210,7 +224,7 @@ impl<'a> Trainer<'a> {
     #[must_use]
     pub fn checkpoint(&self) -> Checkpoint {
         let mut checkpoint = Checkpoint {
-            settings: self.fingerprint(),
+            settings: self.fingerprint.clone(),
             epoch: self.epoch,
             batch: self.batch,
             sums: self.sums.to_list(),
@@ -223,29 +237,18 @@ impl<'a> Trainer<'a> {
     /// Goes on from there.
     ///
     /// # Errors
-    /// [`CheckpointError`] when it belongs to another run.
+    /// [`CheckpointError`] when it belongs to another run, or lacks something.
     pub fn resume(&mut self, checkpoint: &Checkpoint) -> Result<(), CheckpointError> {
-        let ours = self.fingerprint();
-        if checkpoint.settings != ours {
-            return Err(CheckpointError::Settings { theirs: checkpoint.settings.clone(), ours });
+        if checkpoint.settings != self.fingerprint {
+            let (theirs, ours) = (checkpoint.settings.clone(), self.fingerprint.clone());
+            return Err(CheckpointError::Settings { theirs, ours });
         }
+        let sums = Sums::from_list(&checkpoint.sums).ok_or(CheckpointError::Sums(checkpoint.sums.len()))?;
         checkpoint.restore(&self.executor, &mut self.adam)?;
         self.epoch = checkpoint.epoch;
         self.batch = checkpoint.batch;
-        self.sums = Sums::from_list(&checkpoint.sums).unwrap_or_default();
+        self.sums = sums;
         Ok(())
-    }
-
-    /// What must be the same for a run to go on: the settings and the number of scenes. A run at a constant learning
-    /// rate may be made longer.
-    fn fingerprint(&self) -> String {
-        let mut settings = self.settings.clone();
-        if !settings.cosine {
-            settings.epochs = 0;
-        }
-        let (training, validation) = self.scenes();
-        let settings = serde_json::to_string(&settings).unwrap_or_default();
-        format!("{settings} over {training} + {validation} scenes")
     }
 
     /// Trains for the rest of an epoch, unless `stop` is set meanwhile; `report` hears of every step: batches done and
@@ -365,6 +368,17 @@ impl<'a> Trainer<'a> {
     fn diverged(&self) -> TrainError {
         TrainError::Diverged { step: self.steps() }
     }
+}
+
+/// What must be the same for a run to go on: the settings, the scenes and their grasps. A run at a constant learning rate
+/// may be made longer.
+fn fingerprint(settings: &Settings, dataset: &Dataset, training: usize, validation: usize) -> String {
+    let mut settings = settings.clone();
+    if !settings.cosine {
+        settings.epochs = 0;
+    }
+    let settings = serde_json::to_string(&settings).unwrap_or_default();
+    format!("{settings} over {training} + {validation} scenes (labels {})", dataset.fingerprint())
 }
 
 /// Weights that make both classes count the same: n / (2 n_class).

@@ -70,6 +70,22 @@ fn a_run_leaves_a_model_that_can_be_served() {
 }
 
 #[test]
+fn fine_tuning_follows_the_network_it_starts_from() {
+    let folder = prepare();
+    let start = Architecture::TransformerSmall.build(N, 0).unwrap();
+    start.write(&folder.path().join("small.onnx")).unwrap();
+    for (from, batch, learning_rate) in [("start", 32, 3e-4), ("small", 64, 1e-4)] {
+        let arguments = format!("train --from {from}.onnx --data data --threads 1 --epochs 1 --out out.onnx");
+        let output = command(folder.path(), &arguments).output().unwrap();
+        assert!(output.status.success(), "{}", said(&output));
+        let path = folder.path().join("out.onnx");
+        let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
+        let settings: serde_json::Value = serde_json::from_str(&metadata.provenance["settings"]).unwrap();
+        assert_eq!((&settings["batch"], &settings["learning_rate"]), (&batch.into(), &learning_rate.into()), "{from}");
+    }
+}
+
+#[test]
 fn a_run_goes_on_where_it_stopped() {
     let folder = prepare();
     assert!(train(folder.path(), "--out whole.onnx --epochs 3 --name x").status.success());

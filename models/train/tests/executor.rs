@@ -1,8 +1,8 @@
 //! What the executor understands of ONNX, beyond what the networks here use, and what it refuses.
 
 use grasp_models::Architecture;
-use grasp_models::onnx::{AttributeProto, GraphProto, ModelProto, NodeProto, TensorProto};
-use grasp_train::{ExecuteError, Execution, Executor, Outputs};
+use grasp_models::onnx::{AttributeProto, GraphProto, ModelProto, NodeProto, OperatorSetIdProto, TensorProto};
+use grasp_train::{Adam, ExecuteError, Execution, Executor, Outputs};
 use tch::{Device, Kind, Tensor, no_grad};
 
 const N: usize = 16;
@@ -101,10 +101,82 @@ fn unfuse_heads(graph: &mut GraphProto) {
     graph.node.remove(fused);
 }
 
+/// The same network as of opset 18, which made the axes of `ReduceL2` an input.
+fn with_axes_as_input(mut model: ModelProto) -> ModelProto {
+    model.opset_import[0].version = Some(18);
+    let graph = model.graph.as_mut().unwrap();
+    let reduce = graph.node.iter_mut().find(|node| node.op_type() == "ReduceL2").unwrap();
+    reduce.attribute.retain(|attribute| attribute.name() != "axes");
+    reduce.attribute.push(AttributeProto::int("noop_with_empty_axes", 0));
+    reduce.input.push("axes".to_owned());
+    graph.initializer.push(TensorProto::from_i64("axes", &[1], &[1]));
+    model
+}
+
+#[test]
+fn axes_are_a_setting_or_an_input() {
+    let (setting, input) = (run(vgn(), EXECUTION).unwrap(), run(with_axes_as_input(vgn()), EXECUTION).unwrap());
+    assert!(difference(&setting, &input) == 0.0);
+}
+
+#[test]
+fn only_weights_are_learnt() {
+    let mut model = vgn();
+    let graph = model.graph.as_mut().unwrap();
+    // A factor and the bounds and scales of operators, as initialisers.
+    let width = graph.node.iter_mut().flat_map(|node| &mut node.output).find(|output| *output == "width").unwrap();
+    *width = "raw".to_owned();
+    let product = node("Mul", &["raw", "factor"], "product", vec![]);
+    graph.node.extend([product, node("Clip", &["product", "low", "high"], "width", vec![])]);
+    let resize = graph.node.iter_mut().find(|node| node.op_type() == "Resize").unwrap();
+    resize.input[2] = "scales".to_owned();
+    let constants = [
+        TensorProto::from_f32("factor", &[], &[2.0]),
+        TensorProto::from_f32("low", &[1], &[-100.0]),
+        TensorProto::from_f32("high", &[], &[100.0]),
+        TensorProto::from_f32("scales", &[5], &[1.0, 1.0, 2.0, 2.0, 2.0]),
+    ];
+    graph.initializer.splice(1..1, constants);
+
+    let executor = Executor::new(model.clone(), EXECUTION).unwrap();
+    let edge = N as i64;
+    let outputs = executor.forward(&Tensor::ones([1, 1, edge, edge, edge], (Kind::Float, Device::Cpu))).unwrap();
+    (outputs.quality.sum(None) + outputs.rotation.sum(None) + outputs.width.sum(None)).backward();
+    Adam::new(executor.parameters()).step(executor.parameters(), 0.1);
+    let (before, after) = (model.graph.unwrap().initializer, executor.to_model().graph.unwrap().initializer);
+    for (before, after) in before.iter().zip(&after) {
+        let constant = ["factor", "low", "high", "scales"].contains(&before.name());
+        assert_eq!(before == after, constant, "{}", before.name());
+    }
+}
+
+#[test]
+fn other_opsets_are_refused() {
+    let of = |opsets: &[(&str, i64)]| {
+        let import = |&(domain, version): &(&str, i64)| OperatorSetIdProto {
+            domain: Some(domain.to_owned()),
+            version: Some(version),
+        };
+        let model = ModelProto { opset_import: opsets.iter().map(import).collect(), ..vgn() };
+        Executor::new(model, EXECUTION).err().map(|error| error.to_string())
+    };
+    for version in [13, 20] {
+        assert_eq!(of(&[("com.example", 1), ("", version)]), None);
+    }
+    for version in [12, 21] {
+        let error = of(&[("", version)]).unwrap();
+        assert!(error.contains(&format!("opset {version},")) && error.contains("from 13 to 20"), "{error}");
+    }
+    assert!(of(&[]).unwrap().contains("opset 1,"));
+}
+
 #[test]
 fn a_graph_in_pytorchs_style_is_the_same_network() {
     let exported = as_exported(vgn());
-    assert_eq!(exported.parameters(), vgn().parameters());
+    let parameters = |model: &ModelProto| -> usize {
+        model.graph.as_ref().unwrap().initializer.iter().map(TensorProto::elements).sum()
+    };
+    assert_eq!(parameters(&exported), parameters(&vgn()));
     let (ours, theirs) = (run(vgn(), EXECUTION).unwrap(), run(exported, EXECUTION).unwrap());
     let worst = difference(&ours, &theirs);
     assert!(worst < 1e-5, "differs by {worst}");
@@ -124,7 +196,13 @@ fn single_voxels_are_those_of_the_whole_maps() {
     last.output[2] = "narrow".to_owned();
     let size = whole_numbers("size", &[0, 1, edge, edge, edge]);
     graph.node.extend([size, node("Reshape", &["narrow", "size"], "width", vec![])]);
-    for model in [vgn(), as_exported(vgn()), Architecture::TransformerSmall.build(N, 0).unwrap(), whole] {
+    for model in [
+        vgn(),
+        as_exported(vgn()),
+        with_axes_as_input(vgn()),
+        Architecture::TransformerSmall.build(N, 0).unwrap(),
+        whole,
+    ] {
         for channels_last in [false, true] {
             let executor = Executor::new(model.clone(), Execution { channels_last, ..EXECUTION }).unwrap();
             let maps = executor.forward(&volumes).unwrap();

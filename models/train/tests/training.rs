@@ -97,6 +97,16 @@ fn a_checkpoint_of_another_run_is_refused() {
     let checkpoint = trainer(&dataset, &settings(), EXECUTION).checkpoint();
     let mut other = trainer(&dataset, &Settings { seed: 6, ..settings() }, EXECUTION);
     assert!(matches!(other.resume(&checkpoint), Err(CheckpointError::Settings { .. })));
+    let mut relabelled = dataset.clone();
+    relabelled.scenes[3].labels[0].width += 0.5;
+    let mut renamed = dataset.clone();
+    "other".clone_into(&mut renamed.scenes[3].id);
+    for data in [&relabelled, &renamed] {
+        let refused = trainer(data, &settings(), EXECUTION).resume(&checkpoint);
+        assert!(matches!(refused, Err(CheckpointError::Settings { .. })), "as many scenes, but others");
+    }
+    let short = Checkpoint { sums: vec![0.0; 3], ..checkpoint.clone() };
+    assert!(matches!(trainer(&dataset, &settings(), EXECUTION).resume(&short), Err(CheckpointError::Sums(3))));
     let mut longer = trainer(&dataset, &Settings { epochs: 9, ..settings() }, EXECUTION);
     assert!(longer.resume(&checkpoint).is_ok(), "a run at a constant learning rate may be made longer");
     let model = Architecture::TransformerSmall.build(N, 0).unwrap();

@@ -40,7 +40,7 @@ impl Demo {
     pub fn run(self) -> anyhow::Result<()> {
         let benchmark = Benchmark {
             kind: self.scene.kind(),
-            objects: self.scene.objects()?,
+            objects: self.scene.objects("test")?,
             count: 5,
             views: self.scene.views()?,
             noise: !self.scene.no_noise,
@@ -60,22 +60,21 @@ impl Demo {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let detection = runtime.block_on(async {
             let client = Client::connect(server.grpc().to_string()).await?;
-            // The best voxel down to 0.5 where nothing reaches the threshold: a demo should try something.
-            let options = Options { force: Some(0.5), ..Options::default() };
+            // Lower than anyone would execute: a picture should show what is weighed up, too.
+            let options = Options { threshold: Some(0.5), ..Options::default() };
             client.detect(&observation.volume, options).await
         })?;
         // With its runtime the client's connection closes, which the server would wait for when it is told to stop.
         drop(runtime);
         print_detection(&detection);
 
-        let best = detection.grasps.first().context("no grasp was found; another --seed makes another scene")?;
-        let outcome = execute(&mut world.clone(), &best.pose);
-        match outcome {
-            Outcome::Lifted { object, width } => {
+        match detection.grasps.first().map(|best| execute(&mut world.clone(), &best.pose)) {
+            Some(Outcome::Lifted { object, width }) => {
                 let name = world.objects().iter().find(|body| body.id == object).map(|body| body.object.name.as_str());
                 println!("the best one, executed: lifted {} ({:.0} mm wide)", name.unwrap_or("it"), width * 1e3);
             }
-            failure => println!("the best one, executed: not lifted ({failure:?})"),
+            Some(failure) => println!("the best one, executed: not lifted ({failure:?})"),
+            None => println!("nothing to execute: {:?}; another --seed makes another scene", detection.dropped),
         }
 
         draw(&world, &detection.grasps).save(&self.picture)?;

@@ -8,6 +8,9 @@ use rayon::prelude::*;
 
 use super::{Scene, SceneArgs};
 
+/// What scenes are made of unless the command says otherwise.
+const OBJECTS: &str = "train";
+
 /// The same seed gives the same data on any number of threads; a run that was cut off goes on where it stopped.
 #[derive(Args)]
 pub struct Label {
@@ -31,7 +34,7 @@ impl Label {
     pub fn run(self) -> anyhow::Result<()> {
         let recipe = Recipe {
             kind: self.scene.kind(),
-            objects: self.scene.objects()?,
+            objects: self.scene.objects(OBJECTS)?,
             points: self.points,
             views: self.scene.views()?,
             noise: !self.scene.no_noise,
@@ -43,7 +46,7 @@ impl Label {
                 Scene::Packed => "packed",
             }
             .to_owned(),
-            objects: self.scene.objects,
+            objects: self.scene.objects.unwrap_or_else(|| OBJECTS.to_owned()),
             points: recipe.points,
             views: self.scene.views,
             noise: recipe.noise,

@@ -33,12 +33,14 @@ pub fn scene(seed: u64, n: usize) -> Scene {
 }
 
 /// A data set of such scenes.
+// Every test file compiles this module for itself; not all of them call this.
 #[allow(dead_code)]
 pub fn dataset(scenes: u64, n: usize) -> Dataset {
     Dataset { resolution: n, scenes: (0..scenes).map(|seed| scene(seed, n)).collect() }
 }
 
 /// Writes scenes as VGN and GIGA do.
+// As above.
 #[allow(dead_code)]
 pub fn write(folder: &Path, scenes: &[Scene], n: usize) {
     fs::create_dir_all(folder.join("scenes")).unwrap();
