@@ -27,7 +27,7 @@ help: ## list the targets
 
 demo: ## simulate a cluttered table, clear it with the server's grasps, draw demo.png
 	$(with_onnxruntime) $(CARGO) build --release --package graspd --package grasp-sim --locked && \
-		$(RELEASE)/grasp-sim demo --graspd $(RELEASE)/graspd --models models/zoo --picture demo.png
+		$(RELEASE)/grasp-sim demo --graspd $(RELEASE)/graspd --models models/zoo --seed 8 --picture demo.png
 
 build: ## build the server, the simulator and the client, optimised
 	$(CARGO) build --release $(WORKSPACE)

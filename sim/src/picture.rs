@@ -115,8 +115,8 @@ impl Picture {
 
     /// An empty picture of the 0.3 m task cube from a good corner, with its table.
     pub fn of_workspace(width: usize, height: usize, table: f64) -> Picture {
-        let (eye, target) = (Point3::new(0.50, -0.30, 0.52), Point3::new(0.15, 0.15, 0.10));
-        let mut picture = Picture::looking_at(width, height, 0.48, eye, target);
+        let (eye, target) = (Point3::new(0.50, -0.30, 0.52), Point3::new(0.16, 0.14, 0.12));
+        let mut picture = Picture::looking_at(width, height, 0.42, eye, target);
         picture.table(table);
         picture
     }
@@ -143,10 +143,10 @@ impl Picture {
     /// Adds a stout hand with the frame of [`Picture::gripper`], for the one that stands out.
     pub fn hand(&mut self, pose: &Isometry3<f64>, width: f64, color: Color) -> &mut Self {
         let mut hand = fork(width, 0.02, 0.009);
-        let palm = Mesh::cuboid(Vector3::new(0.04, 0.12, 0.03));
-        let flange = Mesh::cylinder(0.022, 0.04, 24);
-        hand.append(&palm.transformed(&Isometry3::translation(0.0, 0.0, -0.023)));
-        hand.append(&flange.transformed(&Isometry3::translation(0.0, 0.0, -0.055)));
+        let palm = Mesh::cuboid(Vector3::new(0.026, 0.10, 0.018));
+        let flange = Mesh::cylinder(0.011, 0.05, 24);
+        hand.append(&palm.transformed(&Isometry3::translation(0.0, 0.0, -0.016)));
+        hand.append(&flange.transformed(&Isometry3::translation(0.0, 0.0, -0.045)));
         self.add(hand.transformed(pose), color, false)
     }
 
