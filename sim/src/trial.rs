@@ -80,14 +80,17 @@ pub fn execute(world: &mut World, grasp: &Isometry3<f64>) -> Outcome {
 
 /// Closes the hand at `start` and lifts it to where a lift from `grasp` ends.
 fn close_and_lift(world: &mut World, start: &Isometry3<f64>, grasp: &Isometry3<f64>) -> Outcome {
-    let gripper = Gripper::insert(world, start);
-    let outcome = close(world, &gripper).map_or(Outcome::ClosedOnNothing, |()| lift(world, &gripper, start, grasp));
+    let mut gripper = Gripper::insert(world, start);
+    let outcome = match close(world, &mut gripper) {
+        Some(()) => lift(world, &mut gripper, start, grasp),
+        None => Outcome::ClosedOnNothing,
+    };
     gripper.remove(world);
     outcome
 }
 
 /// Closes until the width is still for 0.1 s, or 0.5 s at the longest. `None` if nothing is held then.
-fn close(world: &mut World, gripper: &Gripper) -> Option<()> {
+fn close(world: &mut World, gripper: &mut Gripper) -> Option<()> {
     const STILL: f64 = 1e-5;
     let mut still_since = 0;
     let mut width = gripper.width(world);
@@ -105,7 +108,7 @@ fn close(world: &mut World, gripper: &Gripper) -> Option<()> {
     holds(world, gripper).map(|_| ())
 }
 
-fn lift(world: &mut World, gripper: &Gripper, start: &Isometry3<f64>, grasp: &Isometry3<f64>) -> Outcome {
+fn lift(world: &mut World, gripper: &mut Gripper, start: &Isometry3<f64>, grasp: &Isometry3<f64>) -> Outcome {
     let target = grasp.translation.vector + retreat(grasp) * LIFT;
     let path = target - start.translation.vector;
     let direction = path.normalize();

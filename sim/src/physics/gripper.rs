@@ -1,12 +1,13 @@
-use nalgebra::{Isometry3, Point3, Vector3};
+use nalgebra::{Isometry3, Point3, Translation3, Vector3};
 use rapier3d::math::{AngVector, Vector};
 use rapier3d::prelude::{
-    ColliderBuilder, ColliderHandle, GenericJoint, Group, InteractionGroups, InteractionTestMode, MotorModel,
-    PrismaticJointBuilder, RigidBodyBuilder, RigidBodyHandle, RigidBodyVelocity,
+    ColliderBuilder, ColliderHandle, GenericJoint, GenericJointBuilder, Group, ImpulseJointHandle, InteractionGroups,
+    InteractionTestMode, JointAxesMask, JointAxis, MotorModel, PrismaticJointBuilder, RigidBodyBuilder,
+    RigidBodyHandle, RigidBodyVelocity,
 };
 
 use super::world::{SCALE, from_engine, to_engine, vector};
-use super::{BodyId, World};
+use super::{BodyId, STEPS_PER_SECOND, World};
 
 /// Force with which each finger closes, newtons.
 const FINGER_FORCE: f64 = 20.0;
@@ -17,7 +18,14 @@ const MOTOR_DAMPING: f64 = 130.0;
 /// How fast a finger that lags behind the other catches up, 1/s: the hand's gear keeps both at the same opening.
 const GEAR_GAIN: f64 = 60.0;
 
+/// Spinning friction of the fingers, metres: the torque about a contact's normal that a normal force of 1 N holds (the
+/// reference's hand: a soft pad does not let an object swing about the line between the fingers).
+const SPINNING_FRICTION: f64 = 0.1;
+
 const FINGER_MASS: f32 = 0.15;
+/// Engine units. Enough that a brake gives way by its greatest torque alone.
+const BRAKE_DAMPING: f32 = 1e7;
+
 const FINGER_TRAVEL: f64 = grasp::MAX_OPENING / 2.0;
 
 /// A box of the hand in the grasp frame, metres: the frame's z is the approach, ±y the closing axis.
@@ -80,12 +88,14 @@ impl HandBox {
 pub struct Gripper {
     palm: RigidBodyHandle,
     fingers: [Finger; 2],
+    /// A brake on the turning, about the closing axis, of each object that was touched.
+    brakes: Vec<(BodyId, ImpulseJointHandle)>,
 }
 
 struct Finger {
     body: RigidBodyHandle,
     collider: ColliderHandle,
-    joint: rapier3d::prelude::ImpulseJointHandle,
+    joint: ImpulseJointHandle,
     /// +1 for the left finger, −1 for the right: its outward direction along y.
     side: f64,
 }
@@ -100,7 +110,7 @@ impl Gripper {
         let fingers = [1.0, -1.0].map(|side| {
             let offset = Vector3::new(0.0, side * FINGER_TRAVEL, 0.0);
             let body = RigidBodyBuilder::dynamic()
-                .pose(to_engine(&(pose * nalgebra::Translation3::from(offset))))
+                .pose(to_engine(&(pose * Translation3::from(offset))))
                 .gravity_scale(0.0)
                 .can_sleep(false);
             let body = world.bodies.insert(body);
@@ -120,23 +130,62 @@ impl Gripper {
             let joint = world.joints.insert(palm, body, GenericJoint::from(joint), true);
             Finger { body, collider, joint, side }
         });
-        Self { palm, fingers }
+        Self { palm, fingers, brakes: Vec::new() }
     }
 
     /// Lets the fingers push shut during the next step.
-    pub fn close(&self, world: &mut World) {
+    pub fn close(&mut self, world: &mut World) {
+        self.brake(world);
         let joints = self.positions(world);
         let mean = (joints[0] + joints[1]) / 2.0;
         for (finger, position) in self.fingers.iter().zip(joints) {
             let velocity = -FINGER_FORCE / MOTOR_DAMPING - GEAR_GAIN * (position - mean);
             if let Some(joint) = world.joints.get_mut(finger.joint, true) {
-                joint.data.set_motor_velocity(
-                    rapier3d::prelude::JointAxis::LinX,
-                    (velocity * SCALE) as f32,
-                    MOTOR_DAMPING as f32,
-                );
+                joint.data.set_motor_velocity(JointAxis::LinX, (velocity * SCALE) as f32, MOTOR_DAMPING as f32);
             }
         }
+    }
+
+    /// Sets the brakes by the forces of the last step.
+    fn brake(&mut self, world: &mut World) {
+        let touched = self.touched(world);
+        for &(id, _) in &touched {
+            if !self.brakes.iter().any(|(braked, _)| *braked == id) {
+                let turned = world.pose(id).rotation.inverse() * self.pose(world).rotation;
+                let joint = GenericJointBuilder::new(JointAxesMask::empty())
+                    .local_frame2(to_engine(&Isometry3::from_parts(Translation3::identity(), turned)))
+                    .motor_model(JointAxis::AngY, MotorModel::ForceBased)
+                    .motor_velocity(JointAxis::AngY, 0.0, BRAKE_DAMPING)
+                    .build();
+                self.brakes.push((id, world.joints.insert(self.palm, id.0, joint, true)));
+            }
+        }
+        for (id, joint) in &self.brakes {
+            let force = touched.iter().find(|(touched, _)| touched == id).map_or(0.0, |(_, force)| *force);
+            if let Some(joint) = world.joints.get_mut(*joint, true) {
+                // Torques scale with the square of lengths; an engine's force holds one factor already.
+                joint.data.set_motor_max_force(JointAxis::AngY, force * (SPINNING_FRICTION * SCALE) as f32);
+            }
+        }
+    }
+
+    /// The objects the fingers press, and the force in engine units.
+    fn touched(&self, world: &World) -> Vec<(BodyId, f32)> {
+        let mut touched: Vec<(BodyId, f32)> = Vec::new();
+        for finger in &self.fingers {
+            for pair in world.narrow_phase.contact_pairs_with(finger.collider) {
+                // The manifolds' distances are stale between steps; an impulse means that it was touched in this one.
+                let force = pair.total_impulse_magnitude() * STEPS_PER_SECOND as f32;
+                let other = if pair.collider1 == finger.collider { pair.collider2 } else { pair.collider1 };
+                if let Some(id) = world.object_of(other).filter(|_| force > 0.0) {
+                    match touched.iter_mut().find(|(known, _)| *known == id) {
+                        Some((_, sum)) => *sum += force,
+                        None => touched.push((id, force)),
+                    }
+                }
+            }
+        }
+        touched
     }
 
     /// Moves the palm at `velocity` (task frame, m/s) from the next step on.
@@ -155,20 +204,7 @@ impl Gripper {
     /// The object the fingers press hardest, if they press any.
     #[must_use]
     pub fn held(&self, world: &World) -> Option<BodyId> {
-        let mut hardest = None;
-        for finger in &self.fingers {
-            for pair in world.narrow_phase.contact_pairs_with(finger.collider) {
-                // The manifolds' distances are stale between steps; an impulse means that it was touched in this one.
-                let impulse = pair.total_impulse_magnitude();
-                let other = if pair.collider1 == finger.collider { pair.collider2 } else { pair.collider1 };
-                if impulse > hardest.map_or(0.0, |(most, _)| most)
-                    && let Some(id) = world.object_of(other)
-                {
-                    hardest = Some((impulse, id));
-                }
-            }
-        }
-        hardest.map(|(_, id)| id)
+        self.touched(world).into_iter().max_by(|(_, a), (_, b)| a.total_cmp(b)).map(|(id, _)| id)
     }
 
     /// `T_task_grasp` of the hand.
