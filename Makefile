@@ -18,7 +18,7 @@ with_python = GRASPD_PYTHON="$$($(PYTHON) deploy/native.py python)" && export GR
 with_libtorch = LIBTORCH="$$($(PYTHON) deploy/native.py libtorch)" && export LIBTORCH && \
 	LD_LIBRARY_PATH="$$LIBTORCH/lib$${LD_LIBRARY_PATH:+:$$LD_LIBRARY_PATH}" && export LD_LIBRARY_PATH &&
 
-.PHONY: help demo build test fmt fmt-check lint doc deny test-rust test-train test-python clean
+.PHONY: help demo build test fmt fmt-check lint doc deny test-rust test-train test-python bench-sim clean
 # The order of test's parts is the order in which they fail fastest, also under `make -j`.
 .NOTPARALLEL:
 
@@ -59,6 +59,9 @@ test-train: ## test training, in libtorch on the CPU
 
 test-python: ## of test-rust, only the tests whose names say python
 	$(with_onnxruntime) $(with_python) $(CARGO) test $(WORKSPACE) python
+
+bench-sim: ## how fast scenes are made, seen and labelled on one core
+	$(CARGO) run --release --package grasp-sim --example speed --locked
 
 clean: ## remove what was built; what was downloaded stays
 	$(CARGO) clean

@@ -1,3 +1,4 @@
+use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -5,8 +6,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
+use anyhow::Context;
 use grasp::{DecodeError, DecodeParams, Decoded, Volume, decode};
-use grasp_models::{Entry, LoadError, Network, Options, RuntimeError};
+use grasp_models::{Entry, Network, Options, RuntimeError};
 use nalgebra::Isometry3;
 use prometheus::IntGauge;
 use thiserror::Error;
@@ -89,7 +91,7 @@ impl Engine {
         capacity: usize,
         waiting: impl FnOnce(&str) -> IntGauge,
         sessions: &mut Sessions,
-    ) -> Result<Self, LoadError> {
+    ) -> anyhow::Result<Self> {
         let label = format!("{} {}", entry.metadata.name, entry.metadata.version);
         let waiting = waiting(&label);
         let pace = Arc::new(Pace(AtomicU64::new(0)));
@@ -104,7 +106,9 @@ impl Engine {
                 waiting: waiting.clone(),
                 pace: Arc::clone(&pace),
             };
-            sessions.spawn(format!("{} {worker}", entry.metadata.name), session);
+            sessions.spawn(format!("{} {worker}", entry.metadata.name), session).with_context(|| {
+                format!("cannot start thread {worker} of {workers} for the model {label}; lower --workers")
+            })?;
         }
         info!(model = label, sha256 = entry.sha256, workers, threads, "loaded");
         Ok(Self { entry, label, queue, places, capacity, waiting, pace })
@@ -135,10 +139,10 @@ impl Sessions {
         Self { threads: Vec::new(), warm, report }
     }
 
-    fn spawn(&mut self, name: String, session: Session) {
+    fn spawn(&mut self, name: String, session: Session) -> io::Result<()> {
         let report = self.report.clone();
-        let thread = thread::Builder::new().name(name).spawn(move || session.run(&report));
-        self.threads.push(thread.expect("the system has threads left, or nothing could be served"));
+        self.threads.push(thread::Builder::new().name(name).spawn(move || session.run(&report))?);
+        Ok(())
     }
 
     /// Waits until every session has answered once.

@@ -1,5 +1,4 @@
 use grasp::Volume;
-use grasp_models::LoadError;
 use grasp_proto::{FieldError, pb};
 
 use crate::config::Config;
@@ -12,7 +11,7 @@ pub(crate) struct Models(Vec<Engine>);
 
 impl Models {
     /// Loads what the store holds and starts `sessions`, which run until the models are dropped.
-    pub fn load(config: &Config, metrics: &Metrics, sessions: &mut Sessions) -> Result<Self, LoadError> {
+    pub fn load(config: &Config, metrics: &Metrics, sessions: &mut Sessions) -> anyhow::Result<Self> {
         let mut entries = config.store.entries().to_vec();
         // The store has the oldest version of a name first; the sort is stable.
         entries.reverse();
