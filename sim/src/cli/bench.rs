@@ -20,9 +20,13 @@ pub struct Bench {
     #[command(flatten)]
     decoding: DecodingArgs,
 
-    /// Scenes to clear.
-    #[arg(long, default_value_t = 100)]
+    /// Scenes to clear for each seed.
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
     rounds: u64,
+
+    /// Play so many times, with --seed and the numbers after it: the papers use 5.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
+    seeds: u64,
 
     /// Objects a scene.
     #[arg(long, default_value_t = 5)]
@@ -60,6 +64,15 @@ fn parse_force(text: &str) -> Result<Force, String> {
     }
 }
 
+/// Mean and sample standard deviation over the seeds; no deviation from one alone.
+fn mean_and_std(values: Vec<f64>) -> serde_json::Value {
+    let n = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / n;
+    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+    let std = (n > 1.0).then(|| (squares / (n - 1.0)).sqrt());
+    serde_json::json!({ "mean": mean, "std": std, "n": values.len() })
+}
+
 impl DecodingArgs {
     fn params(&self) -> DecodeParams {
         let benchmark = DecodeParams::benchmark();
@@ -86,26 +99,46 @@ impl Bench {
         };
         let params = self.decoding.params();
         for name in &self.planners {
-            let progress = ProgressBar::new(self.rounds).with_message(name.clone());
-            let rounds = benchmark
-                .run(&PlannerSpec::from(name.as_str()), &params, || progress.inc(1))
-                .with_context(|| format!("planner `{name}`"))?;
+            let progress = ProgressBar::new(self.rounds * self.seeds).with_message(name.clone());
+            let mut games = Vec::new();
+            for seed in benchmark.seed..benchmark.seed + self.seeds {
+                let benchmark = Benchmark { seed, ..benchmark.clone() };
+                let rounds = benchmark.run(&PlannerSpec::from(name.as_str()), &params, || progress.inc(1));
+                games.push(rounds.with_context(|| format!("planner `{name}`"))?);
+            }
             progress.finish_and_clear();
-            let mut line = serde_json::to_value(Summary::of(&rounds))?;
+            let mut line = serde_json::to_value(Summary::of(&games.concat()))?;
+            let each: Vec<Summary> = games.iter().map(|rounds| Summary::of(rounds)).collect();
+            line["seeds"] = serde_json::json!({
+                "gsr": mean_and_std(each.iter().map(|summary| summary.gsr).collect()),
+                "dr": mean_and_std(each.iter().map(|summary| summary.dr).collect()),
+            });
             line["planner"] = name.as_str().into();
             line["decoding"] = format!("{params:?}").into();
             line["setup"] = format!(
-                "{:?}, objects {}, views {}, noise {}, {} objects a scene, seed {}",
+                "{:?}, objects {}, views {}, noise {}, {} objects a scene, {} rounds, seed {}",
                 benchmark.kind,
                 self.scene.objects.as_deref().unwrap_or("test"),
                 self.scene.views,
                 benchmark.noise,
                 benchmark.count,
+                benchmark.rounds,
                 benchmark.seed
             )
             .into();
             println!("{line}");
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seeds_are_averaged() {
+        assert_eq!(mean_and_std(vec![0.5]), serde_json::json!({ "mean": 0.5, "std": null, "n": 1 }));
+        assert_eq!(mean_and_std(vec![1.0, 3.0]), serde_json::json!({ "mean": 2.0, "std": 2f64.sqrt(), "n": 2 }));
     }
 }
