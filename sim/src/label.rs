@@ -122,10 +122,12 @@ fn try_point(world: &World, cloud: &[SurfacePoint], rng: &mut impl Rng) -> Trial
     let pose = sample_pose(cloud, rng);
     let turned =
         |yaw: usize| pose * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw as f64 * PI / (YAWS - 1) as f64);
-    let widths: [Option<f64>; YAWS] = std::array::from_fn(|yaw| match trial::label(world, &turned(yaw)) {
+    let tried: [Option<f64>; YAWS - 1] = std::array::from_fn(|yaw| match trial::label(world, &turned(yaw)) {
         trial::Outcome::Lifted { width, .. } => Some(width),
         _ => None,
     });
+    // The last yaw is the first one turned by half a turn, and the hand is symmetric.
+    let widths: [Option<f64>; YAWS] = std::array::from_fn(|yaw| tried[yaw % tried.len()]);
     let best = middle_of_widest_run(&widths.map(|width| width.is_some()));
     match best.and_then(|yaw| widths[yaw].map(|width| (yaw, width))) {
         Some((yaw, width)) => Trial { grasp: Grasp { pose: turned(yaw), width, quality: 1.0 }, success: true },

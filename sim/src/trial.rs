@@ -21,6 +21,9 @@ const LIFT_RAMP: f64 = 0.05;
 /// Opening below which the hand holds nothing: a tenth of its greatest (VGN).
 const EMPTY_WIDTH: f64 = 0.1 * grasp::MAX_OPENING;
 
+/// Steps between two looks at what the lift does, 50 ms.
+const LOOK: u32 = STEPS_PER_SECOND / 20;
+
 /// Step of the approach, metres.
 const APPROACH_STEP: f64 = 0.002;
 
@@ -114,19 +117,51 @@ fn lift(world: &mut World, gripper: &mut Gripper, start: &Isometry3<f64>, grasp:
     let direction = path.normalize();
     let duration = path.norm() / LIFT_SPEED + LIFT_RAMP / 2.0;
     let steps = (duration * f64::from(STEPS_PER_SECOND)).round() as u32;
+    let mut carried = None;
     for step in 1..=steps {
         let ramp = (f64::from(step) / f64::from(STEPS_PER_SECOND) / LIFT_RAMP).min(1.0);
         gripper.set_velocity(world, &(direction * LIFT_SPEED * ramp));
         gripper.close(world);
         world.step();
-        // The reference looks once, at the end; shut fingers will not hold anything any more, so there is no need to wait.
-        if step % (STEPS_PER_SECOND / 20) == 0 && gripper.width(world) <= EMPTY_WIDTH {
-            return Outcome::LostInLift;
+        if step % LOOK == 0 {
+            // The reference looks once, at the end; shut fingers will not hold anything any more.
+            if gripper.width(world) <= EMPTY_WIDTH {
+                return Outcome::LostInLift;
+            }
+            // Nor will anything change for what hangs still in the hand with nothing before it.
+            let before = std::mem::replace(&mut carried, Carried::now(world, gripper));
+            if let (Some(before), Some(now)) = (before, &carried)
+                && now.hangs_still(&before)
+                && gripper.is_free_to_move(world, now.object, &(target - gripper.pose(world).translation.vector))
+            {
+                break;
+            }
         }
     }
     match holds(world, gripper) {
         Some(object) => Outcome::Lifted { object, width: gripper.width(world) },
         None => Outcome::LostInLift,
+    }
+}
+
+/// Where an object is in the hand.
+struct Carried {
+    object: BodyId,
+    pose: Isometry3<f64>,
+}
+
+impl Carried {
+    fn now(world: &World, gripper: &Gripper) -> Option<Self> {
+        let object = holds(world, gripper)?;
+        Some(Self { object, pose: gripper.pose(world).inv_mul(&world.pose(object)) })
+    }
+
+    /// Whether what creeps now would not have crept a millimetre, or turned three degrees, when the lift ends.
+    fn hangs_still(&self, before: &Self) -> bool {
+        const CREEP: f64 = 4e-5;
+        const TURN: f64 = 2e-3;
+        let moved = before.pose.inv_mul(&self.pose);
+        self.object == before.object && moved.translation.vector.norm() < CREEP && moved.rotation.angle() < TURN
     }
 }
 

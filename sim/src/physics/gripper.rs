@@ -213,6 +213,16 @@ impl Gripper {
         from_engine(world.bodies[self.palm].position())
     }
 
+    /// Whether the hand can move on by `travel` (task frame, metres) with `held` in it, touching nothing else.
+    #[must_use]
+    pub fn is_free_to_move(&self, world: &World, held: BodyId, travel: &Vector3<f64>) -> bool {
+        let fingers = self.fingers.each_ref().map(|finger| finger.collider);
+        let mut moving = world.colliders_of(held.0).chain(world.colliders_of(self.palm)).chain(fingers);
+        moving.all(|collider| {
+            !world.touches_another(collider, held, &fingers) && world.is_path_free(collider, held, travel)
+        })
+    }
+
     /// Takes the hand out of the world.
     pub fn remove(self, world: &mut World) {
         for finger in &self.fingers {
