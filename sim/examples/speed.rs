@@ -61,10 +61,17 @@ fn main() {
 impl Times {
     fn measure(kind: SceneKind) -> Self {
         let objects = ObjectSet::procedural(Split::Train);
-        let recipe =
-            Recipe { kind, objects: objects.clone(), points: 120, views: Views::Anywhere(1..=6), noise: true, seed: 1 };
+        let recipe = Recipe {
+            kind,
+            objects: objects.clone(),
+            points: 120,
+            views: Views::Anywhere(1..=6),
+            looks: 1,
+            noise: 1.0,
+            seed: 1,
+        };
         let (points, labelling) =
-            timed(|| (0..SCENES).filter_map(|number| Some(recipe.label(number)?.trials.len())).sum());
+            timed(|| (0..SCENES).filter_map(|number| Some(recipe.label(number)?.points.len())).sum());
 
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let (worlds, generating): (Vec<_>, _) =

@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::camera::{Views, add_noise, look};
+use crate::camera::{Views, observe};
 use crate::objects::ObjectSet;
 use crate::physics::World;
 use crate::planner::{Observation, Planner, PlannerSpec};
@@ -30,8 +30,8 @@ pub struct Benchmark {
     pub count: usize,
     /// Where the scene is looked at from before each grasp.
     pub views: Views,
-    /// Whether the depth carries noise.
-    pub noise: bool,
+    /// Share of the observations whose depth carries noise.
+    pub noise: f64,
     /// Number of scenes.
     pub rounds: u64,
     /// Seed of the scenes.
@@ -141,11 +141,7 @@ impl Benchmark {
     /// Looks at a scene; `None` if nothing of it is seen.
     #[must_use]
     pub fn observe(&self, world: &World, rng: &mut ChaCha8Rng) -> Option<Observation> {
-        let mut views = look(world, &self.views.sample(rng));
-        if self.noise {
-            views.iter_mut().for_each(|view| add_noise(view, rng));
-        }
-        Observation::new(views)
+        Observation::new(observe(world, &self.views, self.noise, rng))
     }
 
     fn play(&self, number: u64, planner: &mut dyn Planner) -> anyhow::Result<Round> {

@@ -4,6 +4,7 @@ use std::f64::consts::{FRAC_PI_2, FRAC_PI_3, TAU};
 use std::ops::RangeInclusive;
 
 use grasp::{DepthImage, Fusion, Intrinsics};
+pub use grasp_data::raw::View;
 use nalgebra::{Isometry3, Point3, Vector3};
 use rand::{Rng, RngExt};
 use rand_distr::{Distribution, Gamma, Normal};
@@ -17,15 +18,6 @@ const NEAR: f64 = 0.1;
 
 /// Furthest depth that is seen, metres.
 const FAR: f64 = 2.0;
-
-/// A depth image and where it was taken from.
-#[derive(Clone, Debug)]
-pub struct View {
-    /// Metres along the optical axis, row by row, 0 where nothing was seen.
-    pub depth: Vec<f32>,
-    /// `T_camera_task`.
-    pub camera_from_task: Isometry3<f64>,
-}
 
 /// Where a scene is looked at from.
 #[derive(Clone, Debug, PartialEq)]
@@ -91,6 +83,16 @@ pub fn look(world: &World, cameras: &[Isometry3<f64>]) -> Vec<View> {
             View { depth: frame.depth, camera_from_task: *camera_from_task }
         })
         .collect()
+}
+
+/// Looks at the scene from where `views` says, a share `noise` of the times with noise in every image.
+#[must_use]
+pub fn observe(world: &World, views: &Views, noise: f64, rng: &mut impl Rng) -> Vec<View> {
+    let mut views = look(world, &views.sample(rng));
+    if rng.random_bool(noise) {
+        views.iter_mut().for_each(|view| add_noise(view, rng));
+    }
+    views
 }
 
 /// Adds the noise of GIGA's evaluation (Dex-Net's model): one Gamma(1000, 0.001) factor per image, then for every

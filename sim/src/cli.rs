@@ -1,8 +1,11 @@
 //! The command line, one file a command.
 
 mod bench;
+mod convert;
 mod demo;
 mod label;
+mod merge;
+mod objects;
 
 use std::path::PathBuf;
 
@@ -18,6 +21,12 @@ use grasp_sim::scene::SceneKind;
 pub enum Command {
     /// Make scenes, try grasps in them, and write what came of it as training data.
     Label(label::Label),
+    /// Turn a data set into another form.
+    Convert(convert::Convert),
+    /// Join what several machines have labelled.
+    Merge(merge::Merge),
+    /// Draw objects, or write them as URDF and OBJ.
+    Objects(objects::Objects),
     /// Clear tables with a planner and say how well it did.
     Bench(bench::Bench),
     /// One scene, from the depth camera through a server of its own to the lifted object.
@@ -29,6 +38,9 @@ impl Command {
     pub fn run(self) -> anyhow::Result<()> {
         match self {
             Self::Label(command) => command.run(),
+            Self::Convert(command) => command.run(),
+            Self::Merge(command) => command.run(),
+            Self::Objects(command) => command.run(),
             Self::Bench(command) => command.run(),
             Self::Demo(command) => command.run(),
         }
@@ -42,7 +54,8 @@ struct SceneArgs {
     #[arg(long, value_enum, default_value = "packed")]
     scene: Scene,
 
-    /// The objects: `train` or `test` (our own), or a folder of URDF files [default: train to label, else test].
+    /// The objects: our own, `train`, `test` or `endless` (a new one at every draw), or a folder of URDF files [default:
+    /// train to label, else test].
     #[arg(long)]
     objects: Option<String>,
 
@@ -51,9 +64,9 @@ struct SceneArgs {
     #[arg(long, default_value = "side")]
     views: String,
 
-    /// Leave out the depth noise of the benchmark.
-    #[arg(long)]
-    no_noise: bool,
+    /// Share of the observations that carry the benchmark's depth noise.
+    #[arg(long, default_value_t = 1.0, value_parser = parse_share)]
+    noise: f64,
 
     /// Seed of everything random.
     #[arg(long, default_value_t = 1)]
@@ -66,6 +79,18 @@ enum Scene {
     Packed,
 }
 
+impl Scene {
+    fn objects(self, name: &str) -> anyhow::Result<ObjectSet> {
+        Ok(match (name, self) {
+            ("endless", _) => ObjectSet::endless(),
+            ("train", _) => ObjectSet::procedural(Split::Train),
+            ("test", Self::Pile) => ObjectSet::procedural(Split::PileTest),
+            ("test", Self::Packed) => ObjectSet::procedural(Split::PackedTest),
+            (folder, _) => ObjectSet::load(&PathBuf::from(folder))?,
+        })
+    }
+}
+
 impl SceneArgs {
     fn kind(&self) -> SceneKind {
         match self.scene {
@@ -75,18 +100,18 @@ impl SceneArgs {
     }
 
     fn objects(&self, default: &str) -> anyhow::Result<ObjectSet> {
-        Ok(match (self.objects.as_deref().unwrap_or(default), self.scene) {
-            ("train", _) => ObjectSet::procedural(Split::Train),
-            ("test", Scene::Pile) => ObjectSet::procedural(Split::PileTest),
-            ("test", Scene::Packed) => ObjectSet::procedural(Split::PackedTest),
-            (folder, _) => ObjectSet::load(&PathBuf::from(folder))?,
-        })
+        self.scene.objects(self.objects.as_deref().unwrap_or(default))
     }
 
     fn views(&self) -> anyhow::Result<Views> {
         parse_views(&self.views)
             .with_context(|| format!("--views is `{}`: use side, side:90, circle, or anywhere:1-6", self.views))
     }
+}
+
+fn parse_share(text: &str) -> Result<f64, String> {
+    let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
+    share.ok_or_else(|| "must be from 0 to 1".to_owned())
 }
 
 fn parse_views(text: &str) -> Option<Views> {

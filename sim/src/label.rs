@@ -8,14 +8,14 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Poisson};
 
-use crate::camera::{View, Views, add_noise, fuse, look};
+use crate::camera::{View, Views, fuse, look, observe};
 use crate::objects::ObjectSet;
 use crate::physics::World;
 use crate::scene::{SceneKind, generate};
 use crate::trial;
 
 /// Yaws at which a point is tried, evenly from 0 to 180° inclusive.
-const YAWS: usize = 6;
+pub const YAWS: usize = 6;
 
 /// Resolution of the second volume, whose surface the points are drawn from.
 const CLOUD_RESOLUTION: usize = 120;
@@ -31,8 +31,10 @@ pub struct Recipe {
     pub points: usize,
     /// What the network will see.
     pub views: Views,
-    /// Whether those views carry the benchmark's noise.
-    pub noise: bool,
+    /// How often a scene is looked at anew, with other views and other noise.
+    pub looks: usize,
+    /// Share of the looks that carry the benchmark's noise.
+    pub noise: f64,
     /// Seed of the whole data set.
     pub seed: u64,
 }
@@ -40,25 +42,60 @@ pub struct Recipe {
 /// A scene as a network sees it, with what came of trying it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelledScene {
-    /// The observed volume's values, `[x][y][z]`, [`RESOLUTION`]³.
-    pub volume: Vec<f32>,
-    /// The trials.
-    pub trials: Vec<Trial>,
+    /// What stands in it.
+    pub objects: Vec<Placed>,
+    /// What was seen of it; at least one.
+    pub looks: Vec<Look>,
+    /// The grasp points.
+    pub points: Vec<Point>,
 }
 
-/// A grasp point, tried. `grasp.quality` is 1 for a success and 0 for a failure.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Trial {
-    /// Pose in the task frame; width measured after the lift, or the greatest for a failure.
+/// An object in a scene.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Placed {
+    /// Its name.
+    pub name: String,
+    /// The factor its mesh was scaled by.
+    pub scale: f64,
+    /// `T_task_object`.
+    pub pose: Isometry3<f64>,
+}
+
+/// One observation of a scene.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Look {
+    /// The depth images.
+    pub views: Vec<View>,
+    /// Their fused values, `[x][y][z]`, [`RESOLUTION`]³.
+    pub volume: Vec<f32>,
+}
+
+/// A grasp point, tried at every yaw.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Point {
+    /// The grasp to learn, in the task frame. Of a success: the middle of the widest run of yaws that lifted something,
+    /// and the opening after the lift. Of a failure: the first yaw, and the greatest opening. Quality 1 or 0.
     pub grasp: Grasp,
+    /// Which yaw that is.
+    pub yaw: usize,
+    /// Which yaws lifted something.
+    pub lifted: [bool; YAWS],
+    /// The object whose surface the point was drawn from: an index into the scene's objects.
+    pub object: Option<usize>,
+}
+
+impl Point {
     /// Whether any yaw lifted an object.
-    pub success: bool,
+    #[must_use]
+    pub fn success(&self) -> bool {
+        self.lifted.contains(&true)
+    }
 }
 
 impl Recipe {
-    /// A generator of its own for each scene: the result does not depend on which thread makes it, or when.
-    fn rng(&self, index: u64) -> ChaCha8Rng {
-        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+    /// Generators of a scene's own: the result does not depend on which thread makes it, or when.
+    fn rng(&self, index: u64, purpose: u64) -> ChaCha8Rng {
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed.wrapping_add(purpose << 32));
         rng.set_stream(index);
         rng
     }
@@ -66,23 +103,30 @@ impl Recipe {
     /// Makes, looks at and labels scene number `index`; `None` if nothing of it can be seen.
     #[must_use]
     pub fn label(&self, index: u64) -> Option<LabelledScene> {
-        let mut rng = self.rng(index);
+        let mut rng = self.rng(index, 0);
         let count = Poisson::new(4.0).expect("4 is positive").sample(&mut rng) as usize + 1;
         let world = generate(self.kind, &self.objects, count, &mut rng);
-
-        let mut views = look(&world, &self.views.sample(&mut rng));
-        if self.noise {
-            views.iter_mut().for_each(|view| add_noise(view, &mut rng));
-        }
-        let volume = fuse(&views, RESOLUTION).volume(Isometry3::identity()).ok()?.values().to_vec();
-
         // Labels cover what six clean views from above see, whatever the network will see.
         let cloud = graspable(&look(&world, &Views::Circle.sample(&mut rng)));
         if cloud.is_empty() {
             return None;
         }
-        let trials = (0..self.points).map(|_| try_point(&world, &cloud, &mut rng)).collect();
-        Some(LabelledScene { volume, trials })
+        let points = (0..self.points).map(|_| try_point(&world, &cloud, &mut rng)).collect();
+        // From a generator of their own, so that how often a scene is looked at does not change its labels.
+        let mut rng = self.rng(index, 1);
+        let looks: Vec<Look> = (0..self.looks).filter_map(|_| self.look(&world, &mut rng)).collect();
+        let objects = world.objects().iter().map(|body| Placed {
+            name: body.object.name.clone(),
+            scale: body.scale,
+            pose: world.pose(body.id),
+        });
+        (!looks.is_empty()).then(|| LabelledScene { objects: objects.collect(), looks, points })
+    }
+
+    fn look(&self, world: &World, rng: &mut ChaCha8Rng) -> Option<Look> {
+        let views = observe(world, &self.views, self.noise, rng);
+        let volume = fuse(&views, RESOLUTION).volume(Isometry3::identity()).ok()?.values().to_vec();
+        Some(Look { views, volume })
     }
 }
 
@@ -107,6 +151,10 @@ pub fn is_graspable(point: &SurfacePoint) -> bool {
 /// The pose has its approach against the normal and its x axis near the task frame's.
 #[must_use]
 pub fn sample_pose(cloud: &[SurfacePoint], rng: &mut impl Rng) -> Isometry3<f64> {
+    sample(cloud, rng).1
+}
+
+fn sample(cloud: &[SurfacePoint], rng: &mut impl Rng) -> (SurfacePoint, Isometry3<f64>) {
     const MARGIN: f64 = 0.1;
     let point = cloud[rng.random_range(0..cloud.len())];
     let depth = rng.random_range(-MARGIN * FINGER_DEPTH..(1.0 + MARGIN) * FINGER_DEPTH);
@@ -115,11 +163,11 @@ pub fn sample_pose(cloud: &[SurfacePoint], rng: &mut impl Rng) -> Isometry3<f64>
     let y = z.cross(&reference).normalize();
     let axes = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[y.cross(&z), y, z]));
     let position = point.position + point.normal * depth;
-    Isometry3::from_parts(Translation3::from(position), UnitQuaternion::from_rotation_matrix(&axes))
+    (point, Isometry3::from_parts(Translation3::from(position), UnitQuaternion::from_rotation_matrix(&axes)))
 }
 
-fn try_point(world: &World, cloud: &[SurfacePoint], rng: &mut impl Rng) -> Trial {
-    let pose = sample_pose(cloud, rng);
+fn try_point(world: &World, cloud: &[SurfacePoint], rng: &mut impl Rng) -> Point {
+    let (surface, pose) = sample(cloud, rng);
     let turned =
         |yaw: usize| pose * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw as f64 * PI / (YAWS - 1) as f64);
     let tried: [Option<f64>; YAWS - 1] = std::array::from_fn(|yaw| match trial::label(world, &turned(yaw)) {
@@ -128,11 +176,12 @@ fn try_point(world: &World, cloud: &[SurfacePoint], rng: &mut impl Rng) -> Trial
     });
     // The last yaw is the first one turned by half a turn, and the hand is symmetric.
     let widths: [Option<f64>; YAWS] = std::array::from_fn(|yaw| tried[yaw % tried.len()]);
-    let best = middle_of_widest_run(&widths.map(|width| width.is_some()));
-    match best.and_then(|yaw| widths[yaw].map(|width| (yaw, width))) {
-        Some((yaw, width)) => Trial { grasp: Grasp { pose: turned(yaw), width, quality: 1.0 }, success: true },
-        None => Trial { grasp: Grasp { pose, width: MAX_OPENING, quality: 0.0 }, success: false },
-    }
+    let lifted = widths.map(|width| width.is_some());
+    let object = world.nearest(&surface.position);
+    let best = middle_of_widest_run(&lifted).and_then(|yaw| widths[yaw].map(|width| (yaw, width)));
+    let (yaw, width) = best.unwrap_or((0, MAX_OPENING));
+    let quality = if best.is_some() { 1.0 } else { 0.0 };
+    Point { grasp: Grasp { pose: turned(yaw), width, quality }, yaw, lifted, object }
 }
 
 /// The middle of the first longest run of successes, as `scipy.signal.find_peaks` places it.

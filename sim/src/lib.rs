@@ -5,10 +5,11 @@
 
 pub mod benchmark;
 pub mod camera;
-pub mod dataset;
+pub mod export;
 pub mod label;
 pub mod mesh;
 pub mod objects;
+pub mod ordered;
 pub mod physics;
 pub mod picture;
 pub mod planner;

@@ -6,6 +6,8 @@ mod urdf;
 use std::path::Path;
 use std::sync::Arc;
 
+use rand::{Rng, RngExt};
+
 use crate::mesh::Mesh;
 pub use urdf::ObjectError;
 
@@ -24,6 +26,16 @@ pub struct Object {
     pub friction: f64,
 }
 
+impl Object {
+    /// Writes it into a folder as URDF and OBJ, as [`ObjectSet::load`] reads them.
+    ///
+    /// # Errors
+    /// [`ObjectError::Write`] names the file.
+    pub fn save(&self, dir: &Path) -> Result<(), ObjectError> {
+        urdf::save(self, dir)
+    }
+}
+
 /// Which procedural objects: the sets share no seed, hence no object.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Split {
@@ -35,17 +47,25 @@ pub enum Split {
     PackedTest,
 }
 
-/// A set of objects for scenes to draw from; never empty.
+/// What scenes draw their objects from; never empty.
 #[derive(Clone, Debug)]
 pub struct ObjectSet {
+    /// Those to draw from; none for objects without end.
     objects: Vec<Arc<Object>>,
 }
 
 impl ObjectSet {
     /// The objects of a split, the same on every call.
+    #[must_use]
     pub fn procedural(split: Split) -> ObjectSet {
         let seeds = procedural::seeds(split).into_iter();
         ObjectSet { objects: seeds.map(|seed| Arc::new(procedural::object(seed))).collect() }
+    }
+
+    /// A new object at every draw, to learn from: none of any test set, hardly ever one twice.
+    #[must_use]
+    pub fn endless() -> ObjectSet {
+        ObjectSet { objects: Vec::new() }
     }
 
     /// Reads every `*.urdf` of a folder, in the order of their names.
@@ -58,23 +78,17 @@ impl ObjectSet {
         Ok(ObjectSet { objects })
     }
 
-    /// The number of objects.
-    pub fn len(&self) -> usize {
-        self.objects.len()
+    /// Any of them, each as likely.
+    pub fn draw(&self, rng: &mut impl Rng) -> Arc<Object> {
+        if self.objects.is_empty() {
+            return Arc::new(procedural::object(rng.random_range(procedural::ENDLESS)));
+        }
+        Arc::clone(&self.objects[rng.random_range(0..self.objects.len())])
     }
 
-    /// Whether there are none; a set built by this module always has some.
-    pub fn is_empty(&self) -> bool {
-        self.objects.is_empty()
-    }
-
-    /// The object at `index`, if there are so many.
-    pub fn get(&self, index: usize) -> Option<&Arc<Object>> {
-        self.objects.get(index)
-    }
-
-    /// All objects in order.
-    pub fn iter(&self) -> std::slice::Iter<'_, Arc<Object>> {
-        self.objects.iter()
+    /// Those there are; none of a set without end.
+    #[must_use]
+    pub fn listed(&self) -> &[Arc<Object>] {
+        &self.objects
     }
 }

@@ -2,7 +2,6 @@
 
 use std::f64::consts::TAU;
 use std::ops::Range;
-use std::sync::Arc;
 
 use grasp::WORKSPACE_SIZE;
 use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
@@ -21,6 +20,15 @@ pub enum SceneKind {
     /// Objects standing upright, side by side.
     Packed,
 }
+
+/// The factors by which the objects of a pile are scaled.
+const PILE_SCALE: Range<f64> = 0.8..1.0;
+
+/// Those of packed ones.
+const PACKED_SCALE: Range<f64> = SMALLEST_SCALE..0.9;
+
+/// The smallest of all.
+pub(crate) const SMALLEST_SCALE: f64 = 0.7;
 
 /// Velocity norm (m/s and rad/s together) at which a body counts as resting.
 const REST_SPEED: f64 = 0.01;
@@ -85,11 +93,11 @@ fn pile(objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
     let mut world = World::new();
     world.add_walls([BOX.start; 2], [BOX.end; 2], BOX_HEIGHT);
     for _ in 0..count {
-        let object = draw(objects, rng);
+        let object = objects.draw(rng);
         let position =
             Translation3::new(rng.random_range(0.1..0.2), rng.random_range(0.1..0.2), TABLE_HEIGHT + DROP_HEIGHT);
         let pose = Isometry3::from_parts(position, random_rotation(rng));
-        world.add(&object, rng.random_range(0.8..1.0), &pose);
+        world.add(&object, rng.random_range(PILE_SCALE), &pose);
         wait_for_rest(&mut world, 1.0);
     }
     world.remove_walls();
@@ -106,10 +114,10 @@ fn packed(objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
         if world.objects().len() >= count {
             break;
         }
-        let object = draw(objects, rng);
+        let object = objects.draw(rng);
         let (x, y) = (rng.random_range(0.08..0.22), rng.random_range(0.08..0.22));
         let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), rng.random_range(0.0..TAU));
-        let scale = rng.random_range(0.7..0.9);
+        let scale = rng.random_range(PACKED_SCALE);
         let z = TABLE_HEIGHT - scale * lowest_point(&object) + CLEARANCE;
         let pose = Isometry3::from_parts(Translation3::new(x, y, z), rotation);
         if !world.is_occupied(&object, scale, &pose) {
@@ -118,11 +126,6 @@ fn packed(objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
         }
     }
     world
-}
-
-fn draw(objects: &ObjectSet, rng: &mut impl Rng) -> Arc<Object> {
-    let index = rng.random_range(0..objects.len());
-    Arc::clone(objects.iter().nth(index).expect("the index was drawn below the length"))
 }
 
 /// Uniform over all rotations: a 4-D Gaussian has no preferred direction.

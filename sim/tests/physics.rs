@@ -93,7 +93,8 @@ fn labels_do_not_depend_on_order_or_threads() {
         objects: ObjectSet::procedural(Split::Train),
         points: 10,
         views: Views::Anywhere(1..=2),
-        noise: true,
+        looks: 2,
+        noise: 1.0,
         seed: 3,
     };
     let forward: Vec<Option<LabelledScene>> = (0..4).map(|index| recipe.label(index)).collect();

@@ -5,8 +5,9 @@
 use std::time::Instant;
 
 use grasp::VoxelOrigin;
+use grasp_data::Trial;
 use grasp_models::build;
-use grasp_train::{Adam, Execution, Executor, Label, Targets};
+use grasp_train::{Adam, Execution, Executor, Targets};
 use nalgebra::{Point3, UnitQuaternion};
 use tch::{Device, Kind, Tensor};
 
@@ -25,7 +26,7 @@ fn main() -> anyhow::Result<()> {
     for index in 0..batch {
         for label in 0..24 {
             let position = Point3::from([5, 7, 11].map(|step| f64::from(label * step % 36 + 2)));
-            let label = Label { position, rotation: UnitQuaternion::identity(), width: 5.0, success: label % 2 == 0 };
+            let label = Trial { position, rotation: UnitQuaternion::identity(), width: 5.0, success: label % 2 == 0 };
             targets.push(index, &label, 40, VoxelOrigin::Corner);
         }
     }

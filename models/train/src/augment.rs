@@ -4,12 +4,10 @@
 //! axis of the cube is exact; only which voxel a grasp falls into depends on the network's convention. (VGN's code turns
 //! indices about 20 instead, which moves the volume against the grasps by a voxel.)
 
-use half::f16;
+use grasp_data::Trial;
 use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
 use rand::{Rng, RngExt};
 use serde::Serialize;
-
-use crate::dataset::Label;
 
 /// Which changes may be made.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
@@ -46,8 +44,8 @@ impl Augmentation {
 }
 
 impl Transform {
-    /// Writes the changed grid `[N, N, N]` to `out`; what is shifted in was not observed.
-    pub fn grid(self, grid: &[f16], n: usize, out: &mut [f32]) {
+    /// Writes the values of the changed volume `[N, N, N]` to `out`; what is shifted in was not observed.
+    pub fn volume(self, volume: &[u8], n: usize, out: &mut [f32]) {
         for x in 0..n {
             for y in 0..n {
                 // Where this column of voxels comes from: every step undone, the last first.
@@ -58,10 +56,10 @@ impl Transform {
                 if self.mirror {
                     from_x = n - 1 - from_x;
                 }
-                let column = &grid[(from_x * n + from_y) * n..][..n];
+                let column = &volume[(from_x * n + from_y) * n..][..n];
                 for (z, value) in out[(x * n + y) * n..][..n].iter_mut().enumerate() {
                     let from_z = usize::try_from(z as i64 - i64::from(self.shift)).ok();
-                    *value = from_z.and_then(|z| column.get(z)).map_or(0.0, |value| value.to_f32());
+                    *value = from_z.and_then(|z| column.get(z)).map_or(0.0, |&byte| grasp_data::value(byte));
                 }
             }
         }
@@ -69,9 +67,9 @@ impl Transform {
 
     /// The grasp in the changed scene of N³ voxels.
     #[must_use]
-    pub fn label(self, label: &Label, n: usize) -> Label {
+    pub fn trial(self, trial: &Trial, n: usize) -> Trial {
         let edge = n as f64;
-        let Label { mut position, mut rotation, .. } = *label;
+        let Trial { mut position, mut rotation, .. } = *trial;
         if self.mirror {
             position.x = edge - position.x;
             // The mirror image of a rotation about an axis is the opposite rotation about the mirrored axis. Of the
@@ -85,6 +83,6 @@ impl Transform {
             rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2) * rotation;
         }
         position.z += f64::from(self.shift);
-        Label { position, rotation, ..*label }
+        Trial { position, rotation, ..*trial }
     }
 }

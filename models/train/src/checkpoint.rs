@@ -44,6 +44,9 @@ pub struct Checkpoint {
     /// Adam's moments: first and second of each weight in turn.
     #[prost(message, repeated, tag = "8")]
     pub moments: Vec<TensorProto>,
+    /// How many scenes of each folder the run has come to know: folders may have grown since.
+    #[prost(uint64, repeated, tag = "9")]
+    pub scenes: Vec<u64>,
 }
 
 /// Why a run cannot go on from a checkpoint.

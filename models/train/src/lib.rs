@@ -1,6 +1,6 @@
 //! Training of grasp networks.
 //!
-//! A [`Trainer`] takes [`Scene`]s out of a [`Dataset`], [changes](Augmentation) them, and runs them through an
+//! A [`Trainer`] takes scenes out of a [`Dataset`](grasp_data::Dataset), [changes](Augmentation) them, and runs them through an
 //! [`Executor`]: the ONNX graph that is served, in libtorch and under autograd. [`Targets::loss`] is what [`Adam`]
 //! minimises; a [`Checkpoint`] is where a run stands.
 
@@ -8,7 +8,6 @@ mod adam;
 mod augment;
 mod checkpoint;
 pub mod curves;
-mod dataset;
 mod execute;
 mod heads;
 mod loss;
@@ -17,7 +16,6 @@ mod trainer;
 pub use adam::Adam;
 pub use augment::{Augmentation, Transform};
 pub use checkpoint::{Checkpoint, CheckpointError};
-pub use dataset::{Dataset, DatasetError, Label, Scene};
 pub use execute::{ExecuteError, Execution, Executor, Outputs};
 pub use loss::{Loss, LossError, Sums, Targets};
 pub use trainer::{Epoch, Record, Settings, TrainError, Trainer, Validation};

@@ -2,10 +2,10 @@
 //! are those of VGN's code, which the paper builds on).
 
 use grasp::VoxelOrigin;
+use grasp_data::Trial;
 use tch::{Kind, Reduction, TchError, Tensor};
 use thiserror::Error;
 
-use crate::dataset::Label;
 use crate::execute::Outputs;
 
 /// Weight of the width's squared error, voxels², against the other two parts. The paper's equation leaves it out.
@@ -64,14 +64,14 @@ pub enum LossError {
 
 impl Targets {
     /// Adds a grasp in the volume number `index` of the batch; without effect when it lies outside the volume.
-    pub fn push(&mut self, index: usize, label: &Label, n: usize, origin: VoxelOrigin) {
-        let Some(cell) = voxel_of(label, n, origin) else { return };
-        let [x, y, z, w]: [f32; 4] = label.rotation.coords.map(|c| c as f32).into();
+    pub fn push(&mut self, index: usize, trial: &Trial, n: usize, origin: VoxelOrigin) {
+        let Some(cell) = voxel_of(trial, n, origin) else { return };
+        let [x, y, z, w]: [f32; 4] = trial.rotation.coords.map(|c| c as f32).into();
         self.cells.push((index * n.pow(3) + cell) as i64);
-        self.labels.push(f32::from(u8::from(label.success)));
+        self.labels.push(f32::from(u8::from(trial.success)));
         // The second is q · (0, 0, 1, 0): turned by 180° about its own z.
         self.rotations.push([[x, y, z, w], [y, -x, w, -z]]);
-        self.widths.push(label.width as f32);
+        self.widths.push(trial.width as f32);
     }
 
     /// How many voxels are labelled.
@@ -137,10 +137,10 @@ impl Targets {
 }
 
 /// The voxel that stands for a grasp there: the nearest index (VGN), or the voxel it lies in.
-fn voxel_of(label: &Label, n: usize, origin: VoxelOrigin) -> Option<usize> {
+fn voxel_of(trial: &Trial, n: usize, origin: VoxelOrigin) -> Option<usize> {
     let index = match origin {
-        VoxelOrigin::Corner => label.position.coords.map(f64::round),
-        VoxelOrigin::Center => label.position.coords.map(f64::floor),
+        VoxelOrigin::Corner => trial.position.coords.map(f64::round),
+        VoxelOrigin::Center => trial.position.coords.map(f64::floor),
     };
     let inside = index.iter().all(|&c| c >= 0.0 && c < n as f64);
     inside.then(|| (index.x as usize * n + index.y as usize) * n + index.z as usize)

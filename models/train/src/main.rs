@@ -42,9 +42,13 @@ struct Training {
     /// Start from this model's weights instead (fine-tuning).
     #[arg(long, conflicts_with = "network")]
     from: Option<PathBuf>,
-    /// Folders in the processed format of VGN and GIGA (grasps.csv, scenes/ID.npz); several are mixed.
+    /// Folders of `grasp-sim label`, or in the processed format of VGN and GIGA (grasps.csv, scenes/ID.npz); several are
+    /// mixed.
     #[arg(long, required = true, num_args = 1..)]
     data: Vec<PathBuf>,
+    /// Before every epoch, take in the scenes that were added to the folders meanwhile.
+    #[arg(long)]
+    follow: bool,
     /// The model to write. Beside it: .state to resume from, .jsonl with one object an epoch, .png with the curves.
     #[arg(long)]
     out: PathBuf,

@@ -8,9 +8,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result, ensure};
 use grasp::VoxelOrigin;
+use grasp_data::Dataset;
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Metadata, build};
-use grasp_train::{Augmentation, Checkpoint, Dataset, Epoch, Execution, Record, Settings, Trainer, curves};
+use grasp_train::{Augmentation, Checkpoint, Epoch, Execution, Record, Settings, Trainer, curves};
 use indicatif::{ProgressBar, ProgressStyle};
 use tch::Device;
 use time::OffsetDateTime;
@@ -26,17 +27,16 @@ pub(crate) fn train(training: &Training) -> Result<()> {
     let files = Files::beside(&training.out)?;
     let (model, mut metadata) = start_from(training)?;
     let settings = settings(training, &metadata);
-    let dataset = Dataset::read(&training.data)?;
+    let dataset = Dataset::open(&training.data)?;
     ensure!(
-        dataset.resolution == metadata.resolution,
+        dataset.resolution() == metadata.resolution,
         "the data have {0}³ voxels, the network reads {1}³",
-        dataset.resolution,
+        dataset.resolution(),
         metadata.resolution
     );
     let device = Device::cuda_if_available();
     let execution = Execution { device, bf16: training.bf16, channels_last: true };
-    let mut trainer = Trainer::new(model, &dataset, settings.clone(), execution)?;
-    describe(training, &settings, &dataset, &mut metadata);
+    let mut trainer = Trainer::new(model, dataset, settings.clone(), execution)?;
 
     let mut records = Vec::new();
     let mut best = None;
@@ -46,15 +46,16 @@ pub(crate) fn train(training: &Training) -> Result<()> {
         best = checkpoint.best;
         records = files.read_log(trainer.epochs())?;
     }
-    let (learnt, held_out) = trainer.scenes();
-    let (grasps, successes) = dataset.grasps();
-    eprintln!("{learnt} scenes to learn from, {held_out} held out, {grasps} grasps, {successes} of them successes");
+    report(&trainer);
 
     let stop = Arc::new(AtomicBool::new(false));
     let signal = Arc::clone(&stop);
     ctrlc::set_handler(move || signal.store(true, Ordering::Relaxed)).context("cannot listen for Ctrl-C")?;
 
     while trainer.epochs() < settings.epochs {
+        if training.follow && trainer.follow()? > 0 {
+            report(&trainer);
+        }
         let bar = progress_bar(trainer.steps_per_epoch(), trainer.epochs() + 1, settings.epochs);
         let epoch = trainer.epoch(&stop, |batch, loss| {
             bar.set_position(batch);
@@ -74,6 +75,7 @@ pub(crate) fn train(training: &Training) -> Result<()> {
             curves::draw(&files.curves, &records)?;
         }
         if training.keep == Keep::Last || better {
+            describe(training, &settings, trainer.dataset(), &mut metadata);
             write_model(&trainer, &metadata, records.last(), &training.out)?;
         }
         Checkpoint { best, ..trainer.checkpoint() }.write(&files.state)?;
@@ -83,6 +85,16 @@ pub(crate) fn train(training: &Training) -> Result<()> {
         }
     }
     Ok(())
+}
+
+fn report(trainer: &Trainer) {
+    let (learnt, held_out) = trainer.scenes();
+    let (grasps, successes) = all_grasps(trainer.dataset());
+    eprintln!("{learnt} scenes to learn from, {held_out} held out, {grasps} grasps, {successes} of them successes");
+}
+
+fn all_grasps(dataset: &Dataset) -> (usize, usize) {
+    dataset.grasps(&(0..dataset.len()).collect::<Vec<_>>())
 }
 
 /// The network and what it says of itself.
@@ -135,10 +147,10 @@ fn settings(training: &Training, metadata: &Metadata) -> Settings {
 /// Notes in the metadata where the weights will come from.
 fn describe(training: &Training, settings: &Settings, dataset: &Dataset, metadata: &mut Metadata) {
     let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let (grasps, successes) = dataset.grasps();
+    let (grasps, successes) = all_grasps(dataset);
     let mut note = |key: &str, value: String| metadata.provenance.insert(key.to_owned(), value);
     note("data", training.data.iter().map(name).collect::<Vec<_>>().join(" "));
-    note("scenes", dataset.scenes.len().to_string());
+    note("scenes", dataset.len().to_string());
     note("grasps", grasps.to_string());
     note("successes", successes.to_string());
     note("settings", serde_json::to_string(settings).unwrap_or_default());

@@ -2,9 +2,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use grasp::VoxelOrigin;
+use grasp_data::{DataError, Dataset};
 use grasp_models::onnx::ModelProto;
-use rand::SeedableRng;
 use rand::seq::SliceRandom;
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use tch::{TchError, Tensor, no_grad};
@@ -13,7 +14,6 @@ use thiserror::Error;
 use crate::adam::Adam;
 use crate::augment::{Augmentation, Transform};
 use crate::checkpoint::{Checkpoint, CheckpointError};
-use crate::dataset::Dataset;
 use crate::execute::{ExecuteError, Execution, Executor};
 use crate::loss::{Loss, LossError, Sums, Targets};
 
@@ -104,6 +104,9 @@ pub enum TrainError {
     /// A setting makes no sense with these data.
     #[error("{0}")]
     Settings(String),
+    /// The data have been damaged meanwhile.
+    #[error(transparent)]
+    Data(#[from] DataError),
     /// The graph cannot be executed.
     #[error(transparent)]
     Execute(#[from] ExecuteError),
@@ -133,10 +136,19 @@ pub enum Epoch {
     Interrupted,
 }
 
+/// What a step sees of a scene.
+#[derive(Clone, Copy, Debug, Default)]
+struct Example {
+    scene: usize,
+    /// Which of its volumes.
+    look: usize,
+    transform: Transform,
+}
+
 /// A run: a network, its optimiser, the data, and how far it has come.
-pub struct Trainer<'a> {
+pub struct Trainer {
     settings: Settings,
-    dataset: &'a Dataset,
+    dataset: Dataset,
     training: Vec<usize>,
     validation: Vec<usize>,
     class_weights: [f64; 2],
@@ -150,44 +162,70 @@ pub struct Trainer<'a> {
     sums: Sums,
 }
 
-impl<'a> Trainer<'a> {
+impl Trainer {
     /// A run from the beginning.
     ///
     /// # Errors
     /// [`TrainError`] when the graph cannot be executed, or no scene is left to learn from.
     pub fn new(
         model: ModelProto,
-        dataset: &'a Dataset,
+        dataset: Dataset,
         settings: Settings,
         execution: Execution,
     ) -> Result<Self, TrainError> {
-        let (training, validation) = dataset.split(settings.validation);
-        if training.is_empty() || settings.batch == 0 {
-            let scenes = dataset.scenes.len();
-            let reason = format!(
-                "nothing to learn from: {scenes} scenes, {} held out, batches of {}",
-                validation.len(),
-                settings.batch
-            );
-            return Err(TrainError::Settings(reason));
-        }
-        let class_weights = if settings.balance { class_weights(dataset, &training)? } else { [1.0; 2] };
         let executor = Executor::new(model, execution)?;
         let adam = Adam::new(executor.parameters());
-        let fingerprint = fingerprint(&settings, dataset, training.len(), validation.len());
-        Ok(Self {
+        let mut trainer = Self {
             settings,
             dataset,
-            training,
-            validation,
-            class_weights,
-            fingerprint,
+            training: Vec::new(),
+            validation: Vec::new(),
+            class_weights: [1.0; 2],
+            fingerprint: String::new(),
             executor,
             adam,
             epoch: 0,
             batch: 0,
             sums: Sums::default(),
-        })
+        };
+        trainer.look_over()?;
+        Ok(trainer)
+    }
+
+    /// Takes in what has been added to the data since; says how many scenes. Between two epochs only.
+    ///
+    /// # Errors
+    /// [`TrainError::Data`] when a file is damaged.
+    pub fn follow(&mut self) -> Result<usize, TrainError> {
+        if self.batch != 0 {
+            return Ok(0);
+        }
+        let added = self.dataset.refresh()?;
+        if added > 0 {
+            self.look_over()?;
+        }
+        Ok(added)
+    }
+
+    /// Everything that depends on the scenes at hand.
+    fn look_over(&mut self) -> Result<(), TrainError> {
+        let (training, validation) = self.dataset.split(self.settings.validation);
+        if training.is_empty() || self.settings.batch == 0 {
+            let (scenes, held_out) = (self.dataset.len(), validation.len());
+            let batch = self.settings.batch;
+            let reason = format!("nothing to learn from: {scenes} scenes, {held_out} held out, batches of {batch}");
+            return Err(TrainError::Settings(reason));
+        }
+        self.class_weights = if self.settings.balance { class_weights(&self.dataset, &training)? } else { [1.0; 2] };
+        self.fingerprint = fingerprint(&self.settings, &self.dataset, training.len(), validation.len());
+        (self.training, self.validation) = (training, validation);
+        Ok(())
+    }
+
+    /// The data.
+    #[must_use]
+    pub fn dataset(&self) -> &Dataset {
+        &self.dataset
     }
 
     /// Scenes learnt from and held out.
@@ -228,6 +266,7 @@ impl<'a> Trainer<'a> {
             epoch: self.epoch,
             batch: self.batch,
             sums: self.sums.to_list(),
+            scenes: self.dataset.sizes().into_iter().map(|size| size as u64).collect(),
             ..Checkpoint::default()
         };
         checkpoint.keep(&self.executor, &self.adam);
@@ -237,11 +276,16 @@ impl<'a> Trainer<'a> {
     /// Goes on from there.
     ///
     /// # Errors
-    /// [`CheckpointError`] when it belongs to another run, or lacks something.
-    pub fn resume(&mut self, checkpoint: &Checkpoint) -> Result<(), CheckpointError> {
+    /// [`TrainError::Checkpoint`] when it belongs to another run, or lacks something.
+    pub fn resume(&mut self, checkpoint: &Checkpoint) -> Result<(), TrainError> {
+        let known: Vec<usize> = checkpoint.scenes.iter().map(|&size| size as usize).collect();
+        if known.len() == self.dataset.sizes().len() && known != self.dataset.sizes() {
+            self.dataset.limit(&known);
+            self.look_over()?;
+        }
         if checkpoint.settings != self.fingerprint {
             let (theirs, ours) = (checkpoint.settings.clone(), self.fingerprint.clone());
-            return Err(CheckpointError::Settings { theirs, ours });
+            return Err(CheckpointError::Settings { theirs, ours }.into());
         }
         let sums = Sums::from_list(&checkpoint.sums).ok_or(CheckpointError::Sums(checkpoint.sums.len()))?;
         checkpoint.restore(&self.executor, &mut self.adam)?;
@@ -301,7 +345,7 @@ impl<'a> Trainer<'a> {
     /// The loss over the scenes held out, as they are; none if there are none.
     fn validate(&self) -> Result<Option<Validation>, TrainError> {
         let mut sums = Sums::default();
-        let scenes: Vec<_> = self.validation.iter().map(|&scene| (scene, Transform::default())).collect();
+        let scenes: Vec<_> = self.validation.iter().map(|&scene| Example { scene, ..Example::default() }).collect();
         for batch in scenes.chunks(self.settings.batch) {
             if let Some(loss) = no_grad(|| self.loss(batch))? {
                 sums.add(&loss.sums);
@@ -319,12 +363,17 @@ impl<'a> Trainer<'a> {
     }
 
     /// The order of an epoch's scenes and how each is changed: a function of the seed and the epoch.
-    fn plan(&self) -> Vec<(usize, Transform)> {
+    fn plan(&self) -> Vec<Example> {
         let mut rng = ChaCha8Rng::seed_from_u64(self.settings.seed);
         rng.set_stream(self.epoch);
         let mut scenes = self.training.clone();
         scenes.shuffle(&mut rng);
-        scenes.into_iter().map(|scene| (scene, self.settings.augmentation.draw(&mut rng))).collect()
+        let mut example = |scene| Example {
+            scene,
+            look: rng.random_range(0..self.dataset.volumes(scene)),
+            transform: self.settings.augmentation.draw(&mut rng),
+        };
+        scenes.into_iter().map(&mut example).collect()
     }
 
     fn learning_rate(&self) -> f64 {
@@ -342,15 +391,15 @@ impl<'a> Trainer<'a> {
     }
 
     /// One forward pass over some scenes; none when no grasp of theirs lies inside its volume.
-    fn loss(&self, batch: &[(usize, Transform)]) -> Result<Option<Loss>, TrainError> {
-        let n = self.dataset.resolution;
+    fn loss(&self, batch: &[Example]) -> Result<Option<Loss>, TrainError> {
+        let n = self.dataset.resolution();
         let mut values = vec![0.0; batch.len() * n.pow(3)];
         let mut targets = Targets::default();
-        for (index, (&(scene, transform), out)) in batch.iter().zip(values.chunks_exact_mut(n.pow(3))).enumerate() {
-            let scene = &self.dataset.scenes[scene];
-            transform.grid(&scene.grid, n, out);
-            for label in &scene.labels {
-                targets.push(index, &transform.label(label, n), n, self.settings.voxel_origin);
+        for (index, (example, out)) in batch.iter().zip(values.chunks_exact_mut(n.pow(3))).enumerate() {
+            let &Example { scene, look, transform } = example;
+            transform.volume(self.dataset.volume(scene, look), n, out);
+            for trial in self.dataset.trials(scene) {
+                targets.push(index, &transform.trial(&trial, n), n, self.settings.voxel_origin);
             }
         }
         if targets.is_empty() {
@@ -383,8 +432,7 @@ fn fingerprint(settings: &Settings, dataset: &Dataset, training: usize, validati
 
 /// Weights that make both classes count the same: n / (2 n_class).
 fn class_weights(dataset: &Dataset, scenes: &[usize]) -> Result<[f64; 2], TrainError> {
-    let labels = || scenes.iter().flat_map(|&scene| &dataset.scenes[scene].labels);
-    let (all, successes) = (labels().count(), labels().filter(|label| label.success).count());
+    let (all, successes) = dataset.grasps(scenes);
     if successes == 0 || successes == all {
         let reason = format!("the classes cannot be balanced: {successes} of {all} grasps succeeded");
         return Err(TrainError::Settings(reason));

@@ -19,7 +19,7 @@ const N: usize = 16;
 fn prepare() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let scenes: Vec<_> = (0..12).map(|seed| support::scene(seed, N)).collect();
-    support::write(&folder.path().join("data"), &scenes, N);
+    support::write(&folder.path().join("data"), &scenes);
     Architecture::Vgn.build(N, 0).unwrap().write(&folder.path().join("start.onnx")).unwrap();
     folder
 }
@@ -132,7 +132,7 @@ fn what_cannot_be_done_is_said() {
     for (arguments, expected) in [
         ("train --network vng --data data --out x.onnx", "there is no network `vng`"),
         ("train --network vgn --data data --out x.onnx", "the data have 16³ voxels, the network reads 40³"),
-        ("train --network vgn --data nowhere --out x.onnx", "nowhere/grasps.csv: No such file"),
+        ("train --network vgn --data nowhere --out x.onnx", "nowhere: No such file"),
         ("train --network vgn --data data --out x.onnx --val 1", "--val is 1"),
         ("train --from start.onnx --data data --out x.onnx --resume", "x.state: No such file"),
         ("train --data data --out x.onnx", "--network"),

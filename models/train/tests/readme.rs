@@ -17,7 +17,7 @@ fn the_training_command_of_the_readme_works() {
 
     let folder = tempfile::tempdir().unwrap();
     let scenes: Vec<_> = (0..8).map(|seed| support::scene(seed, RESOLUTION)).collect();
-    support::write(&folder.path().join(value("--data")), &scenes, RESOLUTION);
+    support::write(&folder.path().join(value("--data")), &scenes);
     let mut command = Command::new(env!("CARGO_BIN_EXE_grasp-train"));
     let output = command.current_dir(folder.path()).args(&arguments).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));

@@ -5,9 +5,10 @@ mod support;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use grasp::VoxelOrigin;
+use grasp_data::{Dataset, Setup, Trial, packed};
 use grasp_models::Architecture;
 use grasp_train::{
-    Augmentation, Checkpoint, CheckpointError, Dataset, Epoch, Execution, Label, Outputs, Record, Settings, Targets,
+    Augmentation, Checkpoint, CheckpointError, Epoch, Execution, Outputs, Record, Settings, Targets, TrainError,
     Trainer,
 };
 use nalgebra::{Point3, UnitQuaternion, Vector3};
@@ -32,7 +33,7 @@ fn settings() -> Settings {
     }
 }
 
-fn trainer<'a>(dataset: &'a Dataset, settings: &Settings, execution: Execution) -> Trainer<'a> {
+fn trainer(dataset: Dataset, settings: &Settings, execution: Execution) -> Trainer {
     // More threads are no faster on volumes this small.
     tch::set_num_threads(1);
     let model = Architecture::Vgn.build(N, 0).unwrap();
@@ -48,10 +49,9 @@ fn epoch(trainer: &mut Trainer) -> Record {
 
 #[test]
 fn eight_scenes_are_learnt_by_heart() {
-    let dataset = support::dataset(8, N);
     for bf16 in [false, true] {
         let settings = Settings { batch: 8, learning_rate: 1e-3, warmup: 20, bf16, ..settings() };
-        let mut trainer = trainer(&dataset, &settings, Execution { bf16, ..EXECUTION });
+        let mut trainer = trainer(support::dataset(8, N), &settings, Execution { bf16, ..EXECUTION });
         let first = epoch(&mut trainer);
         let last = (0..120).map(|_| epoch(&mut trainer)).last().unwrap();
         println!("bf16 {bf16}: loss {:.4} → {:.5}", first.loss, last.loss);
@@ -62,15 +62,15 @@ fn eight_scenes_are_learnt_by_heart() {
 
 #[test]
 fn a_resumed_run_is_the_uninterrupted_run() {
-    let dataset = support::dataset(8, N);
+    let dataset = || support::dataset(8, N);
     let augmentation = Augmentation { turns: true, mirror: true, shift: 1 };
     let settings = Settings { augmentation, validation: 0.5, cosine: true, warmup: 2, ..settings() };
-    let mut whole = trainer(&dataset, &settings, EXECUTION);
+    let mut whole = trainer(dataset(), &settings, EXECUTION);
     assert!(whole.scenes().1 > 0, "some are held out");
     let records: Vec<_> = (0..3).map(|_| epoch(&mut whole)).collect();
 
     // Interrupted after the first batch of the second epoch, and written to a file.
-    let mut part = trainer(&dataset, &settings, EXECUTION);
+    let mut part = trainer(dataset(), &settings, EXECUTION);
     epoch(&mut part);
     let stop = AtomicBool::new(false);
     let ended = part.epoch(&stop, |_, _| stop.store(true, Ordering::Relaxed)).unwrap();
@@ -80,7 +80,7 @@ fn a_resumed_run_is_the_uninterrupted_run() {
     part.checkpoint().write(&path).unwrap();
     drop(part);
 
-    let mut resumed = trainer(&dataset, &settings, EXECUTION);
+    let mut resumed = trainer(dataset(), &settings, EXECUTION);
     resumed.resume(&Checkpoint::read(&path).unwrap()).unwrap();
     assert_eq!((resumed.epochs(), resumed.steps()), (1, whole.steps_per_epoch() + 1));
     for expected in &records[1..] {
@@ -92,40 +92,77 @@ fn a_resumed_run_is_the_uninterrupted_run() {
 }
 
 #[test]
+fn scenes_that_come_while_it_runs_are_learnt_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let provenance = support::provenance();
+    let mut writer = packed::Writer::open(folder.path(), &Setup::benchmark(provenance)).unwrap();
+    let mut write = |numbers: std::ops::Range<u64>| {
+        for number in numbers {
+            let scene = support::scene(number, N);
+            let volume: Vec<f32> = scene.volumes[0].iter().map(|&byte| grasp_data::value(byte)).collect();
+            // Two looks at each, which the plan has to draw from.
+            writer.append(number, &[volume.clone(), volume], &scene.trials).unwrap();
+        }
+    };
+    write(0..4);
+    let open = || Dataset::open(&[folder.path().to_owned()]).unwrap();
+    let mut whole = trainer(open(), &settings(), EXECUTION);
+    epoch(&mut whole);
+    write(4..8);
+    assert_eq!(whole.follow().unwrap(), 4);
+    assert_eq!(whole.scenes().0 + whole.scenes().1, 8);
+    let stop = AtomicBool::new(false);
+    whole.epoch(&stop, |_, _| stop.store(true, Ordering::Relaxed)).unwrap();
+    write(8..12);
+    assert_eq!(whole.follow().unwrap(), 0, "an epoch that has begun keeps its scenes");
+
+    // Resumed, the run knows what it knew, although there is more by now.
+    let mut resumed = trainer(open(), &settings(), EXECUTION);
+    resumed.resume(&whole.checkpoint()).unwrap();
+    for trainer in [&mut whole, &mut resumed] {
+        epoch(trainer);
+        assert_eq!(trainer.follow().unwrap(), 4);
+        epoch(trainer);
+    }
+    assert_eq!(resumed.model(), whole.model(), "to the last bit");
+}
+
+#[test]
 fn a_checkpoint_of_another_run_is_refused() {
-    let dataset = support::dataset(4, N);
-    let checkpoint = trainer(&dataset, &settings(), EXECUTION).checkpoint();
-    let mut other = trainer(&dataset, &Settings { seed: 6, ..settings() }, EXECUTION);
-    assert!(matches!(other.resume(&checkpoint), Err(CheckpointError::Settings { .. })));
-    let mut relabelled = dataset.clone();
-    relabelled.scenes[3].labels[0].width += 0.5;
-    let mut renamed = dataset.clone();
-    "other".clone_into(&mut renamed.scenes[3].id);
-    for data in [&relabelled, &renamed] {
-        let refused = trainer(data, &settings(), EXECUTION).resume(&checkpoint);
-        assert!(matches!(refused, Err(CheckpointError::Settings { .. })), "as many scenes, but others");
+    let scenes = || (0..4).map(|seed| support::scene(seed, N)).collect::<Vec<_>>();
+    let dataset = || Dataset::of(scenes()).unwrap();
+    let checkpoint = trainer(dataset(), &settings(), EXECUTION).checkpoint();
+    let refused = |error| matches!(error, Err(TrainError::Checkpoint(CheckpointError::Settings { .. })));
+    let mut other = trainer(dataset(), &Settings { seed: 6, ..settings() }, EXECUTION);
+    assert!(refused(other.resume(&checkpoint)));
+    let (mut relabelled, mut renamed) = (scenes(), scenes());
+    relabelled[3].trials[0].width += 0.5;
+    "other".clone_into(&mut renamed[3].id);
+    for scenes in [relabelled, renamed] {
+        let mut other = trainer(Dataset::of(scenes).unwrap(), &settings(), EXECUTION);
+        assert!(refused(other.resume(&checkpoint)), "as many scenes, but others");
     }
     let short = Checkpoint { sums: vec![0.0; 3], ..checkpoint.clone() };
-    assert!(matches!(trainer(&dataset, &settings(), EXECUTION).resume(&short), Err(CheckpointError::Sums(3))));
-    let mut longer = trainer(&dataset, &Settings { epochs: 9, ..settings() }, EXECUTION);
+    let cut = trainer(dataset(), &settings(), EXECUTION).resume(&short);
+    assert!(matches!(cut, Err(TrainError::Checkpoint(CheckpointError::Sums(3)))));
+    let mut longer = trainer(dataset(), &Settings { epochs: 9, ..settings() }, EXECUTION);
     assert!(longer.resume(&checkpoint).is_ok(), "a run at a constant learning rate may be made longer");
     let model = Architecture::TransformerSmall.build(N, 0).unwrap();
-    let mut other = Trainer::new(model, &dataset, settings(), EXECUTION).unwrap();
-    assert!(matches!(other.resume(&checkpoint), Err(CheckpointError::Weights(_))));
+    let mut other = Trainer::new(model, dataset(), settings(), EXECUTION).unwrap();
+    assert!(matches!(other.resume(&checkpoint), Err(TrainError::Checkpoint(CheckpointError::Weights(_)))));
 }
 
 #[test]
 fn a_run_without_scenes_is_refused() {
-    let empty = Dataset { resolution: N, scenes: vec![] };
+    let empty = Dataset::of(Vec::new()).unwrap();
     let model = Architecture::Vgn.build(N, 0).unwrap();
-    let error = Trainer::new(model, &empty, settings(), EXECUTION).err().unwrap();
+    let error = Trainer::new(model, empty, settings(), EXECUTION).err().unwrap();
     assert!(error.to_string().contains("nothing to learn from"), "{error}");
 }
 
 #[test]
 fn a_run_that_diverges_says_so() {
-    let dataset = support::dataset(8, N);
-    let mut trainer = trainer(&dataset, &Settings { learning_rate: 1e30, ..settings() }, EXECUTION);
+    let mut trainer = trainer(support::dataset(8, N), &Settings { learning_rate: 1e30, ..settings() }, EXECUTION);
     let error = (0..5).find_map(|_| trainer.epoch(&AtomicBool::new(false), |_, _| {}).err()).unwrap();
     assert!(error.to_string().contains("smaller learning rate"), "{error}");
 }
@@ -139,7 +176,7 @@ fn outputs(quality: f32, rotation: [f32; 4], width: f32) -> Outputs {
 #[test]
 fn the_loss_is_the_papers() {
     let n = 2;
-    let label = Label {
+    let label = Trial {
         position: Point3::new(1.2, 0.7, 1.9),
         rotation: UnitQuaternion::from_euler_angles(0.3, -0.8, 1.1),
         width: 4.0,
@@ -147,7 +184,7 @@ fn the_loss_is_the_papers() {
     };
     let mut targets = Targets::default();
     targets.push(1, &label, n, VoxelOrigin::Center);
-    targets.push(0, &Label { success: false, ..label }, n, VoxelOrigin::Center);
+    targets.push(0, &Trial { success: false, ..label }, n, VoxelOrigin::Center);
     assert_eq!(targets.len(), 2);
 
     // The same rotation, turned by 180° about the approach, with either sign, costs nothing.
@@ -172,14 +209,14 @@ fn the_loss_is_the_papers() {
 
 #[test]
 fn a_grasp_stands_for_the_voxel_of_its_convention() {
-    let at = |x: f64, y: f64, z: f64| Label {
+    let at = |x: f64, y: f64, z: f64| Trial {
         position: Point3::new(x, y, z),
         rotation: UnitQuaternion::identity(),
         width: 4.0,
         success: true,
     };
     let cell = |x: i64, y: i64, z: i64| (x * 4 + y) * 4 + z;
-    let cells = |label: &Label, origin| {
+    let cells = |label: &Trial, origin| {
         let mut targets = Targets::default();
         targets.push(2, label, 4, origin);
         targets.cells().iter().map(|cell| cell - 2 * 64).collect::<Vec<_>>()

@@ -93,7 +93,7 @@ impl Bench {
             objects: self.scene.objects("test")?,
             count: self.count,
             views: self.scene.views()?,
-            noise: !self.scene.no_noise,
+            noise: self.scene.noise,
             rounds: self.rounds,
             seed: self.scene.seed,
         };

@@ -43,7 +43,7 @@ impl Demo {
             objects: self.scene.objects("test")?,
             count: 5,
             views: self.scene.views()?,
-            noise: !self.scene.no_noise,
+            noise: self.scene.noise,
             rounds: 1,
             seed: self.scene.seed,
         };

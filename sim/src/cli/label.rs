@@ -1,17 +1,21 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use clap::Args;
-use grasp_sim::dataset::{DatasetWriter, Setup};
-use grasp_sim::label::Recipe;
+use anyhow::Context;
+use clap::{Args, ValueEnum};
+use grasp::{RESOLUTION, WORKSPACE_SIZE};
+use grasp_data::{Provenance, Setup, Trial, packed, processed, raw};
+use grasp_sim::export::{Export, Line};
+use grasp_sim::label::{LabelledScene, Recipe};
+use grasp_sim::ordered;
 use indicatif::{ProgressBar, ProgressStyle};
-use rayon::prelude::*;
 
 use super::{Scene, SceneArgs};
 
 /// What scenes are made of unless the command says otherwise.
 const OBJECTS: &str = "train";
 
-/// The same seed gives the same data on any number of threads; a run that was cut off goes on where it stopped.
+/// The same seed gives the same data on any number of threads; a run that was cut off goes on where it stopped, also
+/// with more scenes.
 #[derive(Args)]
 pub struct Label {
     #[command(flatten)]
@@ -21,64 +25,133 @@ pub struct Label {
     #[arg(long)]
     scenes: u64,
 
+    /// Number of the first: machines that share the work take a range each, and `merge` joins them.
+    #[arg(long, default_value_t = 0)]
+    first: u64,
+
     /// Grasp points a scene, each tried at six yaws.
     #[arg(long, default_value_t = 120)]
     points: usize,
 
+    /// How often each scene is looked at anew, with other views and other noise; only the packed form keeps more than
+    /// one.
+    #[arg(long, default_value_t = 1)]
+    looks: usize,
+
     /// Folder to write into.
     #[arg(long)]
     out: PathBuf,
+
+    /// In which form: VGN's depth images, VGN's volumes, or the same packed.
+    #[arg(long, value_enum, default_value = "packed")]
+    format: Format,
+
+    /// Also write every scene and its trials to this file, as JSON lines.
+    #[arg(long)]
+    export: Option<PathBuf>,
+}
+
+/// The forms of a data set.
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Format {
+    Raw,
+    Processed,
+    Packed,
 }
 
 impl Label {
     pub fn run(self) -> anyhow::Result<()> {
+        let several = self.looks != 1 && self.format != Format::Packed;
+        anyhow::ensure!(!several && self.looks > 0, "--looks is {}; only --format packed takes several", self.looks);
         let recipe = Recipe {
             kind: self.scene.kind(),
             objects: self.scene.objects(OBJECTS)?,
             points: self.points,
             views: self.scene.views()?,
-            noise: !self.scene.no_noise,
+            looks: self.looks,
+            noise: self.scene.noise,
             seed: self.scene.seed,
         };
-        let setup = Setup {
+        let setup = Setup::benchmark(Provenance {
             scene: match self.scene.scene {
                 Scene::Pile => "pile",
                 Scene::Packed => "packed",
             }
             .to_owned(),
-            objects: self.scene.objects.unwrap_or_else(|| OBJECTS.to_owned()),
+            objects: self.scene.objects.clone().unwrap_or_else(|| OBJECTS.to_owned()),
             points: recipe.points,
-            views: self.scene.views,
+            views: self.scene.views.clone(),
+            looks: recipe.looks,
             noise: recipe.noise,
             seed: recipe.seed,
-        };
-        let mut writer = DatasetWriter::open(&self.out, &setup)?;
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+        });
+        let mut writer = Writer::open(self.format, &self.out, &setup)?;
+        let next = writer.next().unwrap_or(0).max(self.first);
+        let mut export = self.export.as_deref().map(|path| Export::open(path, next)).transpose()?;
 
+        let end = self.first.checked_add(self.scenes).context("--first and --scenes are too large")?;
         let style = "{wide_bar} {pos}/{len} scenes, {per_sec}, {eta} left";
         let progress = ProgressBar::new(self.scenes).with_style(ProgressStyle::with_template(style)?);
-        progress.set_position(writer.next());
+        progress.set_position(next - self.first);
         progress.reset_eta();
-        // Scenes are made in parallel and written in order; a batch is long enough to keep every thread busy.
-        let batch = 16 * rayon::current_num_threads() as u64;
-        while writer.next() < self.scenes {
-            let numbers = writer.next()..self.scenes.min(writer.next() + batch);
-            let labelled: Vec<_> = numbers
-                .clone()
-                .into_par_iter()
-                .map(|number| {
-                    let scene = recipe.label(number);
-                    progress.inc(1);
-                    scene
-                })
-                .collect();
-            for (number, scene) in numbers.zip(labelled) {
-                match scene {
-                    Some(scene) => writer.append(number, &scene)?,
-                    None => writer.skip(number),
+        ordered::for_each(
+            next..end.max(next),
+            |number| recipe.label(number),
+            |number, scene| {
+                if let Some(scene) = scene {
+                    if let Some(export) = &mut export {
+                        export.append(&Line::of(number, &scene))?;
+                    }
+                    writer.append(number, scene)?;
                 }
+                progress.inc(1);
+                anyhow::Ok(())
+            },
+        )?;
+        progress.finish();
+        Ok(())
+    }
+}
+
+enum Writer {
+    Raw(raw::Writer),
+    Processed(processed::Writer),
+    Packed(packed::Writer),
+}
+
+impl Writer {
+    fn open(format: Format, folder: &Path, setup: &Setup) -> anyhow::Result<Self> {
+        Ok(match format {
+            Format::Raw => Self::Raw(raw::Writer::open(folder, setup)?),
+            Format::Processed => Self::Processed(processed::Writer::open(folder, setup)?),
+            Format::Packed => Self::Packed(packed::Writer::open(folder, setup)?),
+        })
+    }
+
+    fn next(&self) -> Option<u64> {
+        match self {
+            Self::Raw(writer) => writer.next(),
+            Self::Processed(writer) => writer.next(),
+            Self::Packed(writer) => writer.next(),
+        }
+    }
+
+    fn append(&mut self, number: u64, mut scene: LabelledScene) -> anyhow::Result<()> {
+        let trials = |unit: f64| -> Vec<Trial> {
+            scene.points.iter().map(|point| Trial::new(&point.grasp, point.success(), unit)).collect()
+        };
+        let voxel_size = WORKSPACE_SIZE / RESOLUTION as f64;
+        let id = format!("{number:08}");
+        match self {
+            Self::Raw(writer) => writer.append(&id, &scene.looks[0].views, &trials(1.0))?,
+            Self::Processed(writer) => writer.append(&id, &scene.looks[0].volume, &trials(voxel_size))?,
+            Self::Packed(writer) => {
+                let trials = trials(voxel_size);
+                let volumes: Vec<Vec<f32>> = scene.looks.drain(..).map(|look| look.volume).collect();
+                writer.append(number, &volumes, &trials)?;
             }
         }
-        progress.finish();
         Ok(())
     }
 }

@@ -2,9 +2,11 @@
 //!
 //! One link per file. Every group (`o` or `g`) of a collision OBJ stands for one convex part.
 
+use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use grasp::MAX_OPENING;
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 use roxmltree::{Document, Node};
@@ -12,6 +14,7 @@ use thiserror::Error;
 
 use super::Object;
 use crate::mesh::Mesh;
+use crate::scene::SMALLEST_SCALE;
 
 /// PyBullet's friction for a link that states none.
 const DEFAULT_FRICTION: f64 = 0.5;
@@ -58,6 +61,25 @@ pub enum ObjectError {
         path: PathBuf,
         /// Why.
         source: tobj::LoadError,
+    },
+    /// An object that nothing can take.
+    #[error(
+        "{}: its thinnest part is {:.0} mm thick, the hand opens {:.0} mm; scale the meshes down (are they in metres?)",
+        path.display(), thickness * 1e3, MAX_OPENING * 1e3
+    )]
+    TooWide {
+        /// The URDF.
+        path: PathBuf,
+        /// Of the thinnest part at the smallest scale of a scene, metres.
+        thickness: f64,
+    },
+    /// A file that could not be written.
+    #[error("cannot write {}: {source}", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
     },
     /// A mesh file without faces.
     #[error("the mesh {} has no faces; export it with its triangles", path.display())]
@@ -111,6 +133,10 @@ pub(super) fn load(path: &Path) -> Result<Object, ObjectError> {
     if parts.is_empty() {
         return Err(urdf.wrong("has no <collision> shape that encloses a volume"));
     }
+    let thickness = parts.iter().map(|part| part.extents().min()).fold(f64::INFINITY, f64::min) * SMALLEST_SCALE;
+    if thickness > MAX_OPENING {
+        return Err(ObjectError::TooWide { path: path.into(), thickness });
+    }
     let mut visual = Mesh::default();
     for node in children(link, "visual") {
         urdf.geometry(node)?.iter().for_each(|mesh| visual.append(mesh));
@@ -120,6 +146,65 @@ pub(super) fn load(path: &Path) -> Result<Object, ObjectError> {
     }
     let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     Ok(Object { name, parts, visual, mass, friction })
+}
+
+/// Writes an object as URDF and OBJ, from which [`load`] makes the same.
+pub(super) fn save(object: &Object, dir: &Path) -> Result<(), ObjectError> {
+    let Object { name, parts, visual, mass, friction } = object;
+    let urdf = format!(
+        "<?xml version=\"1.0\"?>
+<robot name=\"{name}\">
+  <link name=\"base_link\">
+    <contact>
+      <lateral_friction value=\"{friction}\"/>
+    </contact>
+    <inertial>
+      <mass value=\"{mass}\"/>
+      <inertia ixx=\"1\" ixy=\"0\" ixz=\"0\" iyy=\"1\" iyz=\"0\" izz=\"1\"/>
+    </inertial>
+    <visual>
+      <geometry>
+        <mesh filename=\"{name}_visual.obj\"/>
+      </geometry>
+    </visual>
+    <collision>
+      <geometry>
+        <mesh filename=\"{name}_collision.obj\"/>
+      </geometry>
+    </collision>
+  </link>
+</robot>
+"
+    );
+    let files = [
+        (format!("{name}_visual.obj"), obj(std::slice::from_ref(visual))),
+        (format!("{name}_collision.obj"), obj(parts)),
+        // Last: a folder's URDF files are its objects.
+        (format!("{name}.urdf"), urdf),
+    ];
+    for (file, text) in files {
+        let path = dir.join(file);
+        fs::write(&path, text).map_err(|source| ObjectError::Write { path, source })?;
+    }
+    Ok(())
+}
+
+/// Meshes as the groups of an OBJ.
+fn obj(meshes: &[Mesh]) -> String {
+    let mut text = String::new();
+    let mut first = 1;
+    // Writing to a string cannot fail.
+    for (index, mesh) in meshes.iter().enumerate() {
+        let _ = writeln!(text, "o part_{index}");
+        for vertex in &mesh.vertices {
+            let _ = writeln!(text, "v {} {} {}", vertex.x, vertex.y, vertex.z);
+        }
+        for [a, b, c] in mesh.triangles.iter().map(|triangle| triangle.map(|corner| corner + first)) {
+            let _ = writeln!(text, "f {a} {b} {c}");
+        }
+        first += mesh.vertices.len() as u32;
+    }
+    text
 }
 
 /// The file being read, for its errors and for the meshes beside it.
@@ -299,7 +384,7 @@ f 5 7 6\nf 5 6 8\nf 6 7 8\nf 7 5 8
 
     #[test]
     fn errors_name_the_file_and_the_fault() {
-        let cube = "<box size='1 1 1'/>";
+        let cube = "<box size='0.1 0.1 0.1'/>";
         let cases = [
             ("<robot><link>".into(), "thing.urdf is not well-formed XML"),
             ("<robot/>".into(), "has 0 links"),
@@ -310,12 +395,28 @@ f 5 7 6\nf 5 6 8\nf 6 7 8\nf 7 5 8
             (urdf("1", "<capsule/>"), "has a <capsule>"),
             (urdf("1", "<mesh filename='none.obj'/>"), "none.obj has no faces"),
             (urdf("1", "<mesh filename='lost.obj'/>"), "cannot read the mesh"),
+            (urdf("1", "<box size='0.2 0.3 0.2'/>"), "is 140 mm thick, the hand opens 80 mm"),
         ];
         for (urdf, fault) in cases {
             let message = error(&urdf);
             assert!(message.contains(fault), "{message:?} lacks {fault:?}");
             assert!(message.contains(".urdf") || message.contains(".obj"), "{message:?} names no file");
         }
+    }
+
+    #[test]
+    fn what_is_written_is_read_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let object = crate::objects::procedural::object(14);
+        save(&object, folder.path()).unwrap();
+        let [read] = <[Object; 1]>::try_from(load_folder(folder.path()).unwrap()).unwrap();
+        assert_eq!((&read.name, read.mass, read.friction), (&object.name, object.mass, object.friction));
+        assert_eq!(read.parts.len(), object.parts.len());
+        for (read, written) in read.parts.iter().zip(&object.parts) {
+            assert!((read.volume() / written.volume() - 1.0).abs() < 1e-4);
+        }
+        assert_eq!(read.visual.triangles.len(), object.visual.triangles.len());
+        assert!((read.visual.extents() - object.visual.extents()).norm() < 1e-6);
     }
 
     #[test]

@@ -1,6 +1,6 @@
 use std::sync::Arc;
 
-use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use rapier3d::math::{Pose, Rotation, Vector};
 use rapier3d::prelude::{
     BoundingVolume, BroadPhaseBvh, CCDSolver, CoefficientCombineRule, ColliderBuilder, ColliderHandle, ColliderSet,
@@ -235,6 +235,15 @@ impl World {
                 query.intersect_shape(centre, &*shape).next().is_some()
             })
         }
+    }
+
+    /// The object nearest to a point: an index into [`objects`](Self::objects).
+    #[must_use]
+    pub fn nearest(&self, point: &Point3<f64>) -> Option<usize> {
+        const REACH: f32 = (0.05 * SCALE) as f32;
+        let (collider, _) = self.objects_query().project_point(vector(&(point.coords * SCALE)), REACH, true)?;
+        let id = self.object_of(collider)?;
+        self.objects.iter().position(|body| body.id == id)
     }
 
     /// The object that collider belongs to, if it is one.

@@ -1,0 +1,374 @@
+//! The packed form: a few large files that only ever grow.
+//!
+//! A folder holds `setup.json` and `scenes-NNNNN.pack`. A file is a header, 16 bytes (`graspack`, the version 1 and N as
+//! little-endian u32), and records one after the other, each a scene:
+//!
+//! | bytes | what |
+//! |---|---|
+//! | 4 | length of what follows the checksum |
+//! | 4 | its CRC-32 |
+//! | 8 | the scene's number |
+//! | 4, 4 | how many trials, how many volumes |
+//! | 33 a trial | position (voxels), quaternion x y z w, width (voxels): eight f32; 1 for a success, else 0 |
+//! | N³ a volume | [`quantise`](crate::quantise)d values, `[x][y][z]` |
+//!
+//! All numbers are little-endian. A record that is not complete yet, at the end of a file, is not there for a reader. A
+//! run that goes on after it was cut off starts a new file, so that a file that someone has mapped never shrinks.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File, OpenOptions};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use memmap2::Mmap;
+use nalgebra::{Point3, Quaternion, UnitQuaternion};
+
+use crate::error::{At, DataError};
+use crate::{Setup, Trial, edge_of, quantise};
+
+const MAGIC: &[u8; 8] = b"graspack";
+const VERSION: u32 = 1;
+const HEADER: usize = 16;
+/// Length and checksum, before a record's content.
+const PREFIX: usize = 8;
+const TRIAL: usize = 33;
+
+/// Size at which the writer begins the next file.
+const FILE_SIZE: u64 = 1 << 30;
+
+/// Writes scenes in the order of their numbers.
+pub struct Writer {
+    folder: PathBuf,
+    next: Option<u64>,
+    /// The file that is written, its name, and its size.
+    file: Option<(File, PathBuf, u64)>,
+    record: Vec<u8>,
+}
+
+impl Writer {
+    /// Opens a folder, new or left by an earlier run of the same `setup`.
+    ///
+    /// # Errors
+    /// [`DataError`] names the file.
+    pub fn open(folder: &Path, setup: &Setup) -> Result<Self, DataError> {
+        setup.claim(folder)?;
+        let mut reader = Reader::new(folder);
+        reader.refresh()?;
+        let next = reader.scenes.iter().map(|scene| scene.number + 1).max();
+        Ok(Self { folder: folder.to_owned(), next, file: None, record: Vec::new() })
+    }
+
+    /// The scene to go on with, if any was written before.
+    #[must_use]
+    pub fn next(&self) -> Option<u64> {
+        self.next
+    }
+
+    /// Appends a scene in one write: its volumes, each `[N, N, N]` in [0, 1], and its trials.
+    ///
+    /// # Errors
+    /// [`DataError`] names the file; nothing written before is lost.
+    pub fn append(&mut self, number: u64, volumes: &[Vec<f32>], trials: &[Trial]) -> Result<(), DataError> {
+        let quantised: Vec<Vec<u8>> = volumes.iter().map(|volume| quantise(volume)).collect();
+        self.append_quantised(number, &quantised, trials)
+    }
+
+    pub(crate) fn append_quantised(
+        &mut self,
+        number: u64,
+        volumes: &[Vec<u8>],
+        trials: &[Trial],
+    ) -> Result<(), DataError> {
+        let edge = volumes.first().and_then(|volume| edge_of(volume.len())).unwrap_or(0);
+        self.record.clear();
+        self.record.extend([0; PREFIX]);
+        self.record.extend(number.to_le_bytes());
+        self.record.extend((trials.len() as u32).to_le_bytes());
+        self.record.extend((volumes.len() as u32).to_le_bytes());
+        for Trial { position: p, rotation, width, success } in trials {
+            let q = rotation.coords;
+            for number in [p.x, p.y, p.z, q.x, q.y, q.z, q.w, *width] {
+                self.record.extend((number as f32).to_le_bytes());
+            }
+            self.record.push(u8::from(*success));
+        }
+        volumes.iter().for_each(|volume| self.record.extend(volume));
+        let content = &self.record[PREFIX..];
+        let (length, checksum) = (content.len() as u32, crc32fast::hash(content));
+        self.record[..4].copy_from_slice(&length.to_le_bytes());
+        self.record[4..PREFIX].copy_from_slice(&checksum.to_le_bytes());
+
+        let full = self.file.as_ref().is_some_and(|(_, _, size)| *size + self.record.len() as u64 > FILE_SIZE);
+        let (mut file, path, size) = match self.file.take() {
+            Some(open) if !full => open,
+            _ => self.begin_file(edge)?,
+        };
+        // A failure leaves no file open, hence nothing is ever written behind half a record.
+        file.write_all(&self.record).at(&path)?;
+        self.file = Some((file, path, size + self.record.len() as u64));
+        self.next = Some(number + 1);
+        Ok(())
+    }
+
+    fn begin_file(&self, edge: usize) -> Result<(File, PathBuf, u64), DataError> {
+        let path = next_file(&self.folder)?;
+        let mut file = OpenOptions::new().append(true).create_new(true).open(&path).at(&path)?;
+        let header = [MAGIC.as_slice(), &VERSION.to_le_bytes(), &(edge as u32).to_le_bytes()].concat();
+        file.write_all(&header).at(&path)?;
+        Ok((file, path, HEADER as u64))
+    }
+}
+
+/// The packed files of a folder, in the order in which they were begun.
+fn files(folder: &Path) -> Result<Vec<PathBuf>, DataError> {
+    let mut files = Vec::new();
+    for entry in fs::read_dir(folder).at(folder)? {
+        let path = entry.at(folder)?.path();
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        if name.starts_with("scenes-") && name.ends_with(".pack") {
+            files.push(path);
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+/// A name for the next file.
+fn next_file(folder: &Path) -> Result<PathBuf, DataError> {
+    let last = files(folder)?.pop();
+    let number = last.and_then(|path| path.file_stem()?.to_str()?.strip_prefix("scenes-")?.parse::<u32>().ok());
+    Ok(folder.join(format!("scenes-{:05}.pack", number.map_or(0, |number| number + 1))))
+}
+
+/// Whether a folder is of this form.
+pub(crate) fn is_packed(folder: &Path) -> bool {
+    files(folder).is_ok_and(|files| !files.is_empty())
+}
+
+/// The complete scenes of a folder, mapped into memory.
+pub struct Reader {
+    folder: PathBuf,
+    parts: Vec<Part>,
+    scenes: Vec<Location>,
+}
+
+struct Part {
+    path: PathBuf,
+    map: Mmap,
+    edge: usize,
+    /// End of the last complete record.
+    end: usize,
+}
+
+/// Where a scene is: all checked when it was found.
+struct Location {
+    part: usize,
+    number: u64,
+    trials: usize,
+    volumes: usize,
+    /// Where the trials begin.
+    start: usize,
+}
+
+impl Reader {
+    /// Opens a folder, which may still be written to.
+    ///
+    /// # Errors
+    /// [`DataError`] names the file that is damaged, or is none of ours.
+    pub fn open(folder: &Path) -> Result<Self, DataError> {
+        let mut reader = Self::new(folder);
+        reader.refresh()?;
+        Ok(reader)
+    }
+
+    fn new(folder: &Path) -> Self {
+        Self { folder: folder.to_owned(), parts: Vec::new(), scenes: Vec::new() }
+    }
+
+    /// Looks for scenes that were written since; says how many.
+    ///
+    /// # Errors
+    /// As [`open`](Self::open); what was read before remains.
+    pub fn refresh(&mut self) -> Result<usize, DataError> {
+        let before = self.scenes.len();
+        for (index, path) in files(&self.folder)?.into_iter().enumerate() {
+            let known = self.parts.get(index);
+            let length = fs::metadata(&path).at(&path)?.len() as usize;
+            if length < HEADER || known.is_some_and(|part| part.map.len() == length) {
+                continue;
+            }
+            let map = map(&path)?;
+            let edge = check_header(&path, &map)?;
+            let end = known.map_or(HEADER, |part| part.end);
+            let mut part = Part { path, map, edge, end };
+            // The records before stay where they are.
+            self.scenes.extend(part.read_on(index)?);
+            match self.parts.get_mut(index) {
+                Some(known) => *known = part,
+                None => self.parts.push(part),
+            }
+        }
+        Ok(self.scenes.len() - before)
+    }
+
+    /// How many scenes there are.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.scenes.len()
+    }
+
+    /// Whether there are none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.scenes.is_empty()
+    }
+
+    /// Voxels along an edge of scene `index`.
+    #[must_use]
+    pub fn resolution(&self, index: usize) -> usize {
+        self.parts[self.scenes[index].part].edge
+    }
+
+    /// The number of scene `index`.
+    #[must_use]
+    pub fn number(&self, index: usize) -> u64 {
+        self.scenes[index].number
+    }
+
+    /// How many volumes scene `index` has.
+    #[must_use]
+    pub fn volumes(&self, index: usize) -> usize {
+        self.scenes[index].volumes
+    }
+
+    /// Volume `look` of scene `index`, [`quantise`](crate::quantise)d.
+    #[must_use]
+    pub fn volume(&self, index: usize, look: usize) -> &[u8] {
+        let scene = &self.scenes[index];
+        let part = &self.parts[scene.part];
+        let size = part.edge.pow(3);
+        &part.map[scene.start + scene.trials * TRIAL + look * size..][..size]
+    }
+
+    /// The trials of scene `index`.
+    #[must_use]
+    pub fn trials(&self, index: usize) -> Vec<Trial> {
+        let scene = &self.scenes[index];
+        let bytes = &self.parts[scene.part].map[scene.start..][..scene.trials * TRIAL];
+        bytes
+            .chunks_exact(TRIAL)
+            .map(|trial| {
+                let [x, y, z, qx, qy, qz, qw, width] = std::array::from_fn(|i| f64::from(f32_at(trial, 4 * i)));
+                Trial {
+                    position: Point3::new(x, y, z),
+                    rotation: UnitQuaternion::from_quaternion(Quaternion::new(qw, qx, qy, qz)),
+                    width,
+                    success: trial[32] == 1,
+                }
+            })
+            .collect()
+    }
+}
+
+impl Part {
+    /// The records from `end` on, which moves behind them.
+    fn read_on(&mut self, part: usize) -> Result<Vec<Location>, DataError> {
+        let mut scenes = Vec::new();
+        while let Some(prefix) = self.map.get(self.end..self.end + PREFIX) {
+            let (length, checksum) = (u32_at(prefix, 0) as usize, u32_at(prefix, 4));
+            let start = self.end + PREFIX;
+            let Some(content) = self.map.get(start..start + length) else { break };
+            let damaged = |reason: String| {
+                let (path, offset) = (self.path.clone(), self.end as u64);
+                DataError::Damaged { path, offset, reason }
+            };
+            if crc32fast::hash(content) != checksum {
+                return Err(damaged("the checksum of a scene does not fit it".to_owned()));
+            }
+            let [trials, volumes] = match content.get(8..16) {
+                Some(counts) => [u32_at(counts, 0), u32_at(counts, 4)].map(|count| count as usize),
+                None => return Err(damaged(format!("a scene of {length} bytes is too short"))),
+            };
+            if length != 16 + trials * TRIAL + volumes * self.edge.pow(3) {
+                return Err(damaged(format!("{trials} trials and {volumes} volumes do not make {length} bytes")));
+            }
+            let number = u64::from(u32_at(content, 0)) | u64::from(u32_at(content, 4)) << 32;
+            scenes.push(Location { part, number, trials, volumes, start: start + 16 });
+            self.end = start + length;
+        }
+        Ok(scenes)
+    }
+}
+
+fn check_header(path: &Path, bytes: &[u8]) -> Result<usize, DataError> {
+    let damaged = |reason: String| DataError::Damaged { path: path.to_owned(), offset: 0, reason };
+    if &bytes[..8] != MAGIC {
+        return Err(damaged("the file does not begin with `graspack`".to_owned()));
+    }
+    match u32_at(bytes, 8) {
+        VERSION => Ok(u32_at(bytes, 12) as usize),
+        version => Err(damaged(format!("version {version}, this program reads version {VERSION}"))),
+    }
+}
+
+#[expect(
+    unsafe_code,
+    reason = "sound while the file does not shrink: a writer only appends, and never to a file it did not begin"
+)]
+fn map(path: &Path) -> Result<Mmap, DataError> {
+    let file = File::open(path).at(path)?;
+    // SAFETY: see above.
+    unsafe { Mmap::map(&file) }.at(path)
+}
+
+fn u32_at(bytes: &[u8], offset: usize) -> u32 {
+    u32::from_le_bytes(std::array::from_fn(|i| bytes[offset + i]))
+}
+
+fn f32_at(bytes: &[u8], offset: usize) -> f32 {
+    f32::from_bits(u32_at(bytes, offset))
+}
+
+/// Copies the packed files of several folders, made by the same recipe on several machines, into one.
+///
+/// # Errors
+/// [`DataError`] names the folder that was made otherwise, or holds a scene that another holds too; `into` is then as it
+/// was.
+pub fn merge(folders: &[PathBuf], into: &Path) -> Result<usize, DataError> {
+    let mut seen = BTreeMap::new();
+    let mut setup: Option<Setup> = None;
+    for folder in folders {
+        let found = Setup::read(folder)?;
+        match &setup {
+            Some(first) if *first != found => {
+                let found = fs::read_to_string(folder.join("setup.json")).at(folder)?;
+                return Err(DataError::OtherSetup { path: folder.join("setup.json"), found });
+            }
+            _ => setup = Some(found),
+        }
+        let reader = Reader::open(folder)?;
+        for index in 0..reader.len() {
+            let number = reader.number(index);
+            if let Some(first) = seen.insert(number, folder) {
+                let (first, second) = (first.clone(), folder.clone());
+                return Err(DataError::Twice { id: format!("{number:08}"), first, second });
+            }
+        }
+    }
+    let Some(setup) = setup else { return Err(DataError::Empty(into.to_owned())) };
+    setup.claim(into)?;
+    if is_packed(into) {
+        let found = "it holds scenes already".to_owned();
+        return Err(DataError::OtherSetup { path: into.to_owned(), found });
+    }
+    for folder in folders {
+        for source in files(folder)? {
+            let path = next_file(into)?;
+            // Under another name until it is complete.
+            let partial = path.with_extension("partial");
+            fs::copy(&source, &partial).at(&partial)?;
+            fs::rename(&partial, &path).at(&path)?;
+        }
+    }
+    Ok(seen.len())
+}

@@ -1,0 +1,169 @@
+//! `grasps.csv`: a row a trial, the same in both of VGN's formats but for the unit of its lengths.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::fs::{File, OpenOptions};
+use std::io::{self, BufRead, BufReader, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+
+use nalgebra::{Point3, Quaternion, UnitQuaternion};
+use serde::Deserialize;
+
+use crate::Trial;
+use crate::error::{At, DataError};
+
+pub(crate) const FILE: &str = "grasps.csv";
+
+/// In which unit a table's positions and widths are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Unit {
+    Metres,
+    Voxels,
+}
+
+impl Unit {
+    fn header(self) -> &'static str {
+        match self {
+            Self::Metres => "scene_id,qx,qy,qz,qw,x,y,z,width,label",
+            Self::Voxels => "scene_id,qx,qy,qz,qw,i,j,k,width,label",
+        }
+    }
+
+    fn columns(self) -> &'static str {
+        match self {
+            Self::Metres => "scene_id,qx,qy,qz,qw,x,y,z,width,label, with x, y, z and width in metres",
+            Self::Voxels => "scene_id,qx,qy,qz,qw,i,j,k,width,label, with i, j, k and width in voxels",
+        }
+    }
+
+    /// The unit of a folder's table by its header.
+    pub(crate) fn of(folder: &Path) -> Option<Self> {
+        let mut header = String::new();
+        BufReader::new(File::open(folder.join(FILE)).ok()?).read_line(&mut header).ok()?;
+        [Self::Metres, Self::Voxels].into_iter().find(|unit| header.trim_end() == unit.header())
+    }
+}
+
+/// Writes scenes in the order of their numbers, so that a run that was cut off goes on where it stopped.
+pub(crate) struct TableWriter {
+    path: PathBuf,
+    file: File,
+}
+
+impl TableWriter {
+    /// Opens a folder's table, new or left by an earlier run, whose last scene may be unfinished: it is dropped, and its
+    /// number returned, from which to go on.
+    pub(crate) fn open(folder: &Path, unit: Unit) -> Result<(Self, Option<u64>), DataError> {
+        let path = folder.join(FILE);
+        let mut file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path).at(&path)?;
+        let (kept, last) = last_scene(&file).at(&path)?;
+        file.set_len(kept).at(&path)?;
+        file.seek(SeekFrom::End(0)).at(&path)?;
+        if kept == 0 {
+            writeln!(file, "{}", unit.header()).at(&path)?;
+        }
+        Ok((Self { path, file }, last))
+    }
+
+    /// Appends a scene's trials, in the table's unit, in one write.
+    pub(crate) fn append(&mut self, id: &str, trials: &[Trial]) -> Result<(), DataError> {
+        let mut rows = String::new();
+        for Trial { position: p, rotation, width, success } in trials {
+            let (q, label) = (rotation.coords, u8::from(*success));
+            // Writing to a string cannot fail.
+            let _ = writeln!(
+                rows,
+                "{id},{:.7},{:.7},{:.7},{:.7},{:.6},{:.6},{:.6},{width:.6},{label}",
+                q.x, q.y, q.z, q.w, p.x, p.y, p.z
+            );
+        }
+        self.file.write_all(rows.as_bytes()).at(&self.path)
+    }
+}
+
+/// Length of the table without the rows of its last scene, which may be unfinished, and that scene's number.
+fn last_scene(table: &File) -> io::Result<(u64, Option<u64>)> {
+    let mut reader = BufReader::new(table);
+    let mut line = String::new();
+    let (mut offset, mut start, mut last) = (0, 0, None);
+    while reader.read_line(&mut line)? > 0 {
+        // A row without its end may be cut anywhere, even in its scene's number: it goes with the scene before it.
+        if line.ends_with('\n')
+            && let Some(number) = line.split(',').next().and_then(|id| id.parse::<u64>().ok())
+            && last != Some(number)
+        {
+            last = Some(number);
+            start = offset;
+        }
+        offset += line.len() as u64;
+        line.clear();
+    }
+    Ok((start, last))
+}
+
+#[derive(Deserialize)]
+struct Row {
+    scene_id: String,
+    qx: f64,
+    qy: f64,
+    qz: f64,
+    qw: f64,
+    #[serde(alias = "i")]
+    x: f64,
+    #[serde(alias = "j")]
+    y: f64,
+    #[serde(alias = "k")]
+    z: f64,
+    width: f64,
+    label: f64,
+}
+
+/// Reads a folder's table: the trials of each scene, in the table's unit.
+pub(crate) fn read(folder: &Path, unit: Unit) -> Result<BTreeMap<String, Vec<Trial>>, DataError> {
+    let path = folder.join(FILE);
+    let wrong = |line, reason| DataError::Row { path: path.clone(), line, reason, columns: unit.columns() };
+    let mut reader = csv::Reader::from_reader(File::open(&path).at(&path)?);
+    let header = reader.headers().map_err(|error| wrong(1, error.to_string()))?;
+    let missing = unit.header().split(',').find(|&column| header.iter().all(|found| found != column));
+    if let Some(column) = missing {
+        return Err(wrong(1, format!("there is no column `{column}`")));
+    }
+    let mut trials: BTreeMap<String, Vec<Trial>> = BTreeMap::new();
+    // The header is line 1.
+    for (line, row) in (2..).zip(reader.deserialize::<Row>()) {
+        let row = row.map_err(|error| wrong(line, error.to_string()))?;
+        let id = row.scene_id.clone();
+        let trial = row.check().map_err(|reason| wrong(line, reason))?;
+        trials.entry(id).or_default().push(trial);
+    }
+    if trials.is_empty() {
+        return Err(DataError::Empty(folder.to_owned()));
+    }
+    Ok(trials)
+}
+
+impl Row {
+    fn check(self) -> Result<Trial, String> {
+        let Self { qx, qy, qz, qw, x, y, z, width, label, .. } = self;
+        for (name, value) in [("the position", x), ("the position", y), ("the position", z), ("width", width)] {
+            if !value.is_finite() {
+                return Err(format!("{name} is {value}"));
+            }
+        }
+        let rotation = Quaternion::new(qw, qx, qy, qz);
+        if !(0.999..1.001).contains(&rotation.norm()) {
+            return Err(format!("the quaternion has length {}", rotation.norm()));
+        }
+        let success = match label {
+            0.0 => false,
+            1.0 => true,
+            _ => return Err(format!("label is {label}, must be 0 or 1")),
+        };
+        Ok(Trial {
+            position: Point3::new(x, y, z),
+            rotation: UnitQuaternion::from_quaternion(rotation),
+            width,
+            success,
+        })
+    }
+}

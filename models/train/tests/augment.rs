@@ -1,0 +1,104 @@
+//! Changing scenes together with their grasps.
+
+mod support;
+
+use grasp_data::Trial;
+use grasp_train::{Augmentation, Transform};
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+const N: usize = 16;
+
+fn random_trial(rng: &mut ChaCha8Rng) -> Trial {
+    let position = Point3::from(std::array::from_fn(|_| rng.random_range(0.0..N as f64)));
+    let rotation = UnitQuaternion::from_euler_angles(
+        rng.random_range(-3.0..3.0),
+        rng.random_range(-1.5..1.5),
+        rng.random_range(-3.0..3.0),
+    );
+    Trial { position, rotation, width: 5.0, success: true }
+}
+
+/// Points that fix a grasp up to its symmetry: the finger base and the two fingertips, in either order.
+fn points(trial: &Trial) -> [Point3<f64>; 3] {
+    let pose = Isometry3::from_parts(Translation3::from(trial.position), trial.rotation);
+    let mut tips = [-1.0, 1.0].map(|side| pose * Point3::new(0.0, side * trial.width / 2.0, 6.0));
+    tips.sort_by(|a, b| a.x.total_cmp(&b.x));
+    [trial.position, tips[0], tips[1]]
+}
+
+/// Where a point of a scene goes when the scene is changed.
+type Move<'a> = &'a dyn Fn(Point3<f64>) -> Point3<f64>;
+
+#[test]
+fn a_changed_label_is_the_label_of_the_changed_scene() {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let edge = N as f64;
+    let turned = |p: Point3<f64>| Point3::new(edge - p.y, p.x, p.z);
+    let mirrored = |p: Point3<f64>| Point3::new(edge - p.x, p.y, p.z);
+    let shifted = |p: Point3<f64>| Point3::new(p.x, p.y, p.z - 2.0);
+    let moves: [(Transform, Move); 3] = [
+        (Transform { turns: 1, ..Transform::default() }, &turned),
+        (Transform { mirror: true, ..Transform::default() }, &mirrored),
+        (Transform { shift: -2, ..Transform::default() }, &shifted),
+    ];
+    for _ in 0..50 {
+        let trial = random_trial(&mut rng);
+        for (transform, expected) in moves {
+            let mut moved = points(&trial).map(expected);
+            moved[1..].sort_by(|a, b| a.x.total_cmp(&b.x));
+            for (got, expected) in points(&transform.trial(&trial, N)).iter().zip(&moved) {
+                assert!((got - expected).norm() < 1e-9, "{transform:?}: {got} instead of {expected}");
+            }
+        }
+    }
+}
+
+#[test]
+fn the_grid_moves_with_the_label() {
+    // One voxel is different; the label stands at its centre, and so it must afterwards.
+    let mut rng = ChaCha8Rng::seed_from_u64(2);
+    let all = Augmentation { turns: true, mirror: true, shift: 2 };
+    for _ in 0..50 {
+        let cell: [usize; 3] = std::array::from_fn(|_| rng.random_range(2..N - 2));
+        let mut grid = vec![0; N.pow(3)];
+        grid[(cell[0] * N + cell[1]) * N + cell[2]] = 255;
+        let trial = Trial { position: Point3::from(cell.map(|c| c as f64 + 0.5)), ..random_trial(&mut rng) };
+        let transform = all.draw(&mut rng);
+        let mut changed = vec![0.0; N.pow(3)];
+        transform.volume(&grid, N, &mut changed);
+        let moved = transform.trial(&trial, N).position;
+        let [x, y, z] = [moved.x, moved.y, moved.z].map(|c| c.floor() as usize);
+        assert_eq!(changed.iter().sum::<f32>(), 1.0);
+        assert_eq!(changed[(x * N + y) * N + z], 1.0, "{transform:?}");
+    }
+}
+
+#[test]
+fn four_turns_are_none() {
+    let scene = support::scene(3, N);
+    let turn = |turns| Transform { turns, ..Transform::default() };
+    let mut grid = vec![0.0; N.pow(3)];
+    turn(4).volume(&scene.volumes[0], N, &mut grid);
+    assert!(grid.iter().zip(&scene.volumes[0]).all(|(a, b)| *a == grasp_data::value(*b)));
+    let trial = &scene.trials[0];
+    let turned = turn(4).trial(trial, N);
+    assert!((turned.position - trial.position).norm() < 1e-12);
+    assert!(turned.rotation.angle_to(&trial.rotation) < 1e-9);
+    assert!((turn(1).trial(trial, N).position - trial.position).norm() > 1e-3, "one turn is not none");
+    let twice = turn(1).trial(&turn(1).trial(trial, N), N);
+    assert!((twice.position - turn(2).trial(trial, N).position).norm() < 1e-12);
+}
+
+#[test]
+fn every_allowed_change_is_drawn_and_no_other() {
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    let mut draw = |allowed: Augmentation| (0..200).map(|_| allowed.draw(&mut rng)).collect::<Vec<_>>();
+    assert!(draw(Augmentation::default()).iter().all(|t| *t == Transform::default()));
+    let drawn = draw(Augmentation { turns: true, mirror: true, shift: 1 });
+    assert!((0..4).all(|turns| drawn.iter().any(|t| t.turns == turns)));
+    assert!([false, true].iter().all(|mirror| drawn.iter().any(|t| t.mirror == *mirror)));
+    assert!((-1..=1).all(|shift| drawn.iter().any(|t| t.shift == shift)));
+    assert!(drawn.iter().all(|t| t.shift.abs() <= 1 && t.turns < 4));
+}

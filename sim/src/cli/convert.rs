@@ -1,0 +1,132 @@
+use std::path::PathBuf;
+
+use anyhow::{Context, bail};
+use clap::Args;
+use grasp::{DepthImage, Fusion, RESOLUTION};
+use grasp_data::{Dataset, Form, Setup, Trial, packed, processed, raw};
+use grasp_sim::ordered;
+use indicatif::ProgressBar;
+use nalgebra::Isometry3;
+
+use super::label::Format;
+
+/// From raw to processed or packed, its depth images fused and grasps at the borders dropped, as VGN's scripts do; or
+/// between processed and packed.
+#[derive(Args)]
+pub struct Convert {
+    /// Folder to read: VGN's or GIGA's, or one of ours.
+    #[arg(long)]
+    from: PathBuf,
+
+    /// Folder to write into.
+    #[arg(long)]
+    out: PathBuf,
+
+    /// In which form.
+    #[arg(long, value_enum, default_value = "packed")]
+    format: Format,
+}
+
+/// Grasps nearer to the workspace's faces are dropped (VGN's clean-up), metres.
+const BORDER: f64 = 0.02;
+
+impl Convert {
+    pub fn run(self) -> anyhow::Result<()> {
+        if self.format == Format::Raw {
+            bail!("--format raw: depth images cannot be made of volumes; `grasp-sim label --format raw` writes them");
+        }
+        anyhow::ensure!(self.from != self.out, "--from and --out are the same folder");
+        let setup = Setup::read(&self.from)?;
+        let mut writer = Writer::open(&self, &setup)?;
+        match Form::of(&self.from)? {
+            Form::Raw => self.fuse(&setup, &mut writer),
+            Form::Processed | Form::Packed => self.copy(&mut writer),
+        }
+    }
+
+    fn fuse(&self, setup: &Setup, writer: &mut Writer) -> anyhow::Result<()> {
+        let reader = raw::Reader::open(&self.from)?;
+        let scenes: Vec<(&str, &[Trial])> = reader.trials().collect();
+        let voxel_size = setup.size / RESOLUTION as f64;
+        let (mut unseen, mut dropped) = (0, 0);
+        let progress = ProgressBar::new(scenes.len() as u64);
+        ordered::for_each(
+            0..scenes.len() as u64,
+            |index| fuse(&reader, scenes[index as usize].0),
+            |index, volume| {
+                let (id, trials) = scenes[index as usize];
+                progress.inc(1);
+                let Some(volume) = volume? else {
+                    unseen += 1;
+                    return anyhow::Ok(());
+                };
+                let inside =
+                    |trial: &&Trial| trial.position.iter().all(|&c| (BORDER..=setup.size - BORDER).contains(&c));
+                let kept: Vec<Trial> = trials
+                    .iter()
+                    .filter(inside)
+                    .map(|trial| Trial::new(&trial.grasp(1.0), trial.success, voxel_size))
+                    .collect();
+                dropped += trials.len() - kept.len();
+                if kept.is_empty() { Ok(()) } else { writer.append(index, id, &volume, &kept) }
+            },
+        )?;
+        progress.finish_and_clear();
+        println!("{} scenes, {unseen} of them empty; {dropped} grasps at the borders dropped", scenes.len());
+        Ok(())
+    }
+
+    fn copy(&self, writer: &mut Writer) -> anyhow::Result<()> {
+        let dataset = Dataset::open(std::slice::from_ref(&self.from))?;
+        let progress = ProgressBar::new(dataset.len() as u64);
+        for index in 0..dataset.len() {
+            let volume: Vec<f32> = dataset.volume(index, 0).iter().map(|&byte| grasp_data::value(byte)).collect();
+            writer.append(index as u64, &dataset.id(index), &volume, &dataset.trials(index))?;
+            progress.inc(1);
+        }
+        progress.finish_and_clear();
+        println!("{} scenes", dataset.len());
+        Ok(())
+    }
+}
+
+/// The volume of a scene; `None` if nothing of it was seen.
+fn fuse(reader: &raw::Reader, id: &str) -> anyhow::Result<Option<Vec<f32>>> {
+    let mut fusion = Fusion::new(RESOLUTION, reader.setup().size);
+    for view in reader.views(id)? {
+        let image = DepthImage::new(reader.setup().intrinsics(), &view.depth).with_context(|| format!("scene {id}"))?;
+        fusion.integrate(&image, &view.camera_from_task);
+    }
+    Ok(fusion.volume(Isometry3::identity()).ok().map(|volume| volume.values().to_vec()))
+}
+
+enum Writer {
+    Processed(processed::Writer),
+    Packed(packed::Writer),
+}
+
+impl Writer {
+    fn open(convert: &Convert, setup: &Setup) -> anyhow::Result<Self> {
+        let writer = match convert.format {
+            Format::Packed => Self::Packed(packed::Writer::open(&convert.out, setup)?),
+            Format::Processed | Format::Raw => Self::Processed(processed::Writer::open(&convert.out, setup)?),
+        };
+        let begun = match &writer {
+            Self::Processed(writer) => writer.next().is_some(),
+            Self::Packed(writer) => writer.next().is_some(),
+        };
+        anyhow::ensure!(!begun, "{} holds scenes already; use another folder", convert.out.display());
+        Ok(writer)
+    }
+
+    /// The packed form numbers scenes; a name that is no number gives way to `index`.
+    fn append(&mut self, index: u64, id: &str, volume: &[f32], trials: &[Trial]) -> anyhow::Result<()> {
+        match self {
+            Self::Processed(writer) => writer.append(id, volume, trials)?,
+            Self::Packed(writer) => {
+                writer.append(id.parse().unwrap_or(index), std::slice::from_ref(&volume.to_vec()), trials)?;
+            }
+        }
+        Ok(())
+    }
+}

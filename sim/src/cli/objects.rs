@@ -1,0 +1,82 @@
+use std::fs;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use anyhow::Context;
+use clap::Args;
+use grasp_sim::objects::Object;
+use grasp_sim::picture::{Picture, object_color};
+use nalgebra::{Isometry3, Point3};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use super::Scene;
+
+/// Objects across and down, and the distance between them, metres.
+const COLUMNS: usize = 10;
+const ROWS: usize = 6;
+const PITCH: f64 = 0.16;
+
+/// What scenes are made of, to look at, or for another simulator.
+#[derive(Args)]
+pub struct Objects {
+    /// The objects: our own, `train`, `test` or `endless`, or a folder of URDF files.
+    #[arg(long, default_value = "train")]
+    objects: String,
+
+    /// Of which scene the test objects are.
+    #[arg(long, value_enum, default_value = "packed")]
+    scene: Scene,
+
+    /// Leave out so many at the beginning.
+    #[arg(long, default_value_t = 0)]
+    skip: usize,
+
+    /// How many, of objects without end.
+    #[arg(long, default_value_t = COLUMNS * ROWS)]
+    count: usize,
+
+    /// Draw the first 60 on a table, row by row.
+    #[arg(long)]
+    picture: Option<PathBuf>,
+
+    /// Write each into this folder.
+    #[arg(long)]
+    out: Option<PathBuf>,
+}
+
+impl Objects {
+    pub fn run(self) -> anyhow::Result<()> {
+        let set = self.scene.objects(&self.objects)?;
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let mut objects = set.listed().to_vec();
+        if objects.is_empty() {
+            objects = (0..self.skip + self.count).map(|_| set.draw(&mut rng)).collect();
+        }
+        let objects = objects.get(self.skip..).unwrap_or_default();
+        println!("{} objects", objects.len());
+        if let Some(path) = &self.picture {
+            draw(objects).save(path)?;
+            println!("drawn in {}", path.display());
+        }
+        if let Some(folder) = &self.out {
+            fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
+            objects.iter().try_for_each(|object| object.save(folder))?;
+            println!("written to {}", folder.display());
+        }
+        Ok(())
+    }
+}
+
+fn draw(objects: &[Arc<Object>]) -> Picture {
+    let (eye, target) = (Point3::new(0.72, -1.35, 2.0), Point3::new(0.72, 0.4, 0.03));
+    let mut picture = Picture::looking_at(1600, 900, 0.35, eye, target);
+    picture.table(0.0);
+    for (place, object) in objects.iter().take(COLUMNS * ROWS).enumerate() {
+        let (column, row) = ((place % COLUMNS) as f64, (ROWS - 1 - place / COLUMNS) as f64);
+        let lift = -object.visual.bounds().0.z;
+        let pose = Isometry3::translation(column * PITCH, row * PITCH, lift);
+        picture.mesh(&object.visual, &pose, 1.0, object_color(place * 7 + place / 12));
+    }
+    picture
+}
