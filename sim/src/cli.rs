@@ -6,6 +6,7 @@ mod demo;
 mod label;
 mod merge;
 mod objects;
+mod stats;
 
 use std::path::PathBuf;
 
@@ -25,6 +26,8 @@ pub enum Command {
     Convert(convert::Convert),
     /// Join what several machines have labelled.
     Merge(merge::Merge),
+    /// Count what is in a data set.
+    Stats(stats::Stats),
     /// Draw objects, or write them as URDF and OBJ.
     Objects(objects::Objects),
     /// Clear tables with a planner and say how well it did.
@@ -40,6 +43,7 @@ impl Command {
             Self::Label(command) => command.run(),
             Self::Convert(command) => command.run(),
             Self::Merge(command) => command.run(),
+            Self::Stats(command) => command.run(),
             Self::Objects(command) => command.run(),
             Self::Bench(command) => command.run(),
             Self::Demo(command) => command.run(),

@@ -15,6 +15,7 @@ pub mod picture;
 pub mod planner;
 pub mod raster;
 pub mod scene;
+pub mod statistics;
 pub mod trial;
 
 /// Height of the table's top in the task frame, metres.

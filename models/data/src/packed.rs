@@ -10,7 +10,7 @@
 //! | 8 | the scene's number |
 //! | 4, 4 | how many trials, how many volumes |
 //! | 33 a trial | position (voxels), quaternion x y z w, width (voxels): eight f32; 1 for a success, else 0 |
-//! | N³ a volume | [`quantise`](crate::quantise)d values, `[x][y][z]` |
+//! | N³ a volume | [`quantise`]d values, `[x][y][z]` |
 //!
 //! All numbers are little-endian. A record that is not complete yet, at the end of a file, is not there for a reader. A
 //! run that goes on after it was cut off starts a new file, so that a file that someone has mapped never shrinks.
@@ -241,7 +241,7 @@ impl Reader {
         self.scenes[index].volumes
     }
 
-    /// Volume `look` of scene `index`, [`quantise`](crate::quantise)d.
+    /// Volume `look` of scene `index`, [`quantise`]d.
     #[must_use]
     pub fn volume(&self, index: usize, look: usize) -> &[u8] {
         let scene = &self.scenes[index];

@@ -1,6 +1,6 @@
 //! The processed format of VGN and GIGA:
 //!
-//! - `setup.json`: [`Setup`](crate::Setup);
+//! - `setup.json`: [`Setup`];
 //! - `grasps.csv`: `scene_id,qx,qy,qz,qw,i,j,k,width,label`, a row a trial; i, j, k = position / voxel size, width in
 //!   voxels;
 //! - `scenes/ID.npz`: `grid`, `[1, N, N, N]` f32, the observed volume.
