@@ -1,6 +1,7 @@
 //! The command line, one file a command.
 
 mod bench;
+mod candidates;
 mod demo;
 mod label;
 
@@ -18,6 +19,8 @@ use grasp_sim::scene::SceneKind;
 pub enum Command {
     /// Make scenes, try grasps in them, and write what came of it as training data.
     Label(label::Label),
+    /// Make scenes, fit the hand to what is seen of them, try it, and write images and labels for GPD's classifier.
+    Candidates(candidates::Candidates),
     /// Clear tables with a planner and say how well it did.
     Bench(bench::Bench),
     /// One scene, from the depth camera through a server of its own to the lifted object.
@@ -29,6 +32,7 @@ impl Command {
     pub fn run(self) -> anyhow::Result<()> {
         match self {
             Self::Label(command) => command.run(),
+            Self::Candidates(command) => command.run(),
             Self::Bench(command) => command.run(),
             Self::Demo(command) => command.run(),
         }

@@ -2,13 +2,16 @@
 //!
 //! A [`Trainer`] takes [`Scene`]s out of a [`Dataset`], [changes](Augmentation) them, and runs them through an
 //! [`Executor`]: the ONNX graph that is served, in libtorch and under autograd. [`Targets::loss`] is what [`Adam`]
-//! minimises; a [`Checkpoint`] is where a run stands.
+//! minimises; a [`Checkpoint`] is where a run stands. A [`Learner`] trains the classifier of grasp candidates on
+//! [`Examples`].
 
 mod adam;
 mod augment;
 mod checkpoint;
+mod classifier;
 pub mod curves;
 mod dataset;
+mod examples;
 mod execute;
 mod heads;
 mod loss;
@@ -17,7 +20,9 @@ mod trainer;
 pub use adam::Adam;
 pub use augment::{Augmentation, Transform};
 pub use checkpoint::{Checkpoint, CheckpointError};
+pub use classifier::{ClassifierSettings, Learner, Tally};
 pub use dataset::{Dataset, DatasetError, Label, Scene};
+pub use examples::{Examples, ExamplesError};
 pub use execute::{ExecuteError, Execution, Executor, Outputs};
 pub use loss::{Loss, LossError, Sums, Targets};
 pub use trainer::{Epoch, Record, Settings, TrainError, Trainer, Validation};
