@@ -1,7 +1,8 @@
 //! The networks of graspd: their definitions as ONNX graphs, the files they are kept in, and ONNX Runtime.
 //!
 //! [`build`] defines a network with random weights; its [`Metadata`] travels inside the file; a [`Store`] is a folder
-//! of such files; a [`Network`] runs one. [`gpd`] defines the classifier of grasp candidates, which a [`Classifier`] runs.
+//! of such files; a [`Network`] runs one. [`gpd`] defines the classifier of grasp candidates, which a [`Classifier`]
+//! runs.
 
 pub mod gpd;
 mod graph;

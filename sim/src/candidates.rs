@@ -19,7 +19,7 @@ use crate::camera::View;
 use crate::label::{Recipe, is_within_reach};
 use crate::trial;
 
-/// How close the hand may come to the table, metres: the distance at which the benchmark's hand does not touch it.
+/// How close the hand may come to the table, metres: the simulator's fingers are half a millimetre broader on each side.
 const CLEARANCE: f64 = 0.002;
 
 /// A candidate as the classifier sees it, with what came of trying it.
@@ -95,7 +95,7 @@ fn write_array<T: AutoSerialize>(
     // Without the time of day: the same examples are the same bytes.
     let options = FileOptions::default().last_modified_time(DateTime::default());
     archive.zip_writer().start_file(file_name_from_array_name(name), options)?;
-    // Without a buffer every pixel would be a call to the compressor: that took longer than the trials.
+    // Without a buffer every pixel would be a call to the compressor, which took about as long as the trials.
     let mut file = io::BufWriter::with_capacity(1 << 16, archive.zip_writer());
     let mut array = npyz::WriteOptions::new().default_dtype().shape(shape).writer(&mut file).begin_nd()?;
     array.extend(values)?;

@@ -8,7 +8,7 @@ pub const IMAGE_SIZE: usize = 60;
 /// Channels: for each of three projections, three of normals and one of depth.
 ///
 /// GPD knows images of 3, 12 and 15 channels. The last three of 15 are the shadow of what was seen, which needs rays
-/// through voxels for every candidate and gained GPD's authors little.
+/// through voxels for every candidate; 12 show the shape from every side without them.
 pub const CHANNELS: usize = 12;
 
 /// What is shown: the space between the fingers, a centimetre past their tips, and a finger's breadth on each side.
