@@ -1,4 +1,7 @@
+use nalgebra::{Isometry3, Point3};
 use thiserror::Error;
+
+use crate::{DEPTH_MAX, SurfacePoint};
 
 /// A pinhole camera: pixels, with pixel centres at whole numbers. Optical axes: z forward, x right, y down.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -85,5 +88,44 @@ impl<'a> DepthImage<'a> {
     #[must_use]
     pub fn depth(&self) -> &[f32] {
         self.depth
+    }
+
+    /// Every pixel with a reading up to [`DEPTH_MAX`], back-projected: its point in the task frame, with the direction
+    /// towards the camera for a normal. `camera_from_task` is `T_camera_task`.
+    pub fn points(&self, camera_from_task: &Isometry3<f64>) -> impl Iterator<Item = SurfacePoint> {
+        let Intrinsics { width, fx, fy, cx, cy, .. } = self.intrinsics;
+        let task_from_camera = camera_from_task.inverse();
+        let eye = Point3::from(task_from_camera.translation.vector);
+        self.depth.iter().enumerate().filter(|(_, depth)| (f32::MIN_POSITIVE..=DEPTH_MAX).contains(*depth)).map(
+            move |(pixel, &depth)| {
+                let (u, v, z) = ((pixel % width) as f64, (pixel / width) as f64, f64::from(depth));
+                let position = task_from_camera * Point3::new((u - cx) / fx * z, (v - cy) / fy * z, z);
+                SurfacePoint { position, normal: (eye - position).normalize() }
+            },
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+
+    #[test]
+    fn a_pixel_is_projected_back_to_where_it_was_seen() {
+        let intrinsics = Intrinsics { width: 3, height: 2, fx: 2.0, fy: 2.0, cx: 1.0, cy: 0.0 };
+        let depth = [0.0, f32::NAN, 0.5, -1.0, 1.0, 2.5];
+        // The camera stands at (1, 0, 0) of the task frame, its axes along the task frame's.
+        let camera_from_task = Isometry3::translation(-1.0, 0.0, 0.0);
+        let image = DepthImage::new(intrinsics, &depth).unwrap();
+        let points: Vec<SurfacePoint> = image.points(&camera_from_task).collect();
+        let positions: Vec<_> = points.iter().map(|point| point.position).collect();
+        assert_eq!(
+            positions,
+            [Point3::new(1.25, 0.0, 0.5), Point3::new(1.0, 0.5, 1.0)],
+            "what has no depth is left out"
+        );
+        assert!((points[1].normal - Vector3::new(0.0, -0.5, -1.0).normalize()).norm() < 1e-12, "towards the camera");
     }
 }

@@ -1,7 +1,8 @@
 //! The domain of graspd: volumes, depth fusion, grasps, and the decoding of a network's output into grasps.
 //!
-//! Data flows one way: [`DepthImage`] + [`Intrinsics`] → [`Fusion`] → [`Volume`] → a network → [`Maps`] →
-//! [`decode`] → [`Grasp`]s. Nothing here does I/O, spawns a thread or knows where a volume came from.
+//! Data flows one way: [`DepthImage`] + [`Intrinsics`] → [`Fusion`] → [`Volume`] → a network → [`Maps`] → [`decode`] →
+//! [`Grasp`]s. The classical planners go another way: depth → [`gpd::Cloud`] → [`gpd::Candidate`]s. Nothing here does
+//! I/O, spawns a thread or knows where a volume came from.
 //!
 //! Conventions, unless a name says otherwise: metres, radians, unit quaternions as x, y, z, w; a pose or transform
 //! `T_a_b` maps points of frame b into frame a; voxel arrays are indexed `[x][y][z]` with z running fastest.
@@ -10,6 +11,7 @@ mod camera;
 mod decode;
 mod filter;
 mod fusion;
+pub mod gpd;
 mod grasp;
 mod surface;
 mod volume;

@@ -117,17 +117,25 @@ impl Builder {
         output
     }
 
-    /// A convolution that keeps the size, divided by its stride.
+    /// A convolution of volumes that keeps the size, divided by its stride.
     pub fn conv(&mut self, name: &str, x: &str, conv: Conv) -> String {
+        self.convolution::<3>(name, x, conv, (conv.kernel as i64 - 1) / 2)
+    }
+
+    /// A convolution of images without padding: the size falls by `kernel` - 1.
+    pub fn conv_2d(&mut self, name: &str, x: &str, conv: Conv) -> String {
+        self.convolution::<2>(name, x, conv, 0)
+    }
+
+    fn convolution<const AXES: usize>(&mut self, name: &str, x: &str, conv: Conv, pad: i64) -> String {
         let Conv { inputs, outputs, kernel, stride, bias } = conv;
-        let fan_in = inputs * kernel.pow(3);
-        let weight = format!("{name}.weight");
-        let weight = self.parameter(&weight, &[outputs, inputs, kernel, kernel, kernel], Init::FanIn(fan_in));
-        let pad = (kernel as i64 - 1) / 2;
+        let fan_in = inputs * kernel.pow(AXES as u32);
+        let dims = [&[outputs, inputs][..], &[kernel; AXES]].concat();
+        let weight = self.parameter(&format!("{name}.weight"), &dims, Init::FanIn(fan_in));
         let attributes = vec![
-            AttributeProto::ints("kernel_shape", &[kernel as i64; 3]),
-            AttributeProto::ints("pads", &[pad; 6]),
-            AttributeProto::ints("strides", &[stride as i64; 3]),
+            AttributeProto::ints("kernel_shape", &[kernel as i64; AXES]),
+            AttributeProto::ints("pads", &[pad].repeat(2 * AXES)),
+            AttributeProto::ints("strides", &[stride as i64; AXES]),
         ];
         if bias {
             let bias = self.parameter(&format!("{name}.bias"), &[outputs], Init::FanIn(fan_in));
@@ -170,7 +178,7 @@ impl Builder {
     }
 }
 
-/// The sizes of a convolution with a cubic kernel.
+/// The sizes of a convolution with a kernel of equal edges.
 #[derive(Clone, Copy)]
 pub(crate) struct Conv {
     /// Input channels.

@@ -1,8 +1,10 @@
 //! The networks of graspd: their definitions as ONNX graphs, the files they are kept in, and ONNX Runtime.
 //!
 //! [`build`] defines a network with random weights; its [`Metadata`] travels inside the file; a [`Store`] is a folder
-//! of such files; a [`Network`] runs one.
+//! of such files; a [`Network`] runs one. [`gpd`] defines the classifier of grasp candidates, which a [`Classifier`]
+//! runs.
 
+pub mod gpd;
 mod graph;
 mod heads;
 mod metadata;
@@ -15,5 +17,5 @@ mod vgn;
 
 pub use metadata::{Metadata, MetadataError, ValueConvention};
 pub use networks::{Architecture, BuildError, build};
-pub use runtime::{LoadError, LoadReason, Network, Options, Output, RuntimeError, RuntimeInfo, init};
+pub use runtime::{Classifier, LoadError, LoadReason, Network, Options, Output, RuntimeError, RuntimeInfo, init};
 pub use store::{Entry, EntryError, Store, StoreError};

@@ -55,8 +55,8 @@ pub enum MetadataError {
     Resolution(usize),
 }
 
-const PREFIX: &str = "graspd.";
-const PROVENANCE: &str = "provenance.";
+pub(crate) const PREFIX: &str = "graspd.";
+pub(crate) const PROVENANCE: &str = "provenance.";
 
 impl Metadata {
     /// What a file without properties means: VGN's conventions, named after the file.

@@ -1,5 +1,7 @@
 //! ONNX Runtime: the only module that touches it.
 
+mod classifier;
+
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::env::consts::{DLL_PREFIX, DLL_SUFFIX};
@@ -16,6 +18,8 @@ use ort::value::{Outlet, Tensor, TensorElementType};
 use thiserror::Error;
 
 use crate::{Metadata, MetadataError};
+
+pub use classifier::Classifier;
 
 /// The input every network has: `[batch, 1, N, N, N]`.
 const INPUT: &str = "tsdf";
@@ -102,6 +106,17 @@ pub enum LoadReason {
         /// What is different.
         what: String,
     },
+    /// Its inputs or outputs are not those of a classifier of grasp candidates.
+    #[error(
+        "{what}; a classifier reads `images` f32 [batch, {c}, {n}, {n}] and gives `scores` f32 [batch, 2], as \
+         `grasp-train classify` writes it",
+        c = grasp::gpd::CHANNELS,
+        n = grasp::gpd::IMAGE_SIZE
+    )]
+    Classifier {
+        /// What is different.
+        what: String,
+    },
 }
 
 impl From<ort::Error> for LoadReason {
@@ -178,6 +193,16 @@ struct Buffers {
     outputs: [Tensor<f32>; 3],
 }
 
+fn open(path: &Path, options: &Options) -> Result<Session, LoadReason> {
+    let runtime = runtime()?;
+    // Read here, so that a file that cannot be read is told from one that is no model.
+    let bytes = fs::read(path)?;
+    let builder = Session::builder(&runtime.environment)?;
+    let builder = builder.with_intra_threads(options.threads).map_err(ort::Error::from)?;
+    let mut builder = builder.with_inter_threads(1).map_err(ort::Error::from)?;
+    Ok(builder.commit_from_memory(&bytes)?)
+}
+
 /// The maps of a batch, in the network's buffers until it runs again.
 pub struct Output<'a> {
     outputs: &'a [Tensor<f32>; 3],
@@ -195,13 +220,7 @@ impl Network {
     }
 
     fn try_load(path: &Path, options: &Options) -> Result<Self, LoadReason> {
-        let runtime = runtime()?;
-        // Read here, so that a file that cannot be read is told from one that is no model.
-        let bytes = fs::read(path)?;
-        let builder = Session::builder(&runtime.environment)?;
-        let builder = builder.with_intra_threads(options.threads).map_err(ort::Error::from)?;
-        let mut builder = builder.with_inter_threads(1).map_err(ort::Error::from)?;
-        let session = builder.commit_from_memory(&bytes)?;
+        let session = open(path, options)?;
         let resolution = check_signature(session.inputs(), session.outputs())?;
         let metadata = read_metadata(&session, Metadata::defaults(path, resolution))?;
         if let Some(resolution) = resolution.filter(|&resolution| resolution != metadata.resolution) {

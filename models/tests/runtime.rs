@@ -3,10 +3,11 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use grasp::Volume;
+use grasp::gpd::{Candidate, Cloud, Image};
+use grasp::{SurfacePoint, Volume};
 use grasp_models::onnx::{Dimension, ModelProto, ValueInfoProto};
-use grasp_models::{Architecture, Network, Options, RuntimeError, build, init};
-use nalgebra::Isometry3;
+use grasp_models::{Architecture, Classifier, Network, Options, RuntimeError, build, gpd, init};
+use nalgebra::{Isometry3, Point3, Vector3};
 use tempfile::TempDir;
 
 fn save(model: &ModelProto) -> (TempDir, PathBuf) {
@@ -156,4 +157,40 @@ fn a_file_cut_short_is_refused() {
     assert!(error.contains("network.onnx") && error.contains("cut short"), "{error}");
     let error = Network::load(Path::new("nowhere.onnx"), &Options::default()).err().unwrap().to_string();
     assert!(error.starts_with("nowhere.onnx: No such file"), "{error}");
+}
+
+fn images(count: u64) -> Vec<Image> {
+    let point = |i: u64| SurfacePoint {
+        position: Point3::new(0.0, (i % 7) as f64 * 0.01 - 0.03, (i % 11) as f64 * 0.005),
+        normal: Vector3::y(),
+    };
+    let candidate = Candidate { pose: Isometry3::identity(), width: 0.04, point: Point3::origin() };
+    (0..count).map(|seed| Image::of(&Cloud::new((0..20).map(|i| point(i * (seed + 3)))), &candidate)).collect()
+}
+
+#[test]
+fn a_classifier_scores_each_image_by_itself() {
+    let (_folder, path) = save(&gpd::gpd(0));
+    let mut classifier = Classifier::load(&path, &Options::default()).unwrap();
+    let images = images(40);
+    let together = classifier.score(&images).unwrap();
+    assert_eq!(together.len(), images.len());
+    assert!(together.iter().any(|score| (score - together[0]).abs() > 1e-5), "the images differ, so do the scores");
+    for (image, together) in images.iter().zip(together) {
+        let alone = classifier.score(std::slice::from_ref(image)).unwrap();
+        assert!((alone[0] - together).abs() < 1e-5);
+    }
+    assert_eq!(classifier.score(&[]).unwrap(), Vec::<f32>::new());
+}
+
+#[test]
+fn a_network_is_no_classifier_and_a_classifier_no_network() {
+    let (_folder, path) = save(&build("vgn", 0).unwrap());
+    let error = Classifier::load(&path, &Options::default()).err().unwrap().to_string();
+    assert!(error.contains("network.onnx: it has `tsdf`, not `images`; a classifier reads"), "{error}");
+    let (_folder, path) = save(&gpd::gpd(0));
+    let error = Network::load(&path, &Options::default()).err().unwrap().to_string();
+    assert!(error.contains("it has an input `images`"), "{error}");
+    // Small enough to be shipped.
+    assert!(fs::metadata(&path).unwrap().len() < 3_000_000);
 }

@@ -1,6 +1,7 @@
 //! The command line, one file a command.
 
 mod bench;
+mod candidates;
 mod convert;
 mod demo;
 mod label;
@@ -30,6 +31,8 @@ pub enum Command {
     Stats(stats::Stats),
     /// Draw objects, or write them as URDF and OBJ.
     Objects(objects::Objects),
+    /// Make scenes, fit the hand to what is seen of them, try it, and write images and labels for GPD's classifier.
+    Candidates(candidates::Candidates),
     /// Clear tables with a planner and say how well it did.
     Bench(bench::Bench),
     /// One scene, from the depth camera through a server of its own to the lifted object.
@@ -45,6 +48,7 @@ impl Command {
             Self::Merge(command) => command.run(),
             Self::Stats(command) => command.run(),
             Self::Objects(command) => command.run(),
+            Self::Candidates(command) => command.run(),
             Self::Bench(command) => command.run(),
             Self::Demo(command) => command.run(),
         }

@@ -3,7 +3,7 @@
 use std::f64::consts::PI;
 
 use grasp::{FINGER_DEPTH, Grasp, MAX_OPENING, RESOLUTION, SurfacePoint};
-use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Poisson};
@@ -94,18 +94,23 @@ impl Point {
 
 impl Recipe {
     /// Generators of a scene's own: the result does not depend on which thread makes it, or when.
-    fn rng(&self, index: u64, purpose: u64) -> ChaCha8Rng {
+    pub(crate) fn rng(&self, index: u64, purpose: u64) -> ChaCha8Rng {
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed.wrapping_add(purpose << 32));
         rng.set_stream(index);
         rng
+    }
+
+    /// A scene of Poisson(4) + 1 objects.
+    pub(crate) fn scene(&self, rng: &mut ChaCha8Rng) -> World {
+        let count = Poisson::new(4.0).expect("4 is positive").sample(rng) as usize + 1;
+        generate(self.kind, &self.objects, count, rng)
     }
 
     /// Makes, looks at and labels scene number `index`; `None` if nothing of it can be seen.
     #[must_use]
     pub fn label(&self, index: u64) -> Option<LabelledScene> {
         let mut rng = self.rng(index, 0);
-        let count = Poisson::new(4.0).expect("4 is positive").sample(&mut rng) as usize + 1;
-        let world = generate(self.kind, &self.objects, count, &mut rng);
+        let world = self.scene(&mut rng);
         // Labels cover what six clean views from above see, whatever the network will see.
         let cloud = graspable(&look(&world, &Views::Circle.sample(&mut rng)));
         if cloud.is_empty() {
@@ -141,9 +146,15 @@ pub fn graspable(views: &[View]) -> Vec<SurfacePoint> {
 /// Whether a point is above the table, away from the borders, and does not face down (the bounds of GIGA's code).
 #[must_use]
 pub fn is_graspable(point: &SurfacePoint) -> bool {
+    is_within_reach(&point.position) && point.normal.z > -0.1
+}
+
+/// Whether a position is above the table and away from the borders.
+#[must_use]
+pub fn is_within_reach(position: &Point3<f64>) -> bool {
     const LOWER: [f64; 3] = [0.02, 0.02, 0.055];
     const UPPER: [f64; 3] = [0.28, 0.28, 0.30];
-    (0..3).all(|axis| (LOWER[axis]..=UPPER[axis]).contains(&point.position[axis])) && point.normal.z > -0.1
+    (0..3).all(|axis| (LOWER[axis]..=UPPER[axis]).contains(&position[axis]))
 }
 
 /// Draws a grasp point (VGN's `sample_grasp_point`): somewhere on the surface, at a random depth of the fingers.
@@ -215,7 +226,7 @@ mod tests {
     fn a_pose_approaches_against_the_normal() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         for normal in [Vector3::z(), Vector3::x(), -Vector3::x(), Vector3::new(0.3, -0.5, 0.4).normalize()] {
-            let cloud = [SurfacePoint { position: nalgebra::Point3::new(0.1, 0.1, 0.1), normal }];
+            let cloud = [SurfacePoint { position: Point3::new(0.1, 0.1, 0.1), normal }];
             let pose = sample_pose(&cloud, &mut rng);
             assert!((pose.rotation * Vector3::z() + normal).norm() < 1e-9);
             let offset = pose.translation.vector - cloud[0].position.coords;

@@ -5,6 +5,7 @@
 
 pub mod benchmark;
 pub mod camera;
+pub mod candidates;
 pub mod export;
 pub mod label;
 pub mod mesh;

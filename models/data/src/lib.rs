@@ -6,8 +6,9 @@
 //! - **processed** ([`processed`]): VGN's and GIGA's volumes and grasps in voxels, a file a scene;
 //! - **packed** ([`packed`]): the same in few large files that are mapped into memory and may still be growing.
 //!
-//! A [`Dataset`] reads the last two for training.
+//! A [`Dataset`] reads the last two for training. [`Candidates`] are what the classifier of GPD learns from.
 
+mod candidates;
 mod dataset;
 mod error;
 pub mod packed;
@@ -17,6 +18,7 @@ mod setup;
 mod table;
 mod trial;
 
+pub use candidates::Candidates;
 pub use dataset::{Dataset, Form};
 pub use error::DataError;
 pub use setup::{Provenance, Setup};

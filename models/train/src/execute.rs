@@ -29,10 +29,12 @@ const OPERATORS: &[(&str, &[&str])] = &[
     ("Div", &[]),
     ("Erf", &[]),
     ("Expand", &[]),
+    ("Flatten", &["axis"]),
     ("InstanceNormalization", &["epsilon"]),
     ("LayerNormalization", &["axis", "epsilon"]),
     ("LeakyRelu", &["alpha"]),
     ("MatMul", &[]),
+    ("MaxPool", &["ceil_mode", "dilations", "kernel_shape", "pads", "strides"]),
     ("Mul", &[]),
     ("ReduceL2", &["axes", "keepdims", "noop_with_empty_axes"]),
     ("Relu", &[]),
@@ -212,7 +214,15 @@ impl Executor {
     /// # Errors
     /// [`ExecuteError`] names the node at which it failed.
     pub fn forward(&self, volumes: &Tensor) -> Result<Outputs, ExecuteError> {
-        self.execute(volumes, None)
+        self.maps(volumes, None)
+    }
+
+    /// Runs any graph with one input, and returns one of its outputs in f32.
+    ///
+    /// # Errors
+    /// [`ExecuteError`] names the node at which it failed, or the output that there is not.
+    pub fn output(&self, input: &Tensor, name: &'static str) -> Result<Tensor, ExecuteError> {
+        take(&mut self.execute(input, None)?, name)
     }
 
     /// Runs the network as far as some voxels need it, which are given as flat indices into `[batch, N, N, N]`.
@@ -221,7 +231,7 @@ impl Executor {
     /// [`ExecuteError`] names the node at which it failed.
     pub fn forward_at(&self, volumes: &Tensor, cells: &[i64]) -> Result<Outputs, ExecuteError> {
         if !self.heads.is_empty() {
-            return self.execute(volumes, Some(cells));
+            return self.maps(volumes, Some(cells));
         }
         let Outputs { quality, rotation, width } = self.forward(volumes)?;
         let at = |map: &Tensor, channels: i64| {
@@ -232,12 +242,18 @@ impl Executor {
         Ok(Outputs { quality: at(&quality, 1)?, rotation: at(&rotation, 4)?, width: at(&width, 1)? })
     }
 
-    /// The nodes in order; the heads at `cells` alone, if any are given.
-    fn execute(&self, volumes: &Tensor, cells: Option<&[i64]>) -> Result<Outputs, ExecuteError> {
+    fn maps(&self, volumes: &Tensor, cells: Option<&[i64]>) -> Result<Outputs, ExecuteError> {
+        let mut values = self.execute(volumes, cells)?;
+        let [quality, rotation, width] = ["quality", "rotation", "width"].map(|name| take(&mut values, name));
+        Ok(Outputs { quality: quality?, rotation: rotation?, width: width? })
+    }
+
+    /// The value of every node, computed in order; the heads at `cells` alone, if any are given.
+    fn execute(&self, input: &Tensor, cells: Option<&[i64]>) -> Result<HashMap<String, Tensor>, ExecuteError> {
         let graph = self.model.graph.as_ref().ok_or(ExecuteError::NoGraph)?;
         let mut values: HashMap<String, Tensor> = HashMap::with_capacity(graph.node.len());
-        if let Some(input) = graph.input.first() {
-            values.insert(input.name().to_owned(), volumes.shallow_clone());
+        if let Some(declared) = graph.input.first() {
+            values.insert(declared.name().to_owned(), input.shallow_clone());
         }
         for (name, tensor) in self.constants.iter().chain(self.parameters.iter().map(|(name, weight)| (name, weight))) {
             values.insert(name.clone(), tensor.shallow_clone());
@@ -263,12 +279,13 @@ impl Executor {
             };
             values.extend(node.output.iter().cloned().zip(outputs));
         }
-        let mut output = |name| match values.remove(name) {
-            Some(value) => Ok(value.to_kind(Kind::Float)),
-            None => Err(ExecuteError::Output(name)),
-        };
-        Ok(Outputs { quality: output("quality")?, rotation: output("rotation")?, width: output("width")? })
+        Ok(values)
     }
+}
+
+/// An output among the values, in f32.
+fn take(values: &mut HashMap<String, Tensor>, name: &'static str) -> Result<Tensor, ExecuteError> {
+    values.remove(name).map(|value| value.to_kind(Kind::Float)).ok_or(ExecuteError::Output(name))
 }
 
 impl Execution {
@@ -349,6 +366,12 @@ impl Step<'_> {
             "Div" => one(self.input(0)?.f_div(self.input(1)?)),
             "Erf" => one(self.input(0)?.f_erf()),
             "Expand" => one(self.input(0)?.f_broadcast_to(self.whole(1)?)),
+            "Flatten" => {
+                let x = self.input(0)?;
+                let size = x.size();
+                let axis = self.axis("axis", 1, size.len())?;
+                one(x.f_reshape([size[..axis].iter().product(), -1]))
+            }
             "InstanceNormalization" => {
                 let [x, scale, bias] = [self.input(0)?, self.input(1)?, self.input(2)?];
                 let epsilon = self.float("epsilon", 1e-5);
@@ -370,6 +393,7 @@ impl Step<'_> {
                 }
             }
             "MatMul" => one(self.reduced(0)?.f_matmul(&self.reduced(1)?)),
+            "MaxPool" => self.max_pool(),
             "Mul" => one(self.input(0)?.f_mul(self.input(1)?)),
             "ReduceL2" => {
                 // A setting until opset 17, an input since.
@@ -423,6 +447,23 @@ impl Step<'_> {
             &zeros,
             self.int("group", 1),
         );
+        Ok(vec![y.map_err(|source| self.torch(source))?])
+    }
+
+    /// The maximum over windows of images.
+    fn max_pool(&self) -> Result<Vec<Tensor>, ExecuteError> {
+        let x = self.input(0)?;
+        let kernel = self.ints("kernel_shape", &[]);
+        if x.dim() != 4 || kernel.len() != 2 {
+            return Err(self.setting(format!("a window of {kernel:?} over {:?}", x.size())));
+        }
+        let pads = self.ints("pads", &[0; 4]);
+        let (begin, end) = pads.split_at(2);
+        if begin != end {
+            return Err(self.setting(format!("a padding of {begin:?} before and {end:?} after")));
+        }
+        let (strides, dilations) = (self.ints("strides", &[1; 2]), self.ints("dilations", &[1; 2]));
+        let y = x.f_max_pool2d(kernel, strides, begin, dilations, self.int("ceil_mode", 0) != 0);
         Ok(vec![y.map_err(|source| self.torch(source))?])
     }
 

@@ -2,12 +2,15 @@
 //!
 //! A [`Trainer`] takes scenes out of a [`Dataset`](grasp_data::Dataset), [changes](Augmentation) them, and runs them through an
 //! [`Executor`]: the ONNX graph that is served, in libtorch and under autograd. [`Targets::loss`] is what [`Adam`]
-//! minimises; a [`Checkpoint`] is where a run stands.
+//! minimises; a [`Checkpoint`] is where a run stands. A [`Learner`] trains the classifier of grasp candidates on
+//! [`Examples`].
 
 mod adam;
 mod augment;
 mod checkpoint;
+mod classifier;
 pub mod curves;
+mod examples;
 mod execute;
 mod heads;
 mod loss;
@@ -16,6 +19,8 @@ mod trainer;
 pub use adam::Adam;
 pub use augment::{Augmentation, Transform};
 pub use checkpoint::{Checkpoint, CheckpointError};
+pub use classifier::{ClassifierSettings, Learner, Tally};
+pub use examples::Examples;
 pub use execute::{ExecuteError, Execution, Executor, Outputs};
 pub use loss::{Loss, LossError, Sums, Targets};
 pub use trainer::{Epoch, Record, Settings, TrainError, Trainer, Validation};

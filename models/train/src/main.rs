@@ -1,11 +1,12 @@
 //! Trains grasp networks, or writes one with random weights.
 
+mod classify;
 mod run;
 
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use grasp_models::build;
+use grasp_models::{build, gpd};
 
 /// Trains the networks of graspd in libtorch by executing the very ONNX graph that is served.
 #[derive(Parser)]
@@ -19,7 +20,7 @@ struct Cli {
 enum Command {
     /// Writes a network with random weights.
     Init {
-        /// vgn, transformer or transformer-small.
+        /// vgn, transformer, transformer-small, or gpd, the classifier of grasp candidates.
         #[arg(long)]
         network: String,
         /// Decides the weights.
@@ -31,6 +32,8 @@ enum Command {
     },
     /// Trains a network on folders of scenes and grasps.
     Train(Box<Training>),
+    /// Trains GPD's classifier on tried candidates.
+    Classify(classify::Classify),
 }
 
 /// How a network is trained. Where VGN's training and the paper's differ, the default follows the network.
@@ -127,7 +130,9 @@ enum Change {
 
 fn main() -> anyhow::Result<()> {
     match Cli::parse().command {
+        Command::Init { network, seed, out } if network == "gpd" => Ok(gpd::gpd(seed).write(&out)?),
         Command::Init { network, seed, out } => Ok(build(&network, seed)?.write(&out)?),
         Command::Train(training) => run::train(&training),
+        Command::Classify(command) => command.run(),
     }
 }

@@ -2,11 +2,12 @@
 
 use std::path::Path;
 
-use grasp::{Maps, Volume};
+use grasp::gpd::{CHANNELS, Candidate, Cloud, IMAGE_SIZE, Image};
+use grasp::{Maps, SurfacePoint, Volume};
 use grasp_models::onnx::ModelProto;
-use grasp_models::{Architecture, Network, Options};
+use grasp_models::{Architecture, Classifier, Network, Options, gpd};
 use grasp_train::{Execution, Executor};
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Point3, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tch::{Device, Tensor, no_grad};
@@ -52,6 +53,37 @@ fn every_network_agrees_with_onnx_runtime() {
             println!("{architecture}, channels last {channels_last}: |libtorch − ONNX Runtime| ≤ {worst:.1e}");
             assert!(worst <= 1e-4, "{architecture} differs by {worst}");
         }
+    }
+}
+
+#[test]
+fn the_classifier_agrees_with_onnx_runtime() {
+    assert!(std::env::var_os("ORT_DYLIB_PATH").is_some(), "ORT_DYLIB_PATH is not set: run the tests by `make test`");
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("gpd.onnx");
+    gpd::gpd(1).write(&path).unwrap();
+    let mut rng = ChaCha8Rng::seed_from_u64(0);
+    let mut image = || {
+        let mut within = |range: std::ops::Range<f64>| rng.random_range(range);
+        let mut point = || SurfacePoint {
+            position: Point3::new(within(-0.02..0.02), within(-0.05..0.05), within(0.0..0.06)),
+            normal: Vector3::x(),
+        };
+        let cloud = Cloud::new((0..300).map(|_| point()).collect::<Vec<_>>());
+        Image::of(&cloud, &Candidate { pose: Isometry3::identity(), width: 0.05, point: Point3::origin() })
+    };
+    let images: Vec<Image> = (0..3).map(|_| image()).collect();
+    let pixels: Vec<f32> = images.iter().flat_map(Image::pixels).map(|&value| f32::from(value) / 255.0).collect();
+
+    let execution = Execution { device: Device::Cpu, bf16: false, channels_last: false };
+    let executor = Executor::new(ModelProto::read(&path).unwrap(), execution).unwrap();
+    let input = Tensor::from_slice(&pixels).reshape([3, CHANNELS as i64, IMAGE_SIZE as i64, IMAGE_SIZE as i64]);
+    let torch = no_grad(|| executor.output(&input, gpd::OUTPUT)).unwrap();
+    let torch = Vec::<f32>::try_from(torch.select(1, 1) - torch.select(1, 0)).unwrap();
+    let onnx = Classifier::load(&path, &Options::default()).unwrap().score(&images).unwrap();
+    assert_ne!(onnx[0], onnx[1], "the images differ");
+    for (torch, onnx) in torch.iter().zip(onnx) {
+        assert!((torch - onnx).abs() <= 1e-4, "{torch} and {onnx}");
     }
 }
 

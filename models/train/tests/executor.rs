@@ -1,7 +1,7 @@
 //! What the executor understands of ONNX, beyond what the networks here use, and what it refuses.
 
-use grasp_models::Architecture;
 use grasp_models::onnx::{AttributeProto, GraphProto, ModelProto, NodeProto, OperatorSetIdProto, TensorProto};
+use grasp_models::{Architecture, gpd};
 use grasp_train::{Adam, ExecuteError, Execution, Executor, Outputs};
 use tch::{Device, Kind, Tensor, no_grad};
 
@@ -299,4 +299,29 @@ fn what_is_not_understood_is_refused_by_name() {
         graph.node.pop();
     });
     assert!(error.contains("`rotation`"), "{error}");
+}
+
+#[test]
+fn windows_are_those_of_onnx_or_refused() {
+    let pooled = |attributes: Vec<AttributeProto>| {
+        let mut model = gpd::gpd(0);
+        let nodes = &mut model.graph.as_mut().unwrap().node;
+        nodes.truncate(nodes.iter().position(|node| node.op_type() == "MaxPool").unwrap());
+        let input = model.graph.as_ref().unwrap().input[0].name().to_owned();
+        let pool = node("MaxPool", &[&input], "pooled", attributes);
+        model.graph.as_mut().unwrap().node = vec![pool];
+        let image = Tensor::arange(9, (Kind::Float, Device::Cpu)).view([1, 1, 3, 3]);
+        let pooled = Executor::new(model, EXECUTION)?.output(&image, "pooled")?;
+        Ok::<_, ExecuteError>(Vec::<f32>::try_from(pooled.flatten(0, -1)).unwrap())
+    };
+    let kernel = || AttributeProto::ints("kernel_shape", &[2, 2]);
+    let strides = || AttributeProto::ints("strides", &[2, 2]);
+    assert_eq!(pooled(vec![kernel()]).unwrap(), [4.0, 5.0, 7.0, 8.0]);
+    assert_eq!(pooled(vec![kernel(), strides()]).unwrap(), [4.0]);
+    assert_eq!(pooled(vec![kernel(), strides(), AttributeProto::int("ceil_mode", 1)]).unwrap(), [4.0, 5.0, 7.0, 8.0]);
+    assert_eq!(pooled(vec![kernel(), strides(), AttributeProto::ints("pads", &[1; 4])]).unwrap(), [0.0, 2.0, 6.0, 8.0]);
+    let error = pooled(vec![kernel(), AttributeProto::ints("pads", &[0, 0, 1, 1])]).unwrap_err().to_string();
+    assert!(error.contains("`pooled` (MaxPool): a padding of [0, 0] before and [1, 1] after"), "{error}");
+    let error = pooled(vec![AttributeProto::ints("kernel_shape", &[2; 3])]).unwrap_err().to_string();
+    assert!(error.contains("a window of [2, 2, 2]"), "{error}");
 }

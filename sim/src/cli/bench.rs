@@ -10,7 +10,9 @@ use super::SceneArgs;
 /// The scenes depend on the seed alone, so every planner meets the same ones. Prints one JSON object a planner.
 #[derive(Args)]
 pub struct Bench {
-    /// The planners: `random`, an .onnx file, or `grpc:ADDRESS`, a running graspd.
+    /// The planners: `random`; an .onnx network; `grpc:ADDRESS`, a running graspd; `shaf`, the highest place where the
+    /// hand fits; `shaf:FILE`, the highest of a network's proposals above 0.5; `gpd:FILE`, places where the hand fits,
+    /// scored by a classifier of `grasp-train classify`.
     #[arg(long = "planner", required = true)]
     planners: Vec<String>,
 

@@ -1,0 +1,246 @@
+use std::f64::consts::{FRAC_PI_2, PI};
+
+use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use rand::Rng;
+use rand::seq::index;
+
+use super::{Cloud, Hand};
+use crate::SurfacePoint;
+
+/// How candidates are looked for; the defaults are those of GPD's code.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Params {
+    /// The hand that must fit.
+    pub hand: Hand,
+    /// Points of the cloud at which hands are fitted.
+    pub samples: usize,
+    /// Radius around a sample within which normals make its local frame, metres.
+    pub frame_radius: f64,
+    /// Rotations about the curvature axis, evenly over half a turn.
+    pub rotations: usize,
+    /// Placements across the closing axis, evenly over the opening.
+    pub placements: usize,
+    /// How far the fingertips reach past the sample at first, metres (GPD: `init_bite`).
+    pub bite: f64,
+    /// Step by which the hand is pushed further, metres.
+    pub deepening: f64,
+    /// No corner of the hand may be lower than this, metres above z = 0 of the cloud's frame: the table, which is not
+    /// in the cloud.
+    pub lowest: f64,
+}
+
+impl Params {
+    /// GPD's, for a hand that may not go below `lowest`.
+    #[must_use]
+    pub fn above(lowest: f64) -> Self {
+        Self {
+            hand: Hand::default(),
+            samples: 500,
+            frame_radius: 0.01,
+            rotations: 8,
+            placements: 10,
+            bite: 0.01,
+            deepening: 0.005,
+            lowest,
+        }
+    }
+}
+
+/// A place where the hand fits around a part of the cloud.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Candidate {
+    /// `T_task_grasp`: z the approach, ±y the closing axis, origin at the finger base.
+    pub pose: Isometry3<f64>,
+    /// Extent along the closing axis of what was seen between the fingers, metres.
+    pub width: f64,
+    /// The sample it was fitted at.
+    pub point: Point3<f64>,
+}
+
+/// Fits the hand at random points of the cloud: at each, at every rotation, in the middle one of the placements that
+/// are free, pushed as far as it goes. The same cloud and state of `rng` give the same candidates.
+#[must_use]
+pub fn candidates(cloud: &Cloud, params: &Params, rng: &mut impl Rng) -> Vec<Candidate> {
+    let points = cloud.points();
+    let samples = index::sample(rng, points.len(), params.samples.min(points.len()));
+    samples.iter().flat_map(|sample| fit_at(cloud, params, &points[sample])).collect()
+}
+
+/// The candidates at one sample.
+fn fit_at(cloud: &Cloud, params: &Params, sample: &SurfacePoint) -> Vec<Candidate> {
+    let Params { hand, rotations, .. } = params;
+    let (normal, axis) = local_frame(cloud, params, sample);
+    // Whatever the fingers can meet, however the hand is turned and placed.
+    let near: Vec<Point3<f64>> =
+        cloud.within(sample.position, hand.outer_diameter + hand.depth).map(|point| point.position).collect();
+    let rotation = |turn: usize| {
+        let angle = turn as f64 / *rotations as f64 * PI - FRAC_PI_2;
+        let approach = Rotation3::from_axis_angle(&nalgebra::Unit::new_unchecked(axis), angle) * -normal;
+        let axes = Matrix3::from_columns(&[axis, approach.cross(&axis), approach]);
+        UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes))
+    };
+    (0..*rotations).filter_map(|turn| fit(cloud, params, &near, &sample.position, rotation(turn))).collect()
+}
+
+/// The normal and the axis of least curvature around a sample: normals vary least along the latter.
+fn local_frame(cloud: &Cloud, params: &Params, sample: &SurfacePoint) -> (Vector3<f64>, Vector3<f64>) {
+    let normals = cloud.within(sample.position, params.frame_radius).map(|point| point.normal);
+    let eigen = normals.map(|normal| normal * normal.transpose()).sum::<Matrix3<f64>>().symmetric_eigen();
+    let column = |index: usize| -> Vector3<f64> { eigen.eigenvectors.column(index).into() };
+    let normal = column(eigen.eigenvalues.imax());
+    let normal = if normal.dot(&sample.normal) < 0.0 { -normal } else { normal };
+    // On a plane every direction across is as good, so it must be one across.
+    let axis = column(eigen.eigenvalues.imin());
+    (normal, (axis - normal * axis.dot(&normal)).normalize())
+}
+
+/// The hand at one rotation, if it fits at all.
+fn fit(
+    cloud: &Cloud,
+    params: &Params,
+    near: &[Point3<f64>],
+    sample: &Point3<f64>,
+    rotation: UnitQuaternion<f64>,
+) -> Option<Candidate> {
+    let Params { hand, placements, .. } = params;
+    let pose = |offset: f64, bite: f64| {
+        let origin = sample + rotation * Vector3::new(0.0, offset, bite - hand.depth);
+        Isometry3::from_parts(Translation3::from(origin), rotation)
+    };
+    // Only what is as high as the fingers are broad can come between them or in their way.
+    let to_sample = rotation.inverse();
+    let slice: Vec<Point3<f64>> = near
+        .iter()
+        .map(|point| Point3::from(to_sample * (point - sample)))
+        .filter(|point| point.x.abs() <= hand.height / 2.0)
+        .collect();
+    let in_hand = |offset: f64, bite: f64| {
+        slice.iter().map(move |point| Point3::new(point.x, point.y - offset, point.z + hand.depth - bite))
+    };
+    let is_free = |offset: f64, bite: f64| {
+        in_hand(offset, bite).all(|point| !hand.finger_meets(&point) && !hand.palm_meets(&point))
+            && hand.lowest_point(&pose(offset, bite)) >= params.lowest
+    };
+
+    let offset = |placement: usize| {
+        let share = (placement as f64 + 0.5) / *placements as f64;
+        (2.0 * share - 1.0) * hand.half_opening()
+    };
+    let free: Vec<f64> = (0..*placements).map(offset).filter(|&offset| is_free(offset, params.bite)).collect();
+    let offset = *free.get(free.len() / 2)?;
+    let bites = (0..).map(|step| params.bite + f64::from(step) * params.deepening);
+    let bite = bites
+        .take_while(|&bite| bite <= hand.depth + 1e-9 && is_free(offset, bite))
+        .last()
+        .filter(|&bite| palm_is_free(cloud, hand, &pose(offset, bite)))?;
+
+    let held = in_hand(offset, bite).filter(|point| hand.holds(point)).map(|point| point.y);
+    let (lower, upper) = held.fold((f64::MAX, f64::MIN), |(lower, upper), y| (lower.min(y), upper.max(y)));
+    let width = upper - lower;
+    hand.aperture.contains(&width).then(|| Candidate { pose: pose(offset, bite), width, point: *sample })
+}
+
+/// The palm is broader than the fingers: other things can be in its way than in theirs.
+fn palm_is_free(cloud: &Cloud, hand: &Hand, pose: &Isometry3<f64>) -> bool {
+    cloud.points().iter().all(|point| !hand.palm_meets(&pose.inverse_transform_point(&point.position)))
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    const TABLE: f64 = 0.05;
+
+    /// A box of 40 × 120 × 80 mm that stands on the table, all but its bottom seen, a point a millimetre.
+    fn standing_box() -> Vec<SurfacePoint> {
+        let (lower, upper) = (Point3::new(0.13, 0.09, TABLE), Point3::new(0.17, 0.21, TABLE + 0.08));
+        let mut points = Vec::new();
+        for axis in 0..3 {
+            let [u, v] = [(axis + 1) % 3, (axis + 2) % 3];
+            for (bound, side) in [(lower, -1.0), (upper, 1.0)] {
+                let mut normal = Vector3::zeros();
+                normal[axis] = side;
+                if axis == 2 && side < 0.0 {
+                    continue;
+                }
+                let steps = |axis: usize| ((upper[axis] - lower[axis]) / 1e-3).round() as usize;
+                for (i, j) in (0..=steps(u)).flat_map(|i| (0..=steps(v)).map(move |j| (i, j))) {
+                    let mut position = bound;
+                    position[u] = lower[u] + i as f64 * 1e-3;
+                    position[v] = lower[v] + j as f64 * 1e-3;
+                    points.push(SurfacePoint { position, normal });
+                }
+            }
+        }
+        points
+    }
+
+    fn of(points: Vec<SurfacePoint>, seed: u64) -> (Cloud, Vec<Candidate>) {
+        let cloud = Cloud::new(points);
+        let found = candidates(&cloud, &Params::above(TABLE), &mut ChaCha8Rng::seed_from_u64(seed));
+        (cloud, found)
+    }
+
+    #[test]
+    fn a_box_is_closed_on_across_its_narrow_side() {
+        let (_, found) = of(standing_box(), 1);
+        assert!(found.len() > 50, "{} candidates", found.len());
+        let across = |c: &&Candidate| (c.pose.rotation * Vector3::y()).x.abs() > 0.9;
+        let count = found.iter().filter(across).count();
+        assert!(count > found.len() / 3, "{count} of {} close along x, the side of 40 mm", found.len());
+        assert!(found.iter().filter(across).any(|c| (c.width - 0.04).abs() < 0.004), "the width is the box's");
+        let along = found.iter().filter(|c| (c.pose.rotation * Vector3::y()).y.abs() > 0.98);
+        // 120 mm do not fit into the hand; only a corner could come between its fingers.
+        assert!(along.clone().all(|c| c.width < 0.07));
+        assert!(found.iter().any(|c| (c.pose.rotation * Vector3::z()).z < -0.95), "one comes from above");
+    }
+
+    #[test]
+    fn no_candidate_goes_through_the_table_or_the_object() {
+        let (cloud, found) = of(standing_box(), 2);
+        let hand = Hand::default();
+        for candidate in &found {
+            assert!(hand.lowest_point(&candidate.pose) >= TABLE);
+            let mut points = cloud.points().iter().map(|p| candidate.pose.inverse_transform_point(&p.position));
+            assert!(points.clone().all(|point| !hand.finger_meets(&point) && !hand.palm_meets(&point)));
+            assert!(points.any(|point| hand.holds(&point)), "something is between the fingers");
+            assert!(hand.aperture.contains(&candidate.width));
+        }
+        let params = Params::above(TABLE + 0.06);
+        let high = candidates(&cloud, &params, &mut ChaCha8Rng::seed_from_u64(2));
+        assert!(!high.is_empty() && high.len() < found.len(), "a higher table leaves fewer");
+        assert!(high.iter().all(|candidate| hand.lowest_point(&candidate.pose) >= TABLE + 0.06));
+    }
+
+    #[test]
+    fn the_fingertips_pass_the_sample_by_the_bite_at_least() {
+        let (_, found) = of(standing_box(), 3);
+        let params = Params::above(TABLE);
+        for candidate in &found {
+            let bite = params.hand.depth - candidate.pose.inverse_transform_point(&candidate.point).z;
+            let steps = (bite - params.bite) / params.deepening;
+            assert!((steps - steps.round()).abs() < 1e-6 && (-1e-6..8.0 + 1e-6).contains(&steps), "a bite of {bite}");
+        }
+        assert!(found.iter().any(|c| c.pose.inverse_transform_point(&c.point).z < 0.02), "some are deep");
+    }
+
+    #[test]
+    fn the_same_seed_gives_the_same_candidates() {
+        assert_eq!(of(standing_box(), 4).1, of(standing_box(), 4).1);
+        assert_ne!(of(standing_box(), 4).1, of(standing_box(), 5).1);
+    }
+
+    #[test]
+    fn a_wide_plane_and_an_empty_cloud_give_none() {
+        let at = |i: i32, j: i32| Point3::new(f64::from(i) * 2e-3, f64::from(j) * 2e-3, 0.1);
+        let plane = (0..150).flat_map(|i| (0..150).map(move |j| at(i, j)));
+        let plane = plane.map(|position| SurfacePoint { position, normal: Vector3::z() }).collect();
+        let (_, found) = of(plane, 6);
+        let inner = |c: &&Candidate| (0.08..0.22).contains(&c.point.x) && (0.08..0.22).contains(&c.point.y);
+        assert_eq!(found.iter().filter(inner).count(), 0, "nothing to close on away from its borders");
+        assert!(of(vec![], 6).1.is_empty());
+    }
+}

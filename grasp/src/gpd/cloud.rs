@@ -1,0 +1,144 @@
+use std::collections::{BTreeMap, HashMap};
+
+use nalgebra::{Matrix3, Point3, Vector3};
+
+use crate::SurfacePoint;
+
+/// Edge of the voxels that a cloud is thinned to, metres (GPD's code: `voxel_size`).
+pub const VOXEL_SIZE: f64 = 0.003;
+
+/// Radius of the neighbourhood that a normal is taken from, metres (GPD's code: `normals_radius`).
+pub const NORMALS_RADIUS: f64 = 0.03;
+
+/// A point cloud with one point a voxel of [`VOXEL_SIZE`], and normals that look at the camera. Task frame, metres.
+#[derive(Clone, Debug)]
+pub struct Cloud {
+    points: Vec<SurfacePoint>,
+    /// Indices into `points`, by the cell of [`CELL`] they lie in.
+    cells: HashMap<[i64; 3], Vec<usize>>,
+}
+
+/// Edge of the cells that neighbours are looked up in: a normal's neighbourhood touches 27 of them.
+const CELL: f64 = NORMALS_RADIUS;
+
+impl Cloud {
+    /// Thins `points` to the means of their voxels, and takes each normal from the plane through the neighbourhood.
+    ///
+    /// The normals of `points` need only point to the side that was seen, such as [towards the
+    /// camera](crate::DepthImage::points). The order of the points does not matter, but for rounding.
+    pub fn new(points: impl IntoIterator<Item = SurfacePoint>) -> Self {
+        // In the order of the voxels, so that the same points give the same cloud.
+        let mut voxels: BTreeMap<[i64; 3], (Vector3<f64>, Vector3<f64>, f64)> = BTreeMap::new();
+        for SurfacePoint { position, normal } in points {
+            let (sum, side, count) = voxels.entry(cell_of(&position, VOXEL_SIZE)).or_default();
+            *sum += position.coords;
+            *side += normal;
+            *count += 1.0;
+        }
+        let seen: Vec<SurfacePoint> = voxels
+            .into_values()
+            .map(|(sum, side, count)| SurfacePoint {
+                position: Point3::from(sum / count),
+                normal: side.try_normalize(1e-12).unwrap_or(Vector3::z()),
+            })
+            .collect();
+        let mut cells: HashMap<[i64; 3], Vec<usize>> = HashMap::new();
+        for (index, point) in seen.iter().enumerate() {
+            cells.entry(cell_of(&point.position, CELL)).or_default().push(index);
+        }
+        let mut cloud = Self { points: seen, cells };
+        let normals: Vec<Vector3<f64>> = cloud.points.iter().map(|point| cloud.normal_at(point)).collect();
+        for (point, normal) in cloud.points.iter_mut().zip(normals) {
+            point.normal = normal;
+        }
+        cloud
+    }
+
+    /// The points, by voxel.
+    #[must_use]
+    pub fn points(&self) -> &[SurfacePoint] {
+        &self.points
+    }
+
+    /// The points within `radius` of `centre`.
+    pub fn within(&self, centre: Point3<f64>, radius: f64) -> impl Iterator<Item = &SurfacePoint> {
+        let lower = cell_of(&(centre - Vector3::repeat(radius)), CELL);
+        let upper = cell_of(&(centre + Vector3::repeat(radius)), CELL);
+        let cells = (lower[0]..=upper[0])
+            .flat_map(move |x| (lower[1]..=upper[1]).flat_map(move |y| (lower[2]..=upper[2]).map(move |z| [x, y, z])));
+        cells
+            .filter_map(|cell| self.cells.get(&cell))
+            .flatten()
+            .map(|&index| &self.points[index])
+            .filter(move |point| (point.position - centre).norm_squared() <= radius * radius)
+    }
+
+    /// The direction in which the neighbourhood varies least, on the side that was seen.
+    fn normal_at(&self, point: &SurfacePoint) -> Vector3<f64> {
+        let (mut sum, mut squares, mut count) = (Vector3::zeros(), Matrix3::zeros(), 0.0);
+        for neighbour in self.within(point.position, NORMALS_RADIUS) {
+            let offset = neighbour.position - point.position;
+            sum += offset;
+            squares += offset * offset.transpose();
+            count += 1.0;
+        }
+        if count < 3.0 {
+            return point.normal;
+        }
+        let eigen = (squares - sum * sum.transpose() / count).symmetric_eigen();
+        let normal: Vector3<f64> = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into();
+        if normal.dot(&point.normal) < 0.0 { -normal } else { normal }
+    }
+}
+
+fn cell_of(point: &Point3<f64>, edge: f64) -> [i64; 3] {
+    [point.x, point.y, point.z].map(|coordinate| (coordinate / edge).floor() as i64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A plane through the origin, sampled every millimetre, seen from above.
+    fn plane(slope: f64) -> Vec<SurfacePoint> {
+        let at = |i: i32, j: i32| Point3::new(f64::from(i) * 1e-3, f64::from(j) * 1e-3, slope * f64::from(i) * 1e-3);
+        let points = (-60..60).flat_map(|i| (-60..60).map(move |j| at(i, j)));
+        points.map(|position| SurfacePoint { position, normal: Vector3::new(0.3, 0.0, 1.0) }).collect()
+    }
+
+    #[test]
+    fn a_plane_has_its_normal_on_the_side_that_was_seen() {
+        for slope in [0.0, 0.5] {
+            let cloud = Cloud::new(plane(slope));
+            let expected = Vector3::new(-slope, 0.0, 1.0).normalize();
+            let inner = cloud.points().iter().filter(|point| point.position.coords.norm() < 0.02);
+            // The mean of a voxel lies on the plane, but its neighbourhood is not quite even.
+            assert!(inner.clone().count() > 100 && inner.clone().all(|point| point.normal.dot(&expected) > 0.999));
+        }
+        let below = plane(0.0).into_iter().map(|point| SurfacePoint { normal: -point.normal, ..point });
+        assert!(Cloud::new(below).points().iter().all(|point| point.normal.z < -0.999));
+    }
+
+    #[test]
+    fn a_voxel_holds_one_point() {
+        let cloud = Cloud::new(plane(0.0));
+        assert_eq!(cloud.points().len(), 40 * 40);
+    }
+
+    #[test]
+    fn neighbours_are_those_within_the_radius() {
+        let cloud = Cloud::new(plane(0.2));
+        for (centre, radius) in [(Point3::origin(), 0.01), (Point3::new(0.02, -0.03, 0.0), 0.07)] {
+            let near = |point: &&SurfacePoint| (point.position - centre).norm() <= radius;
+            let expected = cloud.points().iter().filter(near).count();
+            assert_eq!(cloud.within(centre, radius).count(), expected);
+        }
+    }
+
+    #[test]
+    fn one_point_alone_keeps_its_direction() {
+        let point = SurfacePoint { position: Point3::new(0.1, 0.1, 0.1), normal: Vector3::y() };
+        assert_eq!(Cloud::new([point]).points(), [point]);
+        assert!(Cloud::new([]).points().is_empty());
+    }
+}

@@ -1,0 +1,116 @@
+use std::ops::RangeInclusive;
+
+use nalgebra::{Isometry3, Point3, Vector3};
+
+use crate::FINGER_DEPTH;
+
+/// A parallel-jaw hand as candidates are fitted around: two finger boxes and a palm. Metres, in the grasp frame (z the
+/// approach, ±y the closing axis, origin at the finger base).
+#[derive(Clone, Debug, PartialEq)]
+pub struct Hand {
+    /// Thickness of a finger along the closing axis (GPD: `finger_width`).
+    pub finger_width: f64,
+    /// From the outside of one finger to the outside of the other, open (GPD: `hand_outer_diameter`).
+    pub outer_diameter: f64,
+    /// Length of the fingers (GPD: `hand_depth`).
+    pub depth: f64,
+    /// Breadth of the fingers along x, half of it to each side (GPD: `hand_height`).
+    pub height: f64,
+    /// Extents along the closing axis that are worth grasping.
+    pub aperture: RangeInclusive<f64>,
+    /// The palm's box, smallest and largest coordinates: GPD's hand has none, but one that approaches from the side
+    /// would rest it on the table.
+    pub palm: [[f64; 3]; 2],
+}
+
+impl Default for Hand {
+    /// The Panda hand with GPD's fingers, which open to [`MAX_OPENING`](crate::MAX_OPENING) too.
+    fn default() -> Self {
+        Self {
+            finger_width: 0.015,
+            outer_diameter: 0.11,
+            depth: FINGER_DEPTH,
+            height: 0.02,
+            aperture: 0.01..=0.07,
+            palm: [[-0.0316, -0.10, -0.088], [0.0316, 0.10, 0.004]],
+        }
+    }
+}
+
+impl Hand {
+    /// Half of the opening between the fingers.
+    #[must_use]
+    pub fn half_opening(&self) -> f64 {
+        self.outer_diameter / 2.0 - self.finger_width
+    }
+
+    /// Whether a point of the grasp frame is in the way of a finger that comes along the approach.
+    #[must_use]
+    pub fn finger_meets(&self, point: &Point3<f64>) -> bool {
+        point.x.abs() <= self.height / 2.0
+            && (self.half_opening()..=self.outer_diameter / 2.0).contains(&point.y.abs())
+            && point.z <= self.depth
+    }
+
+    /// Whether a point of the grasp frame is inside the palm.
+    #[must_use]
+    pub fn palm_meets(&self, point: &Point3<f64>) -> bool {
+        let [lower, upper] = self.palm;
+        (0..3).all(|axis| (lower[axis]..=upper[axis]).contains(&point[axis]))
+    }
+
+    /// Whether a point of the grasp frame is between the fingers.
+    #[must_use]
+    pub fn holds(&self, point: &Point3<f64>) -> bool {
+        point.x.abs() <= self.height / 2.0
+            && point.y.abs() <= self.half_opening()
+            && (0.0..=self.depth).contains(&point.z)
+    }
+
+    /// Height of the lowest corner of the open hand at `pose`.
+    #[must_use]
+    pub fn lowest_point(&self, pose: &Isometry3<f64>) -> f64 {
+        let (x, y) = (self.height / 2.0, self.outer_diameter / 2.0);
+        let fingers = [[-x, -y, 0.0], [x, y, self.depth]];
+        let down = pose.rotation.inverse() * Vector3::z();
+        let lowest = |[lower, upper]: [[f64; 3]; 2]| -> f64 {
+            (0..3).map(|axis| (down[axis] * lower[axis]).min(down[axis] * upper[axis])).sum()
+        };
+        pose.translation.z + lowest(fingers).min(lowest(self.palm))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::{FRAC_PI_2, PI};
+
+    use nalgebra::{Translation3, UnitQuaternion};
+
+    use super::*;
+
+    #[test]
+    fn the_parts_of_the_hand_are_where_they_should_be() {
+        let hand = Hand::default();
+        assert!((2.0 * hand.half_opening() - crate::MAX_OPENING).abs() < 1e-12);
+        let between = Point3::new(0.0, 0.0, 0.03);
+        assert!(hand.holds(&between) && !hand.finger_meets(&between) && !hand.palm_meets(&between));
+        for y in [-0.045, 0.045] {
+            assert!(hand.finger_meets(&Point3::new(0.005, y, 0.03)));
+            assert!(hand.finger_meets(&Point3::new(0.005, y, -0.1)), "on its way");
+            assert!(!hand.finger_meets(&Point3::new(0.02, y, 0.03)) && !hand.finger_meets(&Point3::new(0.0, y, 0.06)));
+        }
+        assert!(hand.palm_meets(&Point3::new(0.03, 0.09, -0.05)));
+    }
+
+    #[test]
+    fn its_lowest_point_is_a_fingertip_or_the_palm() {
+        let hand = Hand::default();
+        let at = |angle| {
+            let rotation = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), angle);
+            hand.lowest_point(&Isometry3::from_parts(Translation3::new(0.1, 0.1, 0.5), rotation))
+        };
+        assert!((at(PI) - 0.45).abs() < 1e-12, "straight down: the fingertips");
+        assert!((at(FRAC_PI_2) - 0.40).abs() < 1e-12, "from the side, closing up and down: the palm");
+        assert!((at(0.0) - (0.5 - 0.088)).abs() < 1e-12, "straight up: the palm's back");
+    }
+}

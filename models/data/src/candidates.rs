@@ -1,0 +1,170 @@
+//! Candidates of GPD that were tried, for its classifier: an `.npz` file of
+//!
+//! - `images`, u8 `[n, CHANNELS, IMAGE_SIZE, IMAGE_SIZE]`, 255 for 1;
+//! - `labels`, u8 `[n]`, 1 for a success;
+//! - `scenes`, u64 `[n]`, the number of each one's scene.
+
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::Path;
+
+use grasp::gpd::{CHANNELS, IMAGE_SIZE, Image};
+use npyz::npz::{NpzArchive, NpzWriter, file_name_from_array_name};
+use npyz::zip::DateTime;
+use npyz::zip::write::FileOptions;
+use npyz::{AutoSerialize, Deserialize, NpyFile, WriterBuilder};
+
+use crate::error::{At, DataError};
+
+/// Bytes of an image.
+const PIXELS: usize = CHANNELS * IMAGE_SIZE * IMAGE_SIZE;
+
+const EXPECTED: &str = "`images` u8 [n, 12, 60, 60], `labels` u8 [n] of 0 and 1, and `scenes` u64 [n], as `grasp-sim candidates` writes them";
+
+/// Candidates, all in memory.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Candidates {
+    /// What the hand would close on: an image of [`CHANNELS`] after the other.
+    pub images: Vec<u8>,
+    /// Whether each succeeded.
+    pub labels: Vec<bool>,
+    /// The number of each one's scene.
+    pub scenes: Vec<u64>,
+}
+
+impl Candidates {
+    /// Adds one of scene number `scene`.
+    pub fn push(&mut self, scene: u64, image: &Image, success: bool) {
+        self.images.extend_from_slice(image.pixels());
+        self.labels.push(success);
+        self.scenes.push(scene);
+    }
+
+    /// Adds all of `others`.
+    pub fn append(&mut self, mut others: Self) {
+        self.images.append(&mut others.images);
+        self.labels.append(&mut others.labels);
+        self.scenes.append(&mut others.scenes);
+    }
+
+    /// How many there are.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.labels.len()
+    }
+
+    /// Whether there are none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.labels.is_empty()
+    }
+
+    /// How many of them succeeded.
+    #[must_use]
+    pub fn successes(&self) -> usize {
+        self.labels.iter().filter(|&&label| label).count()
+    }
+
+    /// Writes them; the file appears when it is whole, and the same candidates are the same bytes.
+    ///
+    /// # Errors
+    /// [`DataError`] names the file.
+    pub fn write(&self, path: &Path) -> Result<(), DataError> {
+        let partial = path.with_extension("npz.partial");
+        self.write_arrays(&partial).at(&partial)?;
+        fs::rename(&partial, path).at(path)
+    }
+
+    fn write_arrays(&self, path: &Path) -> io::Result<()> {
+        let mut archive = NpzWriter::create(path)?;
+        let (count, edge) = (self.labels.len() as u64, IMAGE_SIZE as u64);
+        write_array(&mut archive, "images", &[count, CHANNELS as u64, edge, edge], self.images.iter().copied())?;
+        write_array(&mut archive, "labels", &[count], self.labels.iter().map(|&label| u8::from(label)))?;
+        write_array(&mut archive, "scenes", &[self.scenes.len() as u64], self.scenes.iter().copied())
+    }
+
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// [`DataError`] names the file, and what of it cannot be used.
+    pub fn read(path: &Path) -> Result<Self, DataError> {
+        let wrong = |reason| DataError::Scene { path: path.to_owned(), reason, expected: EXPECTED };
+        let mut archive = NpzArchive::open(path).at(path)?;
+        let (shape, images) = read_array::<u8>(&mut archive, "images").at(path)?;
+        let (_, labels) = read_array::<u8>(&mut archive, "labels").at(path)?;
+        let (_, scenes) = read_array::<u64>(&mut archive, "scenes").at(path)?;
+        let count = labels.len();
+        if shape[1..] != [CHANNELS as u64, IMAGE_SIZE as u64, IMAGE_SIZE as u64] || images.len() != count * PIXELS {
+            return Err(wrong(format!("`images` is {shape:?} and there are {count} labels")));
+        }
+        if scenes.len() != count || count == 0 {
+            return Err(wrong(format!("there are {count} labels and {} scenes", scenes.len())));
+        }
+        if let Some(label) = labels.iter().find(|&&label| label > 1) {
+            return Err(wrong(format!("a label is {label}")));
+        }
+        Ok(Self { images, labels: labels.into_iter().map(|label| label == 1).collect(), scenes })
+    }
+}
+
+fn write_array<T: AutoSerialize>(
+    archive: &mut NpzWriter<io::BufWriter<File>>,
+    name: &str,
+    shape: &[u64],
+    values: impl Iterator<Item = T>,
+) -> io::Result<()> {
+    // Without the time of day: the same candidates are the same bytes.
+    let options = FileOptions::default().last_modified_time(DateTime::default());
+    archive.zip_writer().start_file(file_name_from_array_name(name), options)?;
+    // Without a buffer every pixel would be a call to the compressor, which took about as long as the trials.
+    let mut file = io::BufWriter::with_capacity(1 << 16, archive.zip_writer());
+    let mut array = npyz::WriteOptions::new().default_dtype().shape(shape).writer(&mut file).begin_nd()?;
+    array.extend(values)?;
+    array.finish()?;
+    file.flush()
+}
+
+fn read_array<T: Deserialize>(
+    archive: &mut NpzArchive<io::BufReader<File>>,
+    name: &str,
+) -> io::Result<(Vec<u64>, Vec<T>)> {
+    let file = archive.zip_archive().by_name(&file_name_from_array_name(name));
+    let file = file.map_err(|error| io::Error::other(format!("`{name}`: {error}")))?;
+    // Without a buffer every pixel would be a call to the decompressor.
+    let array = NpyFile::new(io::BufReader::with_capacity(1 << 16, file))?;
+    Ok((array.shape().to_vec(), array.into_vec()?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn two() -> Candidates {
+        let images = (0..2 * PIXELS).map(|index| index as u8).collect();
+        Candidates { images, labels: vec![true, false], scenes: vec![7, 9] }
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("candidates.npz");
+        two().write(&path).unwrap();
+        assert_eq!(Candidates::read(&path).unwrap(), two());
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 1, "nothing partial is left");
+    }
+
+    #[test]
+    fn an_error_names_the_file_and_what_it_holds() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("candidates.npz");
+        let refused = |candidates: Candidates| {
+            candidates.write(&path).unwrap();
+            Candidates::read(&path).unwrap_err().to_string()
+        };
+        let text = refused(Candidates { scenes: vec![7], ..two() });
+        assert!(text.contains("candidates.npz: there are 2 labels and 1 scenes; it must hold"), "{text}");
+        assert!(refused(Candidates::default()).contains("0 labels"));
+        let missing = Candidates::read(&folder.path().join("no.npz")).unwrap_err().to_string();
+        assert!(missing.contains("no.npz"), "{missing}");
+    }
+}

@@ -1,0 +1,63 @@
+//! The classifier of grasp candidates: LeNet as in ten Pas et al., "Grasp Pose Detection in Point Clouds", IJRR 2017,
+//! and its authors' code.
+
+use std::collections::BTreeMap;
+
+use grasp::gpd::{CHANNELS, IMAGE_SIZE};
+
+use crate::graph::{Builder, Conv};
+use crate::metadata::{PREFIX, PROVENANCE};
+use crate::onnx::{AttributeProto, ModelProto, StringStringEntryProto};
+
+/// The classifier's input: f32 `[batch, CHANNELS, IMAGE_SIZE, IMAGE_SIZE]` in [0, 1].
+pub const INPUT: &str = "images";
+
+/// Its output: f32 `[batch, 2]`, the logits of a failure and of a success.
+pub const OUTPUT: &str = "scores";
+
+/// Units of the dense layer. GPD has 500, a file of 14 MB.
+const DENSE: usize = 64;
+
+/// Two convolutions of 20 and 50 channels with a kernel of 5, each halved by the maximum; a dense layer; two logits.
+#[must_use]
+pub fn gpd(seed: u64) -> ModelProto {
+    let mut builder = Builder::new("gpd", seed);
+    let b = &mut builder;
+    let mut x = b.input(INPUT, &[CHANNELS, IMAGE_SIZE, IMAGE_SIZE]);
+    let mut size = IMAGE_SIZE;
+    for (layer, [inputs, outputs]) in [[CHANNELS, 20], [20, 50]].into_iter().enumerate() {
+        x = b.conv_2d(&format!("conv.{layer}"), &x, Conv { inputs, outputs, kernel: 5, stride: 1, bias: true });
+        x = halve(b, &x);
+        x = b.node("Relu", &[&x], vec![]);
+        size = (size - 4) / 2;
+    }
+    x = b.node("Flatten", &[&x], vec![AttributeProto::int("axis", 1)]);
+    x = b.linear("dense.0", &x, 50 * size * size, DENSE, true);
+    x = b.node("Relu", &[&x], vec![]);
+    x = b.linear("dense.1", &x, DENSE, 2, true);
+    b.output(OUTPUT, &x, &[2]);
+    let mut model = builder.finish();
+    let provenance = [("architecture", "gpd".to_owned()), ("seed", seed.to_string())];
+    describe(&mut model, "gpd", "1", &provenance.map(|(key, value)| (key.to_owned(), value)).into());
+    model
+}
+
+/// The greatest of every 2 × 2 pixels.
+fn halve(b: &mut Builder, x: &str) -> String {
+    let attributes = vec![AttributeProto::ints("kernel_shape", &[2; 2]), AttributeProto::ints("strides", &[2; 2])];
+    b.node("MaxPool", &[x], attributes)
+}
+
+/// Replaces what the file says of itself: `graspd.name`, `graspd.version` and `graspd.provenance.…`.
+pub fn describe(model: &mut ModelProto, name: &str, version: &str, provenance: &BTreeMap<String, String>) {
+    model.metadata_props.retain(|property| !property.key().starts_with(PREFIX));
+    let mut put = |key: &str, value: &str| {
+        let key = Some(format!("{PREFIX}{key}"));
+        model.metadata_props.push(StringStringEntryProto { key, value: Some(value.to_owned()) });
+    };
+    put("name", name);
+    put("version", version);
+    for (key, value) in provenance {
+        put(&format!("{PROVENANCE}{key}"), value);
+    }
+}

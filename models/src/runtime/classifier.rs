@@ -1,0 +1,74 @@
+use std::path::Path;
+
+use grasp::gpd::{CHANNELS, IMAGE_SIZE, Image};
+use ort::session::Session;
+use ort::value::{Outlet, Tensor, TensorElementType};
+
+use super::{LoadError, LoadReason, Options, RuntimeError, open, refusal};
+use crate::gpd::{INPUT, OUTPUT};
+
+/// Images that are scored together, to bound the memory: 5.5 MB of input.
+const BATCH: usize = 32;
+
+/// A classifier of grasp candidates, ready to run.
+pub struct Classifier {
+    session: Session,
+    /// For errors.
+    name: String,
+}
+
+impl Classifier {
+    /// Loads a file, and checks that its input and output are those of a classifier.
+    ///
+    /// # Errors
+    /// [`LoadError`] names the file and what is wrong with it.
+    pub fn load(path: &Path, options: &Options) -> Result<Self, LoadError> {
+        let at_path = |reason| LoadError { path: path.to_owned(), reason };
+        let session = open(path, options).map_err(at_path)?;
+        check(session.inputs(), INPUT, &[CHANNELS, IMAGE_SIZE, IMAGE_SIZE]).map_err(at_path)?;
+        check(session.outputs(), OUTPUT, &[2]).map_err(at_path)?;
+        Ok(Self { session, name: path.display().to_string() })
+    }
+
+    /// The score of each image: the logit of a success less that of a failure, above 0 if a success is the likelier.
+    ///
+    /// # Errors
+    /// [`RuntimeError::Run`] when ONNX Runtime fails.
+    pub fn score(&mut self, images: &[Image]) -> Result<Vec<f32>, RuntimeError> {
+        let mut scores = Vec::with_capacity(images.len());
+        for batch in images.chunks(BATCH) {
+            let logits = logits(&mut self.session, batch).map_err(|error| refusal(&self.name, &error))?;
+            scores.extend(logits.chunks_exact(2).map(|pair| pair[1] - pair[0]));
+        }
+        Ok(scores)
+    }
+}
+
+fn logits(session: &mut Session, batch: &[Image]) -> ort::Result<Vec<f32>> {
+    let pixels = batch.iter().flat_map(Image::pixels).map(|&value| f32::from(value) / 255.0).collect::<Vec<_>>();
+    let input = Tensor::from_array(([batch.len(), CHANNELS, IMAGE_SIZE, IMAGE_SIZE], pixels))?;
+    let outputs = session.run(ort::inputs![INPUT => input])?;
+    Ok(outputs[OUTPUT].try_extract_tensor::<f32>()?.1.to_vec())
+}
+
+/// Checks that `name` is f32 of shape `[batch, dims…]`.
+fn check(outlets: &[Outlet], name: &str, dims: &[usize]) -> Result<(), LoadReason> {
+    let wrong = |what: String| LoadReason::Classifier { what };
+    if let [other] = outlets
+        && other.name() != name
+    {
+        return Err(wrong(format!("it has `{}`, not `{name}`", other.name())));
+    }
+    let outlet = outlets.iter().find(|outlet| outlet.name() == name);
+    let dtype = outlet.ok_or_else(|| wrong(format!("it has no `{name}`")))?.dtype();
+    let fits = |shape: &[i64]| {
+        shape.len() == dims.len() + 1
+            && shape[0] < 0
+            && shape[1..].iter().zip(dims).all(|(&dim, &size)| dim < 0 || dim == size as i64)
+    };
+    let is_float = dtype.tensor_type() == Some(TensorElementType::Float32);
+    match dtype.tensor_shape() {
+        Some(shape) if is_float && fits(shape) => Ok(()),
+        _ => Err(wrong(format!("its `{name}` is {dtype}"))),
+    }
+}

@@ -1,0 +1,126 @@
+//! The command `classify`.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, ensure};
+use clap::Args;
+use grasp_models::gpd::{describe, gpd};
+use grasp_train::{ClassifierSettings, Examples, Learner, Tally};
+use indicatif::{ProgressBar, ProgressStyle};
+use serde::Serialize;
+use time::OffsetDateTime;
+
+/// Prints one JSON object an epoch. The model of the smallest validation loss is kept, or the last without validation.
+#[derive(Args)]
+pub(crate) struct Classify {
+    /// Files of `grasp-sim candidates`; several are mixed.
+    #[arg(long, required = true, num_args = 1..)]
+    data: Vec<PathBuf>,
+    /// The classifier to write.
+    #[arg(long)]
+    out: PathBuf,
+    /// Times every candidate is seen.
+    #[arg(long, default_value_t = 10)]
+    epochs: u64,
+    /// Candidates in a step.
+    #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u16).range(1..))]
+    batch: u16,
+    /// Adam's learning rate.
+    #[arg(long, default_value_t = 1e-3)]
+    lr: f64,
+    /// Share of the scenes that are held out to validate on.
+    #[arg(long, default_value_t = 0.1)]
+    val: f64,
+    /// Decides the random weights and the order of the candidates.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Compute convolutions and matrix products in bf16.
+    #[arg(long)]
+    bf16: bool,
+    /// The classifier's version in its metadata.
+    #[arg(long, default_value = "1")]
+    model_version: String,
+    /// Threads libtorch computes with [default: all].
+    #[arg(long)]
+    threads: Option<usize>,
+}
+
+/// A line of the log.
+#[derive(Serialize)]
+struct Record {
+    epoch: u64,
+    training: Tally,
+    validation: Option<Tally>,
+}
+
+impl Classify {
+    /// Trains as told.
+    pub fn run(&self) -> Result<()> {
+        if let Some(threads) = self.threads {
+            tch::set_num_threads(i32::try_from(threads).context("--threads")?);
+        }
+        ensure!((0.0..1.0).contains(&self.val), "--val is {}, must be at least 0 and below 1", self.val);
+        if let Some(folder) = self.out.parent() {
+            fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
+        }
+        let examples = Examples::read(&self.data)?;
+        let settings = ClassifierSettings {
+            batch: usize::from(self.batch),
+            learning_rate: self.lr,
+            validation: self.val,
+            seed: self.seed,
+            bf16: self.bf16,
+        };
+        let mut learner = Learner::new(gpd(self.seed), &examples, settings)?;
+        let (learnt, held_out) = learner.candidates();
+        ensure!(learnt > 0, "--val is {}, which leaves no scene to learn from", self.val);
+        eprintln!("{learnt} candidates to learn from, {held_out} held out, {} successes", examples.successes());
+
+        let mut best = f64::INFINITY;
+        for epoch in 1..=self.epochs {
+            let bar = self.progress_bar(learner.steps_per_epoch(), epoch)?;
+            let training = learner.epoch(|| bar.inc(1))?;
+            bar.finish_and_clear();
+            let record = Record { epoch, training, validation: learner.validate()? };
+            println!("{}", serde_json::to_string(&record)?);
+            let loss = record.validation.map_or(f64::NEG_INFINITY, |validation| validation.loss);
+            if loss <= best {
+                best = loss;
+                self.write(&learner, &examples, &record)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn progress_bar(&self, steps: u64, epoch: u64) -> Result<ProgressBar> {
+        let style = ProgressStyle::with_template("{prefix} {bar:30} {pos}/{len} {elapsed} (left {eta})")?;
+        let prefix = format!("epoch {epoch}/{}", self.epochs);
+        Ok(ProgressBar::new(steps).with_style(style).with_prefix(prefix))
+    }
+
+    /// Writes the classifier with a note of where its weights come from.
+    fn write(&self, learner: &Learner, examples: &Examples, record: &Record) -> Result<()> {
+        let name = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let mut provenance = BTreeMap::new();
+        let mut note = |key: &str, value: String| provenance.insert(key.to_owned(), value);
+        note("architecture", "gpd".to_owned());
+        note("data", self.data.iter().map(|path| name(path)).collect::<Vec<_>>().join(" "));
+        note("candidates", examples.len().to_string());
+        note("successes", examples.successes().to_string());
+        note("epochs", record.epoch.to_string());
+        note("batch", self.batch.to_string());
+        note("learning_rate", self.lr.to_string());
+        note("bf16", self.bf16.to_string());
+        note("seed", self.seed.to_string());
+        note("date", OffsetDateTime::now_utc().date().to_string());
+        note("trainer", format!("grasp-train {}", env!("CARGO_PKG_VERSION")));
+        if let Some(validation) = record.validation {
+            note("validation", serde_json::to_string(&validation)?);
+        }
+        let mut model = learner.model();
+        describe(&mut model, &name(&self.out), &self.model_version, &provenance);
+        Ok(model.write(&self.out)?)
+    }
+}

@@ -1,0 +1,77 @@
+use std::path::PathBuf;
+
+use grasp::gpd::{CHANNELS, IMAGE_SIZE};
+use grasp_data::{Candidates, DataError};
+use sha2::{Digest, Sha256};
+use tch::{Kind, Tensor};
+
+/// Tried grasp candidates, all in memory.
+pub struct Examples {
+    /// u8 `[n, CHANNELS, IMAGE_SIZE, IMAGE_SIZE]`, 255 for 1.
+    images: Tensor,
+    /// Whether each succeeded.
+    labels: Vec<bool>,
+    /// The file and the scene of each.
+    scenes: Vec<(usize, u64)>,
+}
+
+impl Examples {
+    /// Reads files of [`Candidates`]; several are mixed.
+    ///
+    /// # Errors
+    /// [`DataError`] names the file that cannot be used.
+    pub fn read(files: &[PathBuf]) -> Result<Self, DataError> {
+        let (mut images, mut labels, mut scenes) = (Vec::new(), Vec::new(), Vec::new());
+        for (file, path) in files.iter().enumerate() {
+            let candidates = Candidates::read(path)?;
+            let edge = IMAGE_SIZE as i64;
+            images.push(Tensor::from_slice(&candidates.images).reshape([-1, CHANNELS as i64, edge, edge]));
+            labels.extend(candidates.labels);
+            scenes.extend(candidates.scenes.into_iter().map(|scene| (file, scene)));
+        }
+        Ok(Self { images: Tensor::cat(&images, 0), labels, scenes })
+    }
+
+    /// How many there are.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.labels.len()
+    }
+
+    /// Never: a file without candidates is refused.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.labels.is_empty()
+    }
+
+    /// How many of them succeeded.
+    #[must_use]
+    pub fn successes(&self) -> usize {
+        self.labels.iter().filter(|&&label| label).count()
+    }
+
+    /// Which ones to learn from and which are held out: all candidates of about `fraction` of the scenes, chosen by a
+    /// hash of the scene's file and number.
+    #[must_use]
+    pub fn split(&self, fraction: f64) -> (Vec<i64>, Vec<i64>) {
+        (0..self.len() as i64).partition(|&index| {
+            let (file, scene) = self.scenes[index as usize];
+            let hash = Sha256::digest(format!("{file}/{scene}"));
+            let leading = hash.iter().take(8).fold(0_u64, |number, &byte| number << 8 | u64::from(byte));
+            leading as f64 >= fraction * 2.0_f64.powi(64)
+        })
+    }
+
+    /// Some images, f32 in [0, 1], and their classes: 1 for a success.
+    pub(crate) fn batch(&self, indices: &[i64]) -> (Tensor, Tensor) {
+        let images = self.images.index_select(0, &Tensor::from_slice(indices)).to_kind(Kind::Float) / 255.0;
+        let labels: Vec<i64> = indices.iter().map(|&index| i64::from(self.labels[index as usize])).collect();
+        (images, Tensor::from_slice(&labels))
+    }
+
+    /// How many of these failed, and how many succeeded.
+    pub(crate) fn classes(&self, indices: &[i64]) -> [usize; 2] {
+        let successes = indices.iter().filter(|&&index| self.labels[index as usize]).count();
+        [indices.len() - successes, successes]
+    }
+}

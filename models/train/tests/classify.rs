@@ -1,0 +1,143 @@
+//! The classifier of grasp candidates, from what `grasp-sim` writes to what its benchmark plans with.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use grasp::DecodeParams;
+use grasp::SurfacePoint;
+use grasp::gpd::{Candidate, Cloud, Image};
+use grasp_data::Candidates;
+use grasp_models::gpd::gpd;
+use grasp_models::onnx::ModelProto;
+use grasp_sim::benchmark::{Benchmark, Summary};
+use grasp_sim::camera::Views;
+use grasp_sim::label::Recipe;
+use grasp_sim::objects::{ObjectSet, Split};
+use grasp_sim::planner::PlannerSpec;
+use grasp_sim::scene::SceneKind;
+use grasp_train::{ClassifierSettings, Examples, Learner};
+use nalgebra::{Isometry3, Point3, Vector3};
+
+/// A wall between the fingers: along the approach it is held, across it is not.
+fn push(number: u64, candidates: &mut Candidates) {
+    let success = number.is_multiple_of(3);
+    let offset = (number % 7) as f64 * 0.003 - 0.009;
+    let points = (-15..=15).flat_map(|i| (0..=15).map(move |j| (f64::from(i) * 1e-3, f64::from(j) * 1e-3)));
+    let points = points.map(|(x, along)| match success {
+        true => SurfacePoint { position: Point3::new(x, offset, 0.03 + along), normal: Vector3::y() },
+        false => SurfacePoint { position: Point3::new(x, along, 0.04 + offset), normal: Vector3::z() },
+    });
+    let candidate = Candidate { pose: Isometry3::identity(), width: 0.02, point: Point3::origin() };
+    candidates.push(number / 4, &Image::of(&Cloud::new(points), &candidate), success);
+}
+
+fn examples(folder: &Path, count: u64) -> PathBuf {
+    let path = folder.join("walls.npz");
+    let mut walls = Candidates::default();
+    (0..count).for_each(|number| push(number, &mut walls));
+    walls.write(&path).unwrap();
+    path
+}
+
+fn classify(folder: &Path, arguments: &str) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_grasp-train"));
+    command.current_dir(folder).arg("classify").args(arguments.split_whitespace()).output().unwrap()
+}
+
+#[test]
+fn a_small_set_is_learnt_by_heart() {
+    let folder = tempfile::tempdir().unwrap();
+    let examples = Examples::read(&[examples(folder.path(), 48)]).unwrap();
+    assert_eq!((examples.len(), examples.successes()), (48, 16));
+    let settings = ClassifierSettings { batch: 16, learning_rate: 1e-3, validation: 0.25, seed: 1, bf16: false };
+    let mut learner = Learner::new(gpd(1), &examples, settings).unwrap();
+    let (learnt, held_out) = learner.candidates();
+    assert!(learnt + held_out == 48 && held_out > 0 && held_out % 4 == 0, "whole scenes are held out");
+    let first = learner.epoch(|| ()).unwrap();
+    let last = (0..15).map(|_| learner.epoch(|| ()).unwrap()).last().unwrap();
+    assert!(last.loss < 0.1 && last.loss < first.loss / 4.0, "from {} to {}", first.loss, last.loss);
+    assert_eq!((last.accuracy, last.precision, last.recall), (1.0, 1.0, 1.0));
+    assert!(learner.validate().unwrap().unwrap().accuracy > 0.9, "the walls of other scenes are no different");
+}
+
+#[test]
+fn candidates_become_a_classifier_that_plans() {
+    let folder = tempfile::tempdir().unwrap();
+    let recipe = Recipe {
+        kind: SceneKind::Packed,
+        objects: ObjectSet::procedural(Split::Train),
+        points: 10,
+        views: Views::Side { azimuth: 0.0 },
+        looks: 1,
+        noise: 1.0,
+        seed: 1,
+    };
+    let mut tried = Candidates::default();
+    (0..6).for_each(|number| tried.append(recipe.candidates(number)));
+    tried.write(&folder.path().join("packed.npz")).unwrap();
+
+    let arguments = "--data packed.npz --out models/gpd.onnx --epochs 2 --val 0.3 --batch 16 --model-version 2";
+    let output = classify(folder.path(), arguments);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let lines = String::from_utf8(output.stdout).unwrap();
+    let records: Vec<serde_json::Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(records.len(), 2);
+    for name in ["loss", "accuracy", "precision", "recall"] {
+        assert!(records[1]["validation"][name].is_number() && records[1]["training"][name].is_number(), "{name}");
+    }
+    let path = folder.path().join("models/gpd.onnx");
+    let properties = ModelProto::read(&path).unwrap().metadata_props;
+    for (key, value) in [("name", "gpd"), ("version", "2"), ("provenance.data", "packed")] {
+        let key = format!("graspd.{key}");
+        assert!(properties.iter().any(|p| p.key() == key && p.value() == value), "{key}: {properties:?}");
+    }
+
+    let benchmark = Benchmark {
+        kind: SceneKind::Packed,
+        objects: ObjectSet::procedural(Split::PackedTest),
+        count: 3,
+        views: recipe.views,
+        noise: 1.0,
+        rounds: 2,
+        seed: 1,
+    };
+    let planner = PlannerSpec::from(format!("gpd:{}", path.display()).as_str());
+    let rounds = benchmark.run(&planner, &DecodeParams::benchmark(), || ()).unwrap();
+    let summary = Summary::of(&rounds);
+    assert!(summary.rounds == 2 && summary.objects >= 2, "{summary:?}");
+    assert!(summary.attempts > 0 || summary.nothing_proposed == 2, "{summary:?}");
+}
+
+#[test]
+fn the_same_seed_gives_the_same_classifier() {
+    let folder = tempfile::tempdir().unwrap();
+    examples(folder.path(), 24);
+    let train = |name: &str, seed: u64| {
+        let arguments = format!("--data walls.npz --out {name}.onnx --epochs 1 --threads 1 --seed {seed}");
+        assert!(classify(folder.path(), &arguments).status.success());
+        ModelProto::read(&folder.path().join(format!("{name}.onnx"))).unwrap().graph.unwrap().initializer
+    };
+    let first = train("a", 1);
+    assert_eq!(first, train("b", 1));
+    assert_ne!(first, train("c", 2));
+}
+
+#[test]
+fn what_cannot_be_learnt_from_is_said() {
+    let folder = tempfile::tempdir().unwrap();
+    examples(folder.path(), 8);
+    fs::write(folder.path().join("text.npz"), "not a zip").unwrap();
+    for (arguments, expected) in [
+        ("--data text.npz --out x.onnx", "text.npz: "),
+        ("--data nowhere.npz --out x.onnx", "nowhere.npz: No such file"),
+        ("--data walls.npz --out x.onnx --val 1", "--val is 1"),
+        ("--data walls.npz --out x.onnx --batch 0", "--batch"),
+        ("--out x.onnx", "--data"),
+    ] {
+        let output = classify(folder.path(), arguments);
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(!output.status.success() && said.contains(expected), "{arguments}: {said}");
+    }
+    assert!(!folder.path().join("x.onnx").exists());
+}

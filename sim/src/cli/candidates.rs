@@ -1,0 +1,62 @@
+use std::path::PathBuf;
+
+use anyhow::Context;
+use clap::Args;
+use grasp_data::Candidates as Tried;
+use grasp_sim::label::Recipe;
+use grasp_sim::ordered;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::SceneArgs;
+
+/// What `grasp-train classify` learns from: an .npz with `images`, `labels` and `scenes`. The same seed gives the same
+/// file on any number of threads.
+#[derive(Args)]
+pub struct Candidates {
+    #[command(flatten)]
+    scene: SceneArgs,
+
+    /// How many scenes. Their images are in memory together: 43 kB a candidate.
+    #[arg(long)]
+    scenes: u64,
+
+    /// Candidates to try in each scene, drawn from all there are.
+    #[arg(long, default_value_t = 50)]
+    candidates: usize,
+
+    /// File to write.
+    #[arg(long)]
+    out: PathBuf,
+}
+
+impl Candidates {
+    pub fn run(self) -> anyhow::Result<()> {
+        let recipe = Recipe {
+            kind: self.scene.kind(),
+            objects: self.scene.objects("train")?,
+            points: self.candidates,
+            views: self.scene.views()?,
+            looks: 1,
+            noise: self.scene.noise,
+            seed: self.scene.seed,
+        };
+        if let Some(folder) = self.out.parent() {
+            std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
+        }
+        let style = "{wide_bar} {pos}/{len} scenes, {per_sec}, {eta} left";
+        let progress = ProgressBar::new(self.scenes).with_style(ProgressStyle::with_template(style)?);
+        let mut tried = Tried::default();
+        ordered::for_each(
+            0..self.scenes,
+            |number| recipe.candidates(number),
+            |_, candidates| {
+                tried.append(candidates);
+                progress.inc(1);
+                anyhow::Ok(())
+            },
+        )?;
+        progress.finish();
+        eprintln!("{} candidates tried, {} of them successes", tried.len(), tried.successes());
+        Ok(tried.write(&self.out)?)
+    }
+}

@@ -1,0 +1,21 @@
+use grasp::{Grasp, MAX_OPENING};
+use nalgebra::{UnitQuaternion, Vector3};
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+
+use super::{Observation, Planner};
+use crate::label::{graspable, sample_pose};
+
+pub(super) struct Random;
+
+impl Planner for Random {
+    fn plan(&mut self, observation: &Observation, rng: &mut ChaCha8Rng) -> anyhow::Result<Vec<Grasp>> {
+        let surface = graspable(&observation.views);
+        if surface.is_empty() {
+            return Ok(Vec::new());
+        }
+        let yaw = rng.random_range(0.0..std::f64::consts::PI);
+        let pose = sample_pose(&surface, rng) * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw);
+        Ok(vec![Grasp { pose, width: MAX_OPENING, quality: 0.5 }])
+    }
+}
