@@ -18,7 +18,7 @@ with_python = GRASPD_PYTHON="$$($(PYTHON) deploy/native.py python)" && export GR
 with_libtorch = LIBTORCH="$$($(PYTHON) deploy/native.py libtorch)" && export LIBTORCH && \
 	LD_LIBRARY_PATH="$$LIBTORCH/lib$${LD_LIBRARY_PATH:+:$$LD_LIBRARY_PATH}" && export LD_LIBRARY_PATH &&
 
-.PHONY: help demo build test fmt fmt-check lint doc deny test-rust test-train test-python bench-sim clean
+.PHONY: help demo build test fmt fmt-check lint doc deny test-rust test-train test-python bench-sim tables clean
 # The order of test's parts is the order in which they fail fastest, also under `make -j`.
 .NOTPARALLEL:
 
@@ -62,6 +62,9 @@ test-python: ## of test-rust, only the tests whose names say python
 
 bench-sim: ## how fast scenes are made, seen and labelled on one core
 	$(CARGO) run --release --package grasp-sim --example speed --locked
+
+tables: ## play the paper's tables into docs/tables.md; VGN=DIR adds VGN's released weights
+	$(with_onnxruntime) $(CARGO) run --release --package grasp-sim --locked -- tables $(if $(VGN),--released $(VGN))
 
 clean: ## remove what was built; what was downloaded stays
 	$(CARGO) clean

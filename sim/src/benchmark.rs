@@ -3,11 +3,10 @@
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use grasp::DecodeParams;
+use grasp::{DecodeParams, Grasp};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
-use serde::Serialize;
 
 use crate::camera::{Views, observe};
 use crate::objects::ObjectSet;
@@ -39,8 +38,7 @@ pub struct Benchmark {
 }
 
 /// Why a round ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ending {
     /// The table is empty.
     Cleared,
@@ -57,53 +55,48 @@ pub enum Ending {
 pub struct Round {
     /// Objects on the table at first.
     pub objects: usize,
-    /// What became of each grasp.
-    pub attempts: Vec<Outcome>,
+    /// The grasps that were executed.
+    pub attempts: Vec<Attempt>,
     /// Why it ended.
     pub ending: Ending,
+    /// Time to fuse the views of each observation.
+    pub fusion: Vec<Duration>,
     /// Time of each planning: network and post-processing, without fusion.
     pub planning: Vec<Duration>,
 }
 
-/// The benchmark's figures over all rounds.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Summary {
-    /// Rounds played.
-    pub rounds: usize,
-    /// Objects that stood on the tables.
-    pub objects: usize,
-    /// Grasps executed.
-    pub attempts: usize,
-    /// Objects lifted.
-    pub successes: usize,
-    /// Grasp success rate: successes / attempts.
-    pub gsr: f64,
-    /// Declutter rate: successes / objects.
-    pub dr: f64,
-    /// Half the width of the 95 % interval of `gsr`.
-    pub gsr_interval: f64,
-    /// Half the width of the 95 % interval of `dr`.
-    pub dr_interval: f64,
-    /// Attempts that collided at the pre-grasp.
-    pub blocked: usize,
-    /// Attempts that closed on nothing.
-    pub closed_on_nothing: usize,
-    /// Attempts that lost the object in the lift.
-    pub lost_in_lift: usize,
-    /// Rounds that ended because the table was empty.
-    pub cleared: usize,
-    /// Rounds that ended because nothing was proposed or seen.
-    pub nothing_proposed: usize,
-    /// Rounds that ended after two failures in a row.
-    pub gave_up: usize,
-    /// Median time to plan, milliseconds.
-    pub planning_p50_ms: f64,
-    /// 95th percentile of the time to plan, milliseconds.
-    pub planning_p95_ms: f64,
+/// An executed grasp.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Attempt {
+    /// Which.
+    pub grasp: Grasp,
+    /// What became of it.
+    pub outcome: Outcome,
+    /// How far from the grasp the hand closed, because its approach met something, metres.
+    pub short_by: f64,
+}
+
+/// What can be watched while a benchmark is played.
+pub enum Event<'a> {
+    /// A grasp was executed.
+    Attempt {
+        /// Number of the round.
+        round: u64,
+        /// Number of the attempt in it.
+        number: usize,
+        /// The scene as it was before.
+        before: &'a World,
+        /// Everything that was proposed, the executed one first.
+        proposals: &'a [Grasp],
+        /// The grasp, and what became of it.
+        attempt: &'a Attempt,
+    },
+    /// A round has ended.
+    Round,
 }
 
 impl Benchmark {
-    /// Plays every round, on all cores; `progress` is called after each.
+    /// Plays every round, on all cores, before the eyes of `watch`.
     ///
     /// # Errors
     /// The first error of a planner.
@@ -111,7 +104,7 @@ impl Benchmark {
         &self,
         planner: &PlannerSpec,
         params: &DecodeParams,
-        progress: impl Fn() + Sync,
+        watch: impl Fn(Event<'_>) + Sync,
     ) -> anyhow::Result<Vec<Round>> {
         // Planners that wait for the next round: there are as many as threads, however the rounds are dealt out.
         let idle = Mutex::new(Vec::new());
@@ -121,9 +114,9 @@ impl Benchmark {
             .map(|number| {
                 let waiting = idle().pop();
                 let mut player = waiting.map_or_else(|| planner.build(params), Ok)?;
-                let round = self.play(number, player.as_mut());
+                let round = self.play(number, player.as_mut(), &watch);
                 idle().push(player);
-                progress();
+                watch(Event::Round);
                 round
             })
             .collect()
@@ -144,16 +137,22 @@ impl Benchmark {
         Observation::new(observe(world, &self.views, self.noise, rng))
     }
 
-    fn play(&self, number: u64, planner: &mut dyn Planner) -> anyhow::Result<Round> {
+    fn play(&self, number: u64, planner: &mut dyn Planner, watch: impl Fn(Event<'_>)) -> anyhow::Result<Round> {
         let (mut world, mut rng) = self.scene(number);
-        let mut round =
-            Round { objects: world.objects().len(), attempts: vec![], ending: Ending::Cleared, planning: vec![] };
+        let mut round = Round {
+            objects: world.objects().len(),
+            attempts: vec![],
+            ending: Ending::Cleared,
+            fusion: vec![],
+            planning: vec![],
+        };
         let mut failures = 0;
         while !world.objects().is_empty() {
             let Some(observation) = self.observe(&world, &mut rng) else {
                 round.ending = Ending::NothingSeen;
                 break;
             };
+            round.fusion.push(observation.fusion);
             let start = Instant::now();
             let grasps = planner.plan(&observation, &mut rng)?;
             round.planning.push(start.elapsed());
@@ -161,8 +160,17 @@ impl Benchmark {
                 round.ending = Ending::NothingProposed;
                 break;
             };
-            let outcome = execute(&mut world, &best.pose);
-            round.attempts.push(outcome);
+            let before = world.clone();
+            let (outcome, short_by) = execute(&mut world, &best.pose);
+            let attempt = Attempt { grasp: *best, outcome, short_by };
+            watch(Event::Attempt {
+                round: number,
+                number: round.attempts.len(),
+                before: &before,
+                proposals: &grasps,
+                attempt: &attempt,
+            });
+            round.attempts.push(attempt);
             if let Outcome::Lifted { object, .. } = outcome {
                 world.remove(object);
                 failures = 0;
@@ -177,52 +185,4 @@ impl Benchmark {
         }
         Ok(round)
     }
-}
-
-impl Summary {
-    /// Pools rounds, as the papers do.
-    #[must_use]
-    pub fn of(rounds: &[Round]) -> Self {
-        let attempts: Vec<Outcome> = rounds.iter().flat_map(|round| round.attempts.iter().copied()).collect();
-        let count = |wanted: fn(&Outcome) -> bool| attempts.iter().filter(|outcome| wanted(outcome)).count();
-        let ended = |ending: Ending| rounds.iter().filter(|round| round.ending == ending).count();
-        let objects = rounds.iter().map(|round| round.objects).sum();
-        let successes = count(Outcome::is_success);
-        let (gsr, gsr_interval) = proportion(successes, attempts.len());
-        let (dr, dr_interval) = proportion(successes, objects);
-        let mut planning: Vec<f64> =
-            rounds.iter().flat_map(|round| &round.planning).map(|time| time.as_secs_f64() * 1e3).collect();
-        planning.sort_by(f64::total_cmp);
-        let percentile = |share: f64| match planning.len() {
-            0 => 0.0,
-            n => planning[((share * n as f64) as usize).min(n - 1)],
-        };
-        Self {
-            rounds: rounds.len(),
-            objects,
-            attempts: attempts.len(),
-            successes,
-            gsr,
-            dr,
-            gsr_interval,
-            dr_interval,
-            blocked: count(|o| matches!(o, Outcome::BlockedAtPregrasp | Outcome::BlockedOnApproach)),
-            closed_on_nothing: count(|o| *o == Outcome::ClosedOnNothing),
-            lost_in_lift: count(|o| *o == Outcome::LostInLift),
-            cleared: ended(Ending::Cleared),
-            nothing_proposed: ended(Ending::NothingProposed) + ended(Ending::NothingSeen),
-            gave_up: ended(Ending::GaveUp),
-            planning_p50_ms: percentile(0.5),
-            planning_p95_ms: percentile(0.95),
-        }
-    }
-}
-
-/// A share and half of its 95 % interval (normal approximation).
-fn proportion(part: usize, whole: usize) -> (f64, f64) {
-    if whole == 0 {
-        return (0.0, 0.0);
-    }
-    let share = part as f64 / whole as f64;
-    (share, 1.96 * (share * (1.0 - share) / whole as f64).sqrt())
 }

@@ -8,6 +8,7 @@ mod label;
 mod merge;
 mod objects;
 mod stats;
+mod tables;
 
 use std::path::PathBuf;
 
@@ -35,6 +36,8 @@ pub enum Command {
     Candidates(candidates::Candidates),
     /// Clear tables with a planner and say how well it did.
     Bench(bench::Bench),
+    /// Regenerate the tables of the paper.
+    Tables(tables::Tables),
     /// One scene, from the depth camera through a server of its own to the lifted object.
     Demo(demo::Demo),
 }
@@ -50,6 +53,7 @@ impl Command {
             Self::Objects(command) => command.run(),
             Self::Candidates(command) => command.run(),
             Self::Bench(command) => command.run(),
+            Self::Tables(command) => command.run(),
             Self::Demo(command) => command.run(),
         }
     }
@@ -88,6 +92,20 @@ enum Scene {
 }
 
 impl Scene {
+    fn kind(self) -> SceneKind {
+        match self {
+            Self::Pile => SceneKind::Pile,
+            Self::Packed => SceneKind::Packed,
+        }
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Pile => "pile",
+            Self::Packed => "packed",
+        }
+    }
+
     fn objects(self, name: &str) -> anyhow::Result<ObjectSet> {
         Ok(match (name, self) {
             ("endless", _) => ObjectSet::endless(),
@@ -101,10 +119,7 @@ impl Scene {
 
 impl SceneArgs {
     fn kind(&self) -> SceneKind {
-        match self.scene {
-            Scene::Pile => SceneKind::Pile,
-            Scene::Packed => SceneKind::Packed,
-        }
+        self.scene.kind()
     }
 
     fn objects(&self, default: &str) -> anyhow::Result<ObjectSet> {

@@ -16,7 +16,9 @@ pub mod picture;
 pub mod planner;
 pub mod raster;
 pub mod scene;
+pub mod score;
 pub mod statistics;
+pub mod tables;
 pub mod trial;
 
 /// Height of the table's top in the task frame, metres.

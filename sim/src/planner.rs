@@ -7,6 +7,7 @@ mod server;
 mod shaf;
 
 use std::path::PathBuf;
+use std::time::{Duration, Instant};
 
 use grasp::{DecodeParams, Grasp, RESOLUTION, Volume};
 use nalgebra::Isometry3;
@@ -21,18 +22,22 @@ pub struct Observation {
     pub views: Vec<View>,
     /// The volume they were fused into, task frame.
     pub volume: Volume,
+    /// How long that took.
+    pub fusion: Duration,
 }
 
 impl Observation {
     /// Fuses the views; `None` if they see nothing in the workspace but the table.
     #[must_use]
     pub fn new(views: Vec<View>) -> Option<Self> {
+        let start = Instant::now();
         let fusion = fuse(&views, RESOLUTION);
+        let volume = fusion.volume(Isometry3::identity()).ok()?;
+        let took = start.elapsed();
         if !fusion.surface().iter().any(is_graspable) {
             return None;
         }
-        let volume = fusion.volume(Isometry3::identity()).ok()?;
-        Some(Self { views, volume })
+        Some(Self { views, volume, fusion: took })
     }
 }
 

@@ -48,6 +48,18 @@ pub enum Outcome {
 }
 
 impl Outcome {
+    /// The outcome in a word, as reports have it.
+    #[must_use]
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Lifted { .. } => "lifted",
+            Self::BlockedAtPregrasp => "blocked_at_pregrasp",
+            Self::BlockedOnApproach => "blocked_on_approach",
+            Self::ClosedOnNothing => "closed_on_nothing",
+            Self::LostInLift => "lost_in_lift",
+        }
+    }
+
     /// Whether the object was lifted.
     #[must_use]
     pub fn is_success(&self) -> bool {
@@ -65,20 +77,21 @@ pub fn label(world: &World, grasp: &Isometry3<f64>) -> Outcome {
     close_and_lift(&mut world.clone(), grasp, grasp)
 }
 
-/// Executes a grasp as in evaluation: the hand closes where its approach met something. A lifted object is still in
-/// the hand's place in `world`; the caller decides what becomes of it.
-pub fn execute(world: &mut World, grasp: &Isometry3<f64>) -> Outcome {
+/// Executes a grasp as in evaluation: the hand closes where its approach met something, and how far from the grasp that
+/// was is the second answer, metres. A lifted object is still in the hand's place in `world`; the caller decides what
+/// becomes of it.
+pub fn execute(world: &mut World, grasp: &Isometry3<f64>) -> (Outcome, f64) {
     let at = |distance: f64| grasp * Translation3::new(0.0, 0.0, -distance);
     if world.collides(&OPEN_HAND, &at(PREGRASP_DISTANCE)) {
-        return Outcome::BlockedAtPregrasp;
+        return (Outcome::BlockedAtPregrasp, PREGRASP_DISTANCE);
     }
     let steps = (PREGRASP_DISTANCE / APPROACH_STEP).round() as u32;
-    let reached = (1..=steps)
-        .map(|step| at(PREGRASP_DISTANCE - f64::from(step) * APPROACH_STEP))
-        .take_while(|pose| !world.collides(&OPEN_HAND, pose))
+    let short_by = (1..=steps)
+        .map(|step| PREGRASP_DISTANCE - f64::from(step) * APPROACH_STEP)
+        .take_while(|&distance| !world.collides(&OPEN_HAND, &at(distance)))
         .last()
-        .unwrap_or_else(|| at(PREGRASP_DISTANCE));
-    close_and_lift(world, &reached, grasp)
+        .unwrap_or(PREGRASP_DISTANCE);
+    (close_and_lift(world, &at(short_by), grasp), short_by)
 }
 
 /// Closes the hand at `start` and lifts it to where a lift from `grasp` ends.

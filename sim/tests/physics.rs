@@ -64,8 +64,9 @@ fn contact_on_the_way_is_a_failure_only_when_labelling() {
     // Both fingers over the cube: closed along x, it is 4 cm wide, but shifted by 3 cm a finger stands on it.
     let shifted = Translation3::new(0.0, 0.03, 0.0) * from_above();
     assert_eq!(trial::label(&cube_on_table(0.2, 1.0), &shifted), Outcome::BlockedOnApproach);
-    let outcome = trial::execute(&mut cube_on_table(0.2, 1.0), &shifted);
+    let (outcome, short_by) = trial::execute(&mut cube_on_table(0.2, 1.0), &shifted);
     assert_ne!(outcome, Outcome::BlockedOnApproach);
+    assert!((0.001..0.05).contains(&short_by), "the hand stops where the finger stands: {short_by}");
     let through_the_table = Translation3::new(0.0, 0.0, -0.02) * from_above();
     assert_eq!(trial::label(&cube_on_table(0.2, 1.0), &through_the_table), Outcome::BlockedOnApproach);
 }

@@ -10,12 +10,13 @@ use grasp::gpd::{Candidate, Cloud, Image};
 use grasp_data::Candidates;
 use grasp_models::gpd::gpd;
 use grasp_models::onnx::ModelProto;
-use grasp_sim::benchmark::{Benchmark, Summary};
+use grasp_sim::benchmark::Benchmark;
 use grasp_sim::camera::Views;
 use grasp_sim::label::Recipe;
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::planner::PlannerSpec;
 use grasp_sim::scene::SceneKind;
+use grasp_sim::score::Summary;
 use grasp_train::{ClassifierSettings, Examples, Learner};
 use nalgebra::{Isometry3, Point3, Vector3};
 
@@ -103,7 +104,7 @@ fn candidates_become_a_classifier_that_plans() {
         seed: 1,
     };
     let planner = PlannerSpec::from(format!("gpd:{}", path.display()).as_str());
-    let rounds = benchmark.run(&planner, &DecodeParams::benchmark(), || ()).unwrap();
+    let rounds = benchmark.run(&planner, &DecodeParams::benchmark(), |_| ()).unwrap();
     let summary = Summary::of(&rounds);
     assert!(summary.rounds == 2 && summary.objects >= 2, "{summary:?}");
     assert!(summary.attempts > 0 || summary.nothing_proposed == 2, "{summary:?}");

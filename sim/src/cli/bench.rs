@@ -1,13 +1,21 @@
+use std::fs::{self, File};
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+
 use anyhow::Context;
-use clap::Args;
-use grasp::DecodeParams;
-use grasp_sim::benchmark::{Benchmark, Summary};
+use clap::{Args, ValueEnum};
+use grasp::{DecodeParams, Grasp};
+use grasp_sim::TABLE_HEIGHT;
+use grasp_sim::benchmark::{Benchmark, Event};
+use grasp_sim::picture::{Picture, quality_color};
 use grasp_sim::planner::PlannerSpec;
+use grasp_sim::score::{Spread, Summary};
 use indicatif::ProgressBar;
 
 use super::SceneArgs;
 
-/// The scenes depend on the seed alone, so every planner meets the same ones. Prints one JSON object a planner.
+/// The scenes depend on the seed alone, so every planner meets the same ones.
 #[derive(Args)]
 pub struct Bench {
     /// The planners: `random`; an .onnx network; `grpc:ADDRESS`, a running graspd; `shaf`, the highest place where the
@@ -33,6 +41,25 @@ pub struct Bench {
     /// Objects a scene.
     #[arg(long, default_value_t = 5)]
     count: usize,
+
+    /// Print a JSON object or a Markdown row a planner.
+    #[arg(long, value_enum, default_value = "json")]
+    format: Format,
+
+    /// Also write every attempt to this file, as JSON lines: which grasp, and what became of it.
+    #[arg(long)]
+    attempts: Option<PathBuf>,
+
+    /// Also draw every attempt into this folder: the scene, the proposals, and the hand, green where it lifted an object
+    /// and red where it failed.
+    #[arg(long)]
+    pictures: Option<PathBuf>,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Format {
+    Json,
+    Markdown,
 }
 
 /// Between a network's output and the grasps; by default as GIGA's evaluation has it. A running graspd takes the first
@@ -66,15 +93,6 @@ fn parse_force(text: &str) -> Result<Force, String> {
     }
 }
 
-/// Mean and sample standard deviation over the seeds; no deviation from one alone.
-fn mean_and_std(values: Vec<f64>) -> serde_json::Value {
-    let n = values.len() as f64;
-    let mean = values.iter().sum::<f64>() / n;
-    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    let std = (n > 1.0).then(|| (squares / (n - 1.0)).sqrt());
-    serde_json::json!({ "mean": mean, "std": std, "n": values.len() })
-}
-
 impl DecodingArgs {
     fn params(&self) -> DecodeParams {
         let benchmark = DecodeParams::benchmark();
@@ -99,48 +117,142 @@ impl Bench {
             rounds: self.rounds,
             seed: self.scene.seed,
         };
+        let setup = format!(
+            "{}, objects {}, views {}, noise {}, {} objects a scene, {} rounds, seed {}",
+            self.scene.scene.name(),
+            self.scene.objects.as_deref().unwrap_or("test"),
+            self.scene.views,
+            benchmark.noise,
+            benchmark.count,
+            benchmark.rounds,
+            benchmark.seed
+        );
+        let watcher = Watcher::new(self.attempts.as_deref(), self.pictures.as_deref())?;
         let params = self.decoding.params();
+        if self.format == Format::Markdown {
+            println!("{setup}, {} seeds, {params:?}\n\n{MARKDOWN_HEAD}", self.seeds);
+        }
         for name in &self.planners {
             let progress = ProgressBar::new(self.rounds * self.seeds).with_message(name.clone());
             let mut games = Vec::new();
             for seed in benchmark.seed..benchmark.seed + self.seeds {
                 let benchmark = Benchmark { seed, ..benchmark.clone() };
-                let rounds = benchmark.run(&PlannerSpec::from(name.as_str()), &params, || progress.inc(1));
-                games.push(rounds.with_context(|| format!("planner `{name}`"))?);
+                let played = benchmark.run(&PlannerSpec::from(name.as_str()), &params, |event| match event {
+                    Event::Round => progress.inc(1),
+                    Event::Attempt { .. } => watcher.attempt(name, seed, &event),
+                });
+                games.push(played.with_context(|| format!("planner `{name}`"))?);
+                watcher.finish()?;
             }
             progress.finish_and_clear();
-            let mut line = serde_json::to_value(Summary::of(&games.concat()))?;
+            let whole = Summary::of(&games.concat());
             let each: Vec<Summary> = games.iter().map(|rounds| Summary::of(rounds)).collect();
-            line["seeds"] = serde_json::json!({
-                "gsr": mean_and_std(each.iter().map(|summary| summary.gsr).collect()),
-                "dr": mean_and_std(each.iter().map(|summary| summary.dr).collect()),
-            });
-            line["planner"] = name.as_str().into();
-            line["decoding"] = format!("{params:?}").into();
-            line["setup"] = format!(
-                "{:?}, objects {}, views {}, noise {}, {} objects a scene, {} rounds, seed {}",
-                benchmark.kind,
-                self.scene.objects.as_deref().unwrap_or("test"),
-                self.scene.views,
-                benchmark.noise,
-                benchmark.count,
-                benchmark.rounds,
-                benchmark.seed
-            )
-            .into();
-            println!("{line}");
+            let spread = |figure: fn(&Summary) -> f64| Spread::of(&each.iter().map(figure).collect::<Vec<_>>());
+            let (gsr, dr) = (spread(|summary| summary.gsr), spread(|summary| summary.dr));
+            match self.format {
+                Format::Json => {
+                    let mut line = serde_json::to_value(&whole)?;
+                    line["seeds"] = serde_json::json!({ "gsr": gsr, "dr": dr });
+                    line["planner"] = name.as_str().into();
+                    line["decoding"] = format!("{params:?}").into();
+                    line["setup"] = setup.as_str().into();
+                    println!("{line}");
+                }
+                Format::Markdown => println!("{}", markdown(name, &whole, gsr, dr)),
+            }
         }
         Ok(())
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
+const MARKDOWN_HEAD: &str = "\
+| planner | GSR % | DR % | attempts | failed: blocked, empty, lost (stopped short) | \
+rounds ended: cleared, unseen, no proposal, gave up | fusion ms, p50 / p95 | planning ms, p50 / p95 |
+|---|---|---|---|---|---|---|---|";
 
-    #[test]
-    fn seeds_are_averaged() {
-        assert_eq!(mean_and_std(vec![0.5]), serde_json::json!({ "mean": 0.5, "std": null, "n": 1 }));
-        assert_eq!(mean_and_std(vec![1.0, 3.0]), serde_json::json!({ "mean": 2.0, "std": 2f64.sqrt(), "n": 2 }));
+/// A row under [`MARKDOWN_HEAD`]: mean ± std over the seeds, or with one seed the 95 % interval.
+fn markdown(planner: &str, whole: &Summary, gsr: Option<Spread>, dr: Option<Spread>) -> String {
+    let figure = |spread: Option<Spread>, pooled: f64, interval: f64| match spread {
+        Some(spread @ Spread { std: Some(_), .. }) => spread.percent(),
+        _ => format!("{:.1} (±{:.1})", pooled * 100.0, interval * 100.0),
+    };
+    let Summary { attempts, blocked_at_pregrasp, closed_on_nothing, lost_in_lift, stopped_short, .. } = whole;
+    let Summary { cleared, nothing_seen, nothing_proposed, gave_up, .. } = whole;
+    format!(
+        "| {planner} | {} | {} | {attempts} | {blocked_at_pregrasp}, {closed_on_nothing}, {lost_in_lift} \
+         ({stopped_short}) | {cleared}, {nothing_seen}, {nothing_proposed}, {gave_up} | {:.2} / {:.2} | {:.1} / {:.1} |",
+        figure(gsr, whole.gsr, whole.gsr_interval),
+        figure(dr, whole.dr, whole.dr_interval),
+        whole.fusion_p50_ms,
+        whole.fusion_p95_ms,
+        whole.planning_p50_ms,
+        whole.planning_p95_ms,
+    )
+}
+
+/// Keeps what was asked for of every attempt.
+struct Watcher<'a> {
+    lines: Option<(&'a Path, Mutex<BufWriter<File>>)>,
+    pictures: Option<&'a Path>,
+    /// The first that could not be kept.
+    error: Mutex<Option<anyhow::Error>>,
+}
+
+impl<'a> Watcher<'a> {
+    fn new(lines: Option<&'a Path>, pictures: Option<&'a Path>) -> anyhow::Result<Self> {
+        let open = |path: &'a Path| {
+            let file = File::create(path).with_context(|| path.display().to_string())?;
+            anyhow::Ok((path, Mutex::new(BufWriter::new(file))))
+        };
+        if let Some(folder) = pictures {
+            fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
+        }
+        Ok(Self { lines: lines.map(open).transpose()?, pictures, error: Mutex::new(None) })
+    }
+
+    fn attempt(&self, planner: &str, seed: u64, event: &Event) {
+        if let Err(error) = self.keep(planner, seed, event) {
+            self.error.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+        }
+    }
+
+    fn keep(&self, planner: &str, seed: u64, event: &Event) -> anyhow::Result<()> {
+        let Event::Attempt { round, number, before, proposals, attempt } = event else { return Ok(()) };
+        let outcome = attempt.outcome.name();
+        if let Some((path, file)) = &self.lines {
+            let Grasp { pose, width, quality } = attempt.grasp;
+            let line = serde_json::json!({
+                "planner": planner, "seed": seed, "round": round, "attempt": number, "outcome": outcome,
+                "short_by": attempt.short_by, "position": pose.translation.vector.as_slice(),
+                "quaternion_xyzw": pose.rotation.coords.as_slice(), "width": width, "quality": quality,
+                "proposals": proposals.len(), "objects": before.objects().len(),
+            });
+            let mut file = file.lock().unwrap_or_else(PoisonError::into_inner);
+            writeln!(file, "{line}").with_context(|| path.display().to_string())?;
+        }
+        if let Some(folder) = self.pictures {
+            let planner: String = planner.chars().map(|c| if c.is_alphanumeric() { c } else { '-' }).collect();
+            let name = format!("{planner}-{seed}-{round:04}-{number:02}-{outcome}.png");
+            let color = if attempt.outcome.is_success() { quality_color(1.0) } else { quality_color(0.0) };
+            let mut picture = Picture::of_workspace(800, 600, TABLE_HEIGHT);
+            picture.scene(before).hand(&attempt.grasp.pose, attempt.grasp.width, color);
+            for grasp in proposals.iter().skip(1) {
+                picture.gripper(&grasp.pose, grasp.width, quality_color(f64::from(grasp.quality)));
+            }
+            picture.save(&folder.join(name))?;
+        }
+        Ok(())
+    }
+
+    /// What went wrong so far; the lines are on disk then.
+    fn finish(&self) -> anyhow::Result<()> {
+        if let Some(error) = self.error.lock().unwrap_or_else(PoisonError::into_inner).take() {
+            return Err(error);
+        }
+        if let Some((path, file)) = &self.lines {
+            let flushed = file.lock().unwrap_or_else(PoisonError::into_inner).flush();
+            flushed.with_context(|| path.display().to_string())?;
+        }
+        Ok(())
     }
 }

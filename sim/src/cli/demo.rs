@@ -8,7 +8,7 @@ use grasp_client::{Client, Detection, LocalServer, Options};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
 use grasp_sim::physics::World;
-use grasp_sim::picture::{Picture, object_color, quality_color};
+use grasp_sim::picture::{Picture, quality_color};
 use grasp_sim::trial::{Outcome, execute};
 use nalgebra::{UnitQuaternion, Vector3};
 
@@ -68,7 +68,7 @@ impl Demo {
         drop(runtime);
         print_detection(&detection);
 
-        match detection.grasps.first().map(|best| execute(&mut world.clone(), &best.pose)) {
+        match detection.grasps.first().map(|best| execute(&mut world.clone(), &best.pose).0) {
             Some(Outcome::Lifted { object, width }) => {
                 let name = world.objects().iter().find(|body| body.id == object).map(|body| body.object.name.as_str());
                 println!("the best one, executed: lifted {} ({:.0} mm wide)", name.unwrap_or("it"), width * 1e3);
@@ -127,9 +127,7 @@ fn angle_off_vertical(rotation: &UnitQuaternion<f64>) -> f64 {
 /// The scene, every proposal coloured by its quality, and the one that was executed as a solid hand.
 fn draw(world: &World, grasps: &[Grasp]) -> Picture {
     let mut picture = Picture::of_workspace(1200, 900, TABLE_HEIGHT);
-    for (index, body) in world.objects().iter().enumerate() {
-        picture.mesh(&body.object.visual, &world.pose(body.id), body.scale, object_color(index));
-    }
+    picture.scene(world);
     for (index, grasp) in grasps.iter().enumerate() {
         let color = quality_color(f64::from(grasp.quality));
         if index == 0 {

@@ -9,7 +9,7 @@ use grasp_sim::label::{LabelledScene, Recipe};
 use grasp_sim::ordered;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{Scene, SceneArgs};
+use super::SceneArgs;
 
 /// What scenes are made of unless the command says otherwise.
 const OBJECTS: &str = "train";
@@ -73,11 +73,7 @@ impl Label {
             seed: self.scene.seed,
         };
         let setup = Setup::benchmark(Provenance {
-            scene: match self.scene.scene {
-                Scene::Pile => "pile",
-                Scene::Packed => "packed",
-            }
-            .to_owned(),
+            scene: self.scene.scene.name().to_owned(),
             objects: self.scene.objects.clone().unwrap_or_else(|| OBJECTS.to_owned()),
             points: recipe.points,
             views: self.scene.views.clone(),

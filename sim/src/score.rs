@@ -1,0 +1,175 @@
+//! The benchmark's figures.
+
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use crate::benchmark::{Attempt, Ending, Round};
+use crate::trial::Outcome;
+
+/// The benchmark's figures over all rounds.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Summary {
+    /// Rounds played.
+    pub rounds: usize,
+    /// Objects that stood on the tables.
+    pub objects: usize,
+    /// Grasps executed.
+    pub attempts: usize,
+    /// Objects lifted.
+    pub successes: usize,
+    /// Grasp success rate: successes / attempts.
+    pub gsr: f64,
+    /// Declutter rate: successes / objects.
+    pub dr: f64,
+    /// Half the width of the 95 % interval of `gsr`.
+    pub gsr_interval: f64,
+    /// Half the width of the 95 % interval of `dr`.
+    pub dr_interval: f64,
+    /// Attempts that collided at the pre-grasp.
+    pub blocked_at_pregrasp: usize,
+    /// Attempts that closed on nothing.
+    pub closed_on_nothing: usize,
+    /// Attempts that lost the object in the lift.
+    pub lost_in_lift: usize,
+    /// Failures whose approach met something, so that the hand closed short of the grasp; they are among those above.
+    pub stopped_short: usize,
+    /// Rounds that ended because the table was empty.
+    pub cleared: usize,
+    /// Rounds that ended because nothing was seen.
+    pub nothing_seen: usize,
+    /// Rounds that ended because nothing was proposed.
+    pub nothing_proposed: usize,
+    /// Rounds that ended after two failures in a row.
+    pub gave_up: usize,
+    /// Median time to fuse an observation's views, milliseconds.
+    pub fusion_p50_ms: f64,
+    /// 95th percentile of the time to fuse, milliseconds.
+    pub fusion_p95_ms: f64,
+    /// Median time to plan, milliseconds.
+    pub planning_p50_ms: f64,
+    /// 95th percentile of the time to plan, milliseconds.
+    pub planning_p95_ms: f64,
+}
+
+impl Summary {
+    /// Pools rounds, as the papers do.
+    #[must_use]
+    pub fn of(rounds: &[Round]) -> Self {
+        let attempts: Vec<Attempt> = rounds.iter().flat_map(|round| round.attempts.iter().copied()).collect();
+        let count = |wanted: fn(&Outcome) -> bool| attempts.iter().filter(|attempt| wanted(&attempt.outcome)).count();
+        let ended = |ending: Ending| rounds.iter().filter(|round| round.ending == ending).count();
+        let objects = rounds.iter().map(|round| round.objects).sum();
+        let successes = count(Outcome::is_success);
+        let (gsr, gsr_interval) = proportion(successes, attempts.len());
+        let (dr, dr_interval) = proportion(successes, objects);
+        let fusion = Milliseconds::of(rounds.iter().flat_map(|round| &round.fusion));
+        let planning = Milliseconds::of(rounds.iter().flat_map(|round| &round.planning));
+        Self {
+            rounds: rounds.len(),
+            objects,
+            attempts: attempts.len(),
+            successes,
+            gsr,
+            dr,
+            gsr_interval,
+            dr_interval,
+            blocked_at_pregrasp: count(|o| *o == Outcome::BlockedAtPregrasp),
+            closed_on_nothing: count(|o| *o == Outcome::ClosedOnNothing),
+            lost_in_lift: count(|o| *o == Outcome::LostInLift),
+            stopped_short: attempts
+                .iter()
+                .filter(|attempt| {
+                    !attempt.outcome.is_success()
+                        && attempt.outcome != Outcome::BlockedAtPregrasp
+                        && attempt.short_by > 1e-6
+                })
+                .count(),
+            cleared: ended(Ending::Cleared),
+            nothing_seen: ended(Ending::NothingSeen),
+            nothing_proposed: ended(Ending::NothingProposed),
+            gave_up: ended(Ending::GaveUp),
+            fusion_p50_ms: fusion.percentile(0.5),
+            fusion_p95_ms: fusion.percentile(0.95),
+            planning_p50_ms: planning.percentile(0.5),
+            planning_p95_ms: planning.percentile(0.95),
+        }
+    }
+}
+
+/// A share and half of its 95 % interval (normal approximation).
+fn proportion(part: usize, whole: usize) -> (f64, f64) {
+    if whole == 0 {
+        return (0.0, 0.0);
+    }
+    let share = part as f64 / whole as f64;
+    (share, 1.96 * (share * (1.0 - share) / whole as f64).sqrt())
+}
+
+/// A figure over several seeds.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Spread {
+    /// Mean.
+    pub mean: f64,
+    /// Sample standard deviation; none of one value.
+    pub std: Option<f64>,
+    /// How many values.
+    pub n: usize,
+}
+
+impl Spread {
+    /// Of these values; `None` of none.
+    #[must_use]
+    pub fn of(values: &[f64]) -> Option<Self> {
+        let n = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / n;
+        let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+        let std = (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt());
+        (!values.is_empty()).then_some(Self { mean, std, n: values.len() })
+    }
+
+    /// As a percentage: `79.7 ± 2.0`.
+    #[must_use]
+    pub fn percent(&self) -> String {
+        let std = self.std.map_or_else(String::new, |std| format!(" ± {:.1}", std * 100.0));
+        format!("{:.1}{std}", self.mean * 100.0)
+    }
+}
+
+/// Durations in order.
+struct Milliseconds(Vec<f64>);
+
+impl Milliseconds {
+    fn of<'a>(durations: impl Iterator<Item = &'a Duration>) -> Self {
+        let mut sorted: Vec<f64> = durations.map(|duration| duration.as_secs_f64() * 1e3).collect();
+        sorted.sort_by(f64::total_cmp);
+        Self(sorted)
+    }
+
+    /// The value that this share lies below; 0 of nothing.
+    fn percentile(&self, share: f64) -> f64 {
+        let rank = (share * self.0.len() as f64) as usize;
+        self.0.get(rank.min(self.0.len().saturating_sub(1))).copied().unwrap_or(0.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seeds_are_averaged() {
+        assert_eq!(Spread::of(&[]), None);
+        assert_eq!(Spread::of(&[0.5]), Some(Spread { mean: 0.5, std: None, n: 1 }));
+        let two = Spread::of(&[0.1, 0.3]).unwrap();
+        assert_eq!(two.percent(), "20.0 ± 14.1");
+    }
+
+    #[test]
+    fn percentiles_are_of_what_was_measured() {
+        let durations: Vec<Duration> = (1..=100).rev().map(Duration::from_millis).collect();
+        let sorted = Milliseconds::of(durations.iter());
+        assert_eq!((sorted.percentile(0.5), sorted.percentile(0.95), sorted.percentile(1.0)), (51.0, 96.0, 100.0));
+        assert_eq!(Milliseconds::of([].iter()).percentile(0.5), 0.0);
+    }
+}

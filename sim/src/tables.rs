@@ -1,0 +1,249 @@
+//! The tables of *6-DoF Robotic Grasping with Transformer*, as they come out here beside what is published.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+use serde::{Deserialize, Serialize};
+
+use crate::score::{Spread, Summary};
+
+/// A scenario of the benchmark, as it is written in results.
+pub type Scenario = &'static str;
+
+/// Both scenarios.
+pub const SCENARIOS: [Scenario; 2] = ["packed", "pile"];
+
+/// The cameras that networks are looked at from: the paper's view first.
+pub const VIEWS: [(&str, &str); 5] = [
+    ("side", "the paper's side view"),
+    ("side:90", "turned by 90°"),
+    ("side:180", "turned by 180°"),
+    ("anywhere:1-6", "one to six from anywhere"),
+    ("circle", "six from above"),
+];
+
+/// What a cell of a table is about.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct Game {
+    /// The planner's name in the tables.
+    pub method: String,
+    /// The scenario that its network learnt from, if it learnt from one only.
+    pub learnt: Option<String>,
+    /// The scenario that it is tried on.
+    pub scenario: String,
+    /// Where the cameras stand.
+    pub views: String,
+}
+
+/// What was measured.
+#[derive(Clone, Debug, Default)]
+pub struct Results {
+    /// A summary for each seed.
+    pub games: BTreeMap<Game, Vec<Summary>>,
+    /// Milliseconds to plan, by method and scenario, one observation at a time.
+    pub times: BTreeMap<(String, String), Spread>,
+    /// What the networks learnt from, by the names of their files: scenes and grasps.
+    pub data: BTreeMap<String, (String, String)>,
+    /// Objects of the test sets, by scenario.
+    pub test_objects: BTreeMap<String, usize>,
+}
+
+/// `[packed GSR, packed DR, pile GSR, pile DR]` of the paper's table of results, in %.
+const PUBLISHED: [(&str, [&str; 4]); 6] = [
+    ("shaf (proposals)", ["56.6 ± 2.0", "58.0 ± 3.0", "50.7 ± 1.7", "42.6 ± 2.8"]),
+    ("gpd", ["35.4 ± 1.9", "30.7 ± 2.0", "17.7 ± 2.3", "9.2 ± 1.3"]),
+    ("vgn", ["74.5 ± 1.3", "79.2 ± 2.3", "60.7 ± 4.2", "44.0 ± 4.9"]),
+    (RELEASED, ["74.4 ± 3.6", "79.8 ± 3.1", "62.5 ± 2.4", "46.4 ± 2.9"]),
+    ("transformer", OF_PAPER),
+    ("transformer-small", OF_PAPER),
+];
+
+const OF_PAPER: [&str; 4] = ["79.7 ± 2.0", "85.9 ± 1.7", "66.9 ± 3.0", "50.9 ± 3.5"];
+
+/// The same for networks that learnt from the other scenario.
+const PUBLISHED_CROSSED: [(&str, [&str; 4]); 3] = [
+    (RELEASED, ["60.1 ± 1.8", "63.2 ± 1.8", "44.9 ± 1.2", "33.5 ± 1.3"]),
+    ("transformer", CROSSED_OF_PAPER),
+    ("transformer-small", CROSSED_OF_PAPER),
+];
+
+const CROSSED_OF_PAPER: [&str; 4] = ["74.0 ± 2.8", "78.9 ± 2.7", "49.5 ± 1.4", "39.8 ± 1.7"];
+
+/// Milliseconds on an RTX 3090, packed and pile.
+const PUBLISHED_TIMES: [(&str, [&str; 2]); 3] = [
+    (RELEASED, ["11.0 ± 0.5", "11.2 ± 0.6"]),
+    ("transformer", ["24.3 ± 0.7", "24.6 ± 1.1"]),
+    ("transformer-small", ["24.3 ± 0.7", "24.6 ± 1.1"]),
+];
+
+/// What VGN's released weights are called, as in the paper.
+pub const RELEASED: &str = "VGN-R";
+
+/// What a method's name ends with if its network learnt from both scenarios.
+pub const LEARNT_BOTH: &str = " (both)";
+
+impl Results {
+    /// The tables in Markdown, under a head of one's own.
+    #[must_use]
+    pub fn markdown(&self) -> String {
+        let mut text = String::new();
+        self.data(&mut text);
+        let learnt_here = |game: &Game| game.learnt.as_ref().is_none_or(|learnt| *learnt == game.scenario);
+        text.push_str("\n## Table 2: clearing tables\n\n");
+        self.success(&mut text, &PUBLISHED, learnt_here);
+        text.push_str("\n## Table 3: milliseconds to plan\n\n");
+        self.times(&mut text);
+        text.push_str("\n## Table 4: learnt from the other scenario\n\n");
+        self.success(&mut text, &PUBLISHED_CROSSED, |game| !learnt_here(game));
+        text.push_str("\n## Where the camera stands\n\n");
+        self.views(&mut text);
+        text.push_str("\n## How it ended\n\n");
+        self.endings(&mut text);
+        text
+    }
+
+    fn data(&self, text: &mut String) {
+        text.push_str("## Table 1: what was learnt from\n\n| | scenes | grasps | test objects |\n|---|---|---|---|\n");
+        text.push_str("| pile, published | 83,305 | 1,564,546 | 40 |\n| packed, published | 16,640 | 638,012 | 16 |\n");
+        for scenario in SCENARIOS {
+            let objects = self.test_objects.get(scenario).map_or_else(String::new, usize::to_string);
+            let _ = writeln!(text, "| {scenario}, here | | | {objects} |");
+        }
+        for (file, (scenes, grasps)) in &self.data {
+            let _ = writeln!(text, "| `{file}` | {scenes} | {grasps} | |");
+        }
+    }
+
+    fn success(&self, text: &mut String, published: &[(&str, [&str; 4])], wanted: impl Fn(&Game) -> bool) {
+        text.push_str("| | packed GSR % | published | packed DR % | published | ");
+        text.push_str("pile GSR % | published | pile DR % | published |\n|---|---|---|---|---|---|---|---|---|\n");
+        let games = || self.games.iter().filter(|(game, _)| game.views == VIEWS[0].0 && wanted(game));
+        for method in in_order(games().map(|(game, _)| game.method.as_str())) {
+            let name = method.strip_suffix(LEARNT_BOTH).unwrap_or(method);
+            let of_method = published.iter().find(|(other, _)| *other == name).map(|(_, figures)| figures);
+            let mut row = format!("| {method} ");
+            for (column, scenario) in SCENARIOS.into_iter().enumerate() {
+                let played =
+                    games().find(|(game, _)| game.method == method && game.scenario == scenario).map(|(_, s)| s);
+                let figures: [fn(&Summary) -> f64; 2] = [|summary| summary.gsr, |summary| summary.dr];
+                for (index, figure) in figures.into_iter().enumerate() {
+                    let here = played.map_or_else(|| "–".to_owned(), |played| spread(played, figure));
+                    let there = of_method.map_or("–", |figures| figures[2 * column + index]);
+                    let _ = write!(row, "| {here} | {there} ");
+                }
+            }
+            text.push_str(&row);
+            text.push_str("|\n");
+        }
+    }
+
+    fn times(&self, text: &mut String) {
+        text.push_str("| | packed | published | pile | published |\n|---|---|---|---|---|\n");
+        for method in in_order(self.times.keys().map(|(method, _)| method.as_str())) {
+            let published =
+                PUBLISHED_TIMES.iter().find(|(name, _)| *name == method.strip_suffix(LEARNT_BOTH).unwrap_or(method));
+            let published = published.map(|(_, times)| times);
+            let mut row = format!("| {method} ");
+            for (column, scenario) in SCENARIOS.into_iter().enumerate() {
+                let here = self.times.get(&(method.to_owned(), scenario.to_owned()));
+                let here = here.map_or_else(
+                    || "–".to_owned(),
+                    |time| format!("{:.1} ± {:.1} (n {})", time.mean, time.std.unwrap_or(0.0), time.n),
+                );
+                let _ = write!(row, "| {here} | {} ", published.map_or("–", |times| times[column]));
+            }
+            text.push_str(&row);
+            text.push_str("|\n");
+        }
+    }
+
+    fn views(&self, text: &mut String) {
+        text.push_str("GSR / DR in %, pooled.\n\n| |");
+        VIEWS.iter().for_each(|(_, name)| text.push_str(&format!(" {name} |")));
+        text.push_str(&format!("\n|---|{}\n", "---|".repeat(VIEWS.len())));
+        let mut rows: Vec<(&str, Option<&str>, &str)> = self
+            .games
+            .keys()
+            .filter(|game| game.views != VIEWS[0].0)
+            .map(|game| (game.method.as_str(), game.learnt.as_deref(), game.scenario.as_str()))
+            .collect();
+        rows.sort_unstable();
+        rows.dedup();
+        for (method, learnt, scenario) in rows {
+            let _ = write!(text, "| {method} on {scenario} |");
+            for (views, _) in VIEWS {
+                let of_cell = |game: &Game| {
+                    let network = game.method == method && game.learnt.as_deref() == learnt;
+                    network && game.scenario == scenario && game.views == views
+                };
+                let played = self.games.iter().find(|(game, _)| of_cell(game)).map(|(_, played)| played);
+                let figures = played.map_or_else(|| "–".to_owned(), |played| pooled(played));
+                let _ = write!(text, " {figures} |");
+            }
+            text.push('\n');
+        }
+    }
+
+    fn endings(&self, text: &mut String) {
+        text.push_str("Of the attempts from the paper's view, in %; and of the rounds.\n\n");
+        text.push_str("| | attempts | lifted | blocked at the pre-grasp | closed on nothing | lost in the lift | ");
+        text.push_str("rounds | cleared | nothing seen | no proposal | two failures |\n");
+        text.push_str("|---|---|---|---|---|---|---|---|---|---|---|\n");
+        let games = || self.games.iter().filter(|(game, _)| game.views == VIEWS[0].0);
+        let methods = in_order(games().map(|(game, _)| game.method.as_str()));
+        for (game, played) in methods.iter().flat_map(|method| games().filter(|(game, _)| game.method == *method)) {
+            let sum = |figure: fn(&Summary) -> usize| played.iter().map(figure).sum::<usize>();
+            let share = |part: usize, whole: usize| match whole {
+                0 => "–".to_owned(),
+                whole => format!("{:.1}", part as f64 / whole as f64 * 100.0),
+            };
+            let (attempts, rounds) = (sum(|s| s.attempts), sum(|s| s.rounds));
+            let of_attempts = [
+                sum(|s| s.successes),
+                sum(|s| s.blocked_at_pregrasp),
+                sum(|s| s.closed_on_nothing),
+                sum(|s| s.lost_in_lift),
+            ]
+            .map(|part| share(part, attempts));
+            let of_rounds =
+                [sum(|s| s.cleared), sum(|s| s.nothing_seen), sum(|s| s.nothing_proposed), sum(|s| s.gave_up)]
+                    .map(|part| share(part, rounds));
+            let _ = writeln!(
+                text,
+                "| {} on {} | {attempts} | {} | {rounds} | {} |",
+                name(game),
+                game.scenario,
+                of_attempts.join(" | "),
+                of_rounds.join(" | ")
+            );
+        }
+    }
+}
+
+/// Each once: first the baselines as the paper has them, then the networks by their names.
+fn in_order<'a>(methods: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
+    const BASELINES: [&str; 6] = ["random", "shaf", "shaf (proposals)", "gpd", RELEASED, "vgn"];
+    let mut methods: Vec<&str> = methods.collect();
+    let rank = |method: &str| BASELINES.iter().position(|name| *name == method).unwrap_or(BASELINES.len());
+    methods.sort_unstable_by_key(|method| (rank(method), *method));
+    methods.dedup();
+    methods
+}
+
+fn name(game: &Game) -> String {
+    match &game.learnt {
+        Some(learnt) if *learnt != game.scenario => format!("{}, learnt from {learnt},", game.method),
+        _ => game.method.clone(),
+    }
+}
+
+fn spread(played: &[Summary], figure: fn(&Summary) -> f64) -> String {
+    let values: Vec<f64> = played.iter().map(figure).collect();
+    Spread::of(&values).map_or_else(|| "–".to_owned(), |spread| spread.percent())
+}
+
+fn pooled(played: &[Summary]) -> String {
+    let sum = |figure: fn(&Summary) -> usize| played.iter().map(figure).sum::<usize>() as f64;
+    let successes = sum(|s| s.successes) * 100.0;
+    format!("{:.1} / {:.1}", successes / sum(|s| s.attempts).max(1.0), successes / sum(|s| s.objects).max(1.0))
+}
