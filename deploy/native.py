@@ -116,13 +116,13 @@ def python() -> Path:
     def build(part: Path) -> None:
         import venv
 
-        say(f"The Python packages of the client's tests, 75 MB of wheels -> {folder}")
+        say(f"The Python packages of the tests, 95 MB of wheels -> {folder}")
         # Without a pip of its own, since Debian's Python has none to give. Nothing in bin/ but
         # `python` is used, which is what survives the renaming of the folder.
         venv.create(part, with_pip=False)
         names = [word for word in REQUIREMENTS.read_text().split() if "==" in word]
         pip(["--python", f"{part}/bin/python", "install", "--requirement", str(REQUIREMENTS)], names, f"""\
-The Python packages of the client's tests could not be installed; pip says above why.
+The Python packages of the tests could not be installed; pip says above why.
 To bring them from a machine with a network and Python {version}, run this there,
     python3 -m pip download --dest wheels --requirement {REQUIREMENTS}
 and copy the wheels into {WHEELS}/

@@ -1,25 +1,41 @@
-//! Another language: a client made from the .proto file alone, in `python/`.
+//! Another language, with the tests in `python/`.
 
+use std::ffi::OsStr;
 use std::path::Path;
 use std::process::Command;
 
-use grasp_tests::{Server, TestModel};
+use grasp_tests::{Server, TestModel, grasp_sim};
 
-#[test]
-fn a_python_client_gets_along_with_the_server() {
+/// Runs the tests of a file; `expected` is one of them, for unittest is content when it finds none at all.
+fn run(file: &str, environment: &[(&str, &OsStr)], expected: &str) {
     let python = std::env::var_os("GRASPD_PYTHON").expect("GRASPD_PYTHON is not set: run the tests by `make test`");
-    let server = Server::run(&[TestModel::new("mirror")], &[]);
-    let tests = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let tests = Path::new(env!("CARGO_MANIFEST_DIR")).join("python");
     let output = Command::new(python)
-        .args(["-m", "unittest", "discover", "--verbose", "--start-directory"])
-        .arg(tests.join("python"))
-        .env("GRASPD_SERVER", server.grpc().to_string())
-        .env("GRASPD_PROTO", tests.join("../proto/proto"))
+        .args(["-m", "unittest", "discover", "--verbose", "--pattern", file, "--start-directory"])
+        .arg(tests)
+        .envs(environment.iter().copied())
         .env("PYTHONDONTWRITEBYTECODE", "1")
         .output()
         .unwrap();
     let report = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{report}");
-    // unittest is content when it finds no test at all.
-    assert!(report.contains("test_the_grasps_are_where_the_blobs_are"), "{report}");
+    assert!(output.status.success() && report.contains(expected), "{report}");
+}
+
+#[test]
+fn a_python_client_gets_along_with_the_server() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let address = server.grpc().to_string();
+    let proto = Path::new(env!("CARGO_MANIFEST_DIR")).join("../proto/proto");
+    let environment = [("GRASPD_SERVER", address.as_ref()), ("GRASPD_PROTO", proto.as_os_str())];
+    run("test_client.py", &environment, "test_the_grasps_are_where_the_blobs_are");
+}
+
+#[test]
+fn python_reads_and_writes_our_data() {
+    run("test_data.py", &[("GRASP_SIM", grasp_sim().as_os_str())], "test_processed_data_load_with_pandas");
+}
+
+#[test]
+fn the_label_jobs_share_the_work_seen_from_python() {
+    run("test_label_jobs.py", &[("GRASP_SIM", grasp_sim().as_os_str())], "test_pods_label_what_one_machine_would");
 }

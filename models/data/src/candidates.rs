@@ -10,11 +10,10 @@ use std::path::Path;
 
 use grasp::gpd::{CHANNELS, IMAGE_SIZE, Image};
 use npyz::npz::{NpzArchive, NpzWriter, file_name_from_array_name};
-use npyz::zip::DateTime;
-use npyz::zip::write::FileOptions;
 use npyz::{AutoSerialize, Deserialize, NpyFile, WriterBuilder};
 
 use crate::error::{At, DataError};
+use crate::without_time;
 
 /// Bytes of an image.
 const PIXELS: usize = CHANNELS * IMAGE_SIZE * IMAGE_SIZE;
@@ -113,9 +112,7 @@ fn write_array<T: AutoSerialize>(
     shape: &[u64],
     values: impl Iterator<Item = T>,
 ) -> io::Result<()> {
-    // Without the time of day: the same candidates are the same bytes.
-    let options = FileOptions::default().last_modified_time(DateTime::default());
-    archive.zip_writer().start_file(file_name_from_array_name(name), options)?;
+    archive.zip_writer().start_file(file_name_from_array_name(name), without_time())?;
     // Without a buffer every pixel would be a call to the compressor, which took about as long as the trials.
     let mut file = io::BufWriter::with_capacity(1 << 16, archive.zip_writer());
     let mut array = npyz::WriteOptions::new().default_dtype().shape(shape).writer(&mut file).begin_nd()?;

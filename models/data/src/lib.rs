@@ -58,6 +58,11 @@ fn edge_of(voxels: usize) -> Option<usize> {
     (edge > 0 && edge.pow(3) == voxels).then_some(edge)
 }
 
+/// Options of an archive's entry that leave the time of day out: the same data are the same bytes.
+fn without_time() -> npyz::zip::write::FileOptions {
+    npyz::zip::write::FileOptions::default().last_modified_time(npyz::zip::DateTime::default())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -15,7 +15,7 @@ use rayon::prelude::*;
 
 use crate::error::{At, DataError};
 use crate::table::{self, TableWriter, Unit};
-use crate::{Scene, Setup, Trial, edge_of, quantise};
+use crate::{Scene, Setup, Trial, edge_of, quantise, without_time};
 
 const EXPECTED: &str = "`grid`, f32 [1, N, N, N] with values in [0, 1]";
 
@@ -76,7 +76,7 @@ pub fn read(folder: &Path) -> Result<Vec<Scene>, DataError> {
 fn write_volume(path: &Path, values: &[f32]) -> io::Result<()> {
     let edge = edge_of(values.len()).ok_or_else(|| io::Error::other(format!("{} is no cube", values.len())))? as u64;
     let mut archive = NpzWriter::create(path)?;
-    let array = archive.array("grid", npyz::zip::write::FileOptions::default())?;
+    let array = archive.array("grid", without_time())?;
     let mut grid = array.default_dtype().shape(&[1, edge, edge, edge]).begin_nd()?;
     grid.extend(values.iter().copied())?;
     grid.finish()

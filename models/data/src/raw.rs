@@ -16,7 +16,7 @@ use npyz::npz::{NpzArchive, NpzWriter};
 
 use crate::error::{At, DataError};
 use crate::table::{self, TableWriter, Unit};
-use crate::{Setup, Trial};
+use crate::{Setup, Trial, without_time};
 
 const EXPECTED: &str = "`depth_imgs`, f32 [n, height, width], and `extrinsics`, [n, 7]";
 
@@ -150,8 +150,7 @@ impl Reader {
 fn write_views(path: &Path, views: &[View], [height, width]: [usize; 2]) -> io::Result<()> {
     let mut archive = NpzWriter::create(path)?;
     // Deflated, as numpy.savez_compressed does: a depth image shrinks to a tenth.
-    let options =
-        || npyz::zip::write::FileOptions::default().compression_method(npyz::zip::CompressionMethod::Deflated);
+    let options = || without_time().compression_method(npyz::zip::CompressionMethod::Deflated);
     let count = views.len() as u64;
     let array = archive.array("depth_imgs", options())?;
     let mut images = array.default_dtype().shape(&[count, height as u64, width as u64]).begin_nd()?;

@@ -129,7 +129,7 @@ impl World {
     ///
     /// A pinched object creeps out of the hand unless friction is solved in both passes of a step and at each point of
     /// contact, and the fingers push with two thirds of their force unless motors and contacts are iterated together;
-    /// softer contacts let go of what is held by an edge. With these, VGN's released weights do within 5 points in
+    /// softer contacts let go of what is held by an edge. With these, VGN's released weights do within 6 points in
     /// this world what they do in the reference's; fewer iterations begin to lose points, more gain none.
     pub(super) fn grip(&mut self) {
         self.parameters = IntegrationParameters {

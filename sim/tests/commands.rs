@@ -1,0 +1,335 @@
+//! The commands of `grasp-sim` as a user types them. `ORT_DYLIB_PATH` must name ONNX Runtime's library.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::thread::sleep;
+use std::time::Duration;
+
+use grasp_data::Dataset;
+use grasp_sim::export;
+use serde_json::Value;
+use tempfile::TempDir;
+
+const SIM: &str = env!("CARGO_BIN_EXE_grasp-sim");
+const NETWORK: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo/vgn-packed.onnx");
+
+/// A folder to run commands in.
+struct Desk(TempDir);
+
+impl Desk {
+    fn new() -> Self {
+        Self(tempfile::tempdir().unwrap())
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    fn command(&self, arguments: &str) -> Command {
+        let mut command = Command::new(SIM);
+        command.current_dir(&self.0).args(arguments.split_whitespace()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command
+    }
+
+    fn run(&self, arguments: &str) -> String {
+        let output = self.command(arguments).output().unwrap();
+        assert!(output.status.success(), "{arguments}: {}", stderr(&output));
+        String::from_utf8(output.stdout).unwrap()
+    }
+
+    /// Runs what must fail, and gives what it says.
+    fn refused(&self, arguments: &str) -> String {
+        let output = self.command(arguments).output().unwrap();
+        assert!(!output.status.success(), "{arguments} should fail");
+        stderr(&output)
+    }
+
+    /// All there is in a packed folder: a scene's name, its volumes and its trials.
+    fn scenes(&self, name: &str) -> Vec<(String, Vec<Vec<u8>>, Vec<String>)> {
+        let data = Dataset::open(&[self.path(name)]).unwrap();
+        let scene = |index| {
+            let volumes = (0..data.volumes(index)).map(|look| data.volume(index, look).to_vec()).collect();
+            let trials =
+                data.trials(index).iter().map(|t| format!("{:.3?} {:.3} {}", t.position, t.width, t.success)).collect();
+            (data.id(index), volumes, trials)
+        };
+        let mut scenes: Vec<_> = (0..data.len()).map(scene).collect();
+        scenes.sort();
+        scenes
+    }
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+const LABEL: &str = "label --scene packed --objects endless --views anywhere:1-2 --looks 2 --points 6 --seed 4";
+
+fn bytes_of(folder: &Path) -> u64 {
+    let files = fs::read_dir(folder).into_iter().flatten().flatten();
+    files.filter_map(|file| file.metadata().ok()).map(|file| file.len()).sum()
+}
+
+#[test]
+fn a_killed_run_goes_on_without_a_lost_or_doubled_scene() {
+    let desk = Desk::new();
+    desk.run(&format!("{LABEL} --scenes 40 --out whole --export whole.jsonl"));
+    let mut kills = 0;
+    for threshold in [200_000, 1_500_000, 3_000_000] {
+        let mut child =
+            desk.command(&format!("{LABEL} --scenes 40 --out killed --export killed.jsonl")).spawn().unwrap();
+        while bytes_of(&desk.path("killed")) < threshold && child.try_wait().unwrap().is_none() {
+            sleep(Duration::from_millis(2));
+        }
+        kills += usize::from(child.try_wait().unwrap().is_none());
+        child.kill().unwrap();
+        child.wait().unwrap();
+    }
+    assert!(kills > 0, "it was never caught at work");
+    desk.run(&format!("{LABEL} --scenes 40 --out killed --export killed.jsonl"));
+    let whole = desk.scenes("whole");
+    assert!(whole.len() > 35);
+    assert!(whole == desk.scenes("killed"));
+    assert_eq!(fs::read(desk.path("whole.jsonl")).unwrap(), fs::read(desk.path("killed.jsonl")).unwrap());
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bytes_on_any_number_of_threads() {
+    let desk = Desk::new();
+    let label = |threads: &str| {
+        let out = format!("{LABEL} --scenes 12 --out threads-{threads}");
+        assert!(desk.command(&out).env("RAYON_NUM_THREADS", threads).output().unwrap().status.success());
+        fs::read(desk.path(&format!("threads-{threads}/scenes-00000.pack"))).unwrap()
+    };
+    let one = label("1");
+    assert!(one.len() > 1_000_000 && one == label("3"));
+    desk.run(&format!("{} --scenes 12 --out other", LABEL.replace("--seed 4", "--seed 5")));
+    assert!(one != fs::read(desk.path("other/scenes-00000.pack")).unwrap());
+}
+
+#[test]
+fn a_full_disk_is_said_and_what_was_written_stays() {
+    let desk = Desk::new();
+    // A limit on the size of files stands for the disk's end. In blocks of 512 or 1,024 bytes, as the shell likes.
+    let command = format!("trap '' XFSZ; ulimit -f 1000; exec {SIM} {LABEL} --scenes 30 --out full");
+    let output = Command::new("sh").args(["-c", &command]).current_dir(&desk.0).output().unwrap();
+    assert!(!output.status.success());
+    let said = stderr(&output);
+    assert!(said.contains("full/scenes-00000.pack: File too large"), "{said}");
+    let kept = desk.scenes("full");
+    assert!((1..30).contains(&kept.len()), "{} scenes", kept.len());
+    desk.run(&format!("{LABEL} --scenes 30 --out full"));
+    desk.run(&format!("{LABEL} --scenes 30 --out whole"));
+    assert!(desk.scenes("full") == desk.scenes("whole"));
+}
+
+#[test]
+fn every_form_holds_the_same() {
+    let desk = Desk::new();
+    let label = "label --scene pile --points 20 --scenes 6 --seed 2";
+    for format in ["raw", "processed", "packed"] {
+        desk.run(&format!("{label} --format {format} --out {format}"));
+    }
+    desk.run("convert --from processed --out from-processed");
+    assert!(desk.scenes("packed") == desk.scenes("from-processed"));
+    desk.run("convert --from raw --out from-raw");
+    // Grasps at the borders are dropped on the way from raw, and poses are f32 in its files.
+    let (packed, fused) = (desk.scenes("packed"), desk.scenes("from-raw"));
+    assert_eq!(packed.len(), fused.len());
+    for ((_, before, _), (_, after, _)) in packed.iter().zip(&fused) {
+        let pairs = || before[0].iter().zip(&after[0]);
+        let equal = pairs().filter(|(before, after)| before.abs_diff(**after) <= 1).count();
+        assert!(equal as f64 / pairs().count() as f64 > 0.999);
+    }
+}
+
+#[test]
+fn an_export_can_be_replayed() {
+    let desk = Desk::new();
+    desk.run("label --scene packed --objects train --points 10 --scenes 4 --seed 3 --out data --export scenes.jsonl");
+    desk.run("objects --objects train --out objects");
+    let lines = export::read(&desk.path("scenes.jsonl")).unwrap();
+    let data = Dataset::open(&[desk.path("data")]).unwrap();
+    assert_eq!(lines.len(), data.len());
+    for (index, line) in lines.iter().enumerate() {
+        assert!(!line.objects.is_empty() && line.trials.len() == 10);
+        for object in &line.objects {
+            assert!((0.7..=0.9).contains(&object.scale) && object.pose[2] > 0.05);
+            let urdf = format!("objects/{}.urdf", object.object);
+            assert!(desk.path(&urdf).exists(), "{urdf} is not among what `objects --out` wrote");
+        }
+        for (exported, trial) in line.trials.iter().zip(data.trials(index)) {
+            let grasp = trial.grasp(0.3 / 40.0);
+            assert_eq!(exported.label == 1, trial.success);
+            assert_eq!(exported.yaws.contains(&1), trial.success);
+            assert!((exported.width - grasp.width).abs() < 1e-6);
+            let position = grasp.pose.translation.vector;
+            assert!((0..3).all(|axis| (exported.pose[axis] - position[axis]).abs() < 1e-6));
+            assert!(exported.object.is_some_and(|object| object < line.objects.len()));
+        }
+    }
+}
+
+#[test]
+fn statistics_count_every_grasp_once() {
+    let desk = Desk::new();
+    desk.run("label --scene pile --points 25 --scenes 6 --seed 2 --out data --export scenes.jsonl");
+    let said = desk.run("stats data --export scenes.jsonl --out statistics");
+    assert!(said.contains("150 grasps"), "{said}");
+    let json: Value = serde_json::from_slice(&fs::read(desk.path("statistics/statistics.json")).unwrap()).unwrap();
+    let sum =
+        |bins: &Value, key: &str| bins.as_array().unwrap().iter().map(|bin| bin[key].as_u64().unwrap()).sum::<u64>();
+    let data = &json["data"];
+    let [failures, successes] = ["failures", "successes"].map(|key| data["grasps"][key].as_u64().unwrap());
+    assert_eq!(failures + successes, 150);
+    for over in ["heights", "approaches"] {
+        assert_eq!(sum(&data[over]["bins"], "failures"), failures, "{over}");
+        assert_eq!(sum(&data[over]["bins"], "successes"), successes, "{over}");
+    }
+    assert_eq!(sum(&data["widths"]["bins"], "successes"), successes);
+    let by_object = json["objects"].as_object().unwrap().values();
+    assert_eq!(by_object.map(|count| count["successes"].as_u64().unwrap()).sum::<u64>(), successes);
+    for picture in ["statistics.png", "objects.png"] {
+        assert!(fs::read(desk.path("statistics").join(picture)).unwrap().starts_with(b"\x89PNG"));
+    }
+}
+
+#[test]
+fn a_benchmark_tells_of_every_attempt() {
+    let desk = Desk::new();
+    let bench = format!("bench --planner random --planner {NETWORK} --rounds 1 --seeds 2 --seed 3");
+    let lines = desk.run(&format!("{bench} --attempts attempts.jsonl --pictures pictures"));
+    let summaries: Vec<Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let attempts = fs::read_to_string(desk.path("attempts.jsonl")).unwrap();
+    let attempts: Vec<Value> = attempts.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(summaries.len(), 2);
+    for summary in &summaries {
+        let count = |outcome: &str| {
+            let of_planner = attempts.iter().filter(|attempt| attempt["planner"] == summary["planner"]);
+            of_planner.filter(|attempt| attempt["outcome"] == outcome).count() as u64
+        };
+        let figure = |name: &str| summary[name].as_u64().unwrap();
+        assert_eq!(count("lifted"), figure("successes"));
+        for outcome in ["blocked_at_pregrasp", "closed_on_nothing", "lost_in_lift"] {
+            assert_eq!(count(outcome), figure(outcome), "{outcome}");
+        }
+        let failed = figure("blocked_at_pregrasp") + figure("closed_on_nothing") + figure("lost_in_lift");
+        assert_eq!(figure("successes") + failed, figure("attempts"));
+        let ended = ["cleared", "nothing_seen", "nothing_proposed", "gave_up"].map(figure).iter().sum::<u64>();
+        assert_eq!((ended, summary["seeds"]["gsr"]["n"].as_u64()), (2, Some(2)));
+        assert!(summary["fusion_p50_ms"].as_f64().unwrap() > 0.0);
+    }
+    let pictures: Vec<_> = fs::read_dir(desk.path("pictures")).unwrap().collect();
+    assert_eq!(pictures.len(), attempts.len(), "a picture for each attempt");
+
+    let rows = desk.run(&format!("{bench} --format markdown"));
+    let of_network = rows.lines().find(|line| line.contains("vgn-packed.onnx |")).unwrap();
+    let gsr = format!("{:.1} ±", summaries[1]["seeds"]["gsr"]["mean"].as_f64().unwrap() * 100.0);
+    assert!(of_network.contains(&gsr), "{of_network}: {gsr}");
+}
+
+#[test]
+fn every_planner_meets_the_same_scenes() {
+    let desk = Desk::new();
+    let objects = |planner: &str| -> Vec<u64> {
+        let lines = desk.run(&format!("bench --planner {planner} --scene pile --rounds 3 --seed 9"));
+        vec![serde_json::from_str::<Value>(&lines).unwrap()["objects"].as_u64().unwrap()]
+    };
+    assert_eq!(objects("random"), objects("shaf"));
+}
+
+#[test]
+fn tables_are_played_once() {
+    let desk = Desk::new();
+    fs::create_dir(desk.path("zoo")).unwrap();
+    fs::copy(NETWORK, desk.path("zoo/vgn-packed.onnx")).unwrap();
+    let tables = "tables --models zoo --out out/tables.md --rounds 1 --seeds 1 --timed 1";
+    let missing = |desk: &Desk| {
+        let output = desk.command(tables).output().unwrap();
+        assert!(output.status.success(), "{}", stderr(&output));
+        let said = stderr(&output);
+        let words: Vec<usize> = said.split_whitespace().filter_map(|word| word.parse().ok()).collect();
+        (words[0], words[1])
+    };
+    let (first, all) = missing(&desk);
+    assert!(first == all && all > 10);
+    let text = fs::read_to_string(desk.path("out/tables.md")).unwrap();
+    for row in ["| shaf |", "| vgn |", "74.5 ± 1.3", "`vgn-packed.onnx` | 3,264 |", "| vgn on packed |"] {
+        assert!(text.contains(row), "`{row}` is missing from:\n{text}");
+    }
+    assert_eq!(missing(&desk), (0, all));
+    assert_eq!(fs::read_to_string(desk.path("out/tables.md")).unwrap(), text);
+
+    // A run that was killed in the middle of a line, and a network that has changed.
+    let log = fs::read_to_string(desk.path("out/tables.jsonl")).unwrap();
+    assert_eq!(log.lines().count(), all);
+    fs::write(desk.path("out/tables.jsonl"), &log[..log.len() - 20]).unwrap();
+    assert_eq!(missing(&desk), (1, all));
+    let mut network = fs::read(NETWORK).unwrap();
+    // A field that ONNX does not know: another file, the same network.
+    network.extend([0xF8, 0x3F, 0x01]);
+    fs::write(desk.path("zoo/vgn-packed.onnx"), network).unwrap();
+    let (played, _) = missing(&desk);
+    assert!(played > 5 && played < all, "{played} of {all}: what does not depend on the network is kept");
+}
+
+#[test]
+fn mistakes_name_what_is_wrong() {
+    let desk = Desk::new();
+    desk.run("label --scene pile --points 5 --scenes 3 --format processed --out half");
+    for folder in ["empty", "urdf", "flat", "wide", "half/scenes"] {
+        fs::create_dir_all(desk.path(folder)).unwrap();
+    }
+    let urdf = |mesh: &str| {
+        format!(
+            "<robot name='o'><link name='l'><inertial><mass value='0.1'/></inertial><collision><geometry>\
+             <mesh filename='{mesh}'/></geometry></collision></link></robot>"
+        )
+    };
+    fs::write(desk.path("urdf/a.urdf"), "<robot><link>").unwrap();
+    fs::write(desk.path("flat/a.urdf"), urdf("a.obj")).unwrap();
+    fs::write(desk.path("flat/a.obj"), "v 0 0 0\nv 1 0 0\n").unwrap();
+    fs::write(desk.path("wide/a.urdf"), urdf("a.obj")).unwrap();
+    let corners = (0..8)
+        .map(|i| format!("v {} {} {}\n", 0.3 * f64::from(i & 1), 0.3 * f64::from(i >> 1 & 1), 0.3 * f64::from(i >> 2)));
+    let faces = ["1 2 4 3", "5 6 8 7", "1 2 6 5", "3 4 8 7", "1 3 7 5", "2 4 8 6"].map(|face| format!("f {face}\n"));
+    fs::write(desk.path("wide/a.obj"), corners.chain(faces).collect::<String>()).unwrap();
+    let label = "label --scene packed --scenes 1 --out never --objects";
+    for (arguments, expected) in [
+        (format!("{label} nowhere"), "nowhere"),
+        (format!("{label} empty"), "empty"),
+        (format!("{label} urdf"), "urdf/a.urdf"),
+        (format!("{label} flat"), "flat/a.obj"),
+        (format!("{label} wide"), "wide/a.urdf"),
+        ("label --scenes 1 --out never --views top".to_owned(), "use side, side:90, circle, or anywhere:1-6"),
+        ("label --scenes 1 --out never --noise 2".to_owned(), "must be from 0 to 1"),
+        ("label --scenes 1 --out never --looks 2 --format raw".to_owned(), "only --format packed"),
+        ("label --scenes 3 --scene pile --points 6 --format processed --out half".to_owned(), "half/setup.json"),
+        ("bench --planner nowhere.onnx --rounds 1".to_owned(), "nowhere.onnx"),
+        ("bench --planner grpc:127.0.0.1:1 --rounds 1".to_owned(), "127.0.0.1:1"),
+        ("tables --models nowhere".to_owned(), "nowhere"),
+        ("stats empty".to_owned(), "empty"),
+    ] {
+        let said = desk.refused(&arguments);
+        assert!(said.contains(expected) && !said.contains("panicked"), "{arguments}: {said}");
+    }
+    assert!(!desk.path("never").exists(), "nothing is begun that cannot go on");
+
+    // Half a data set: a scene whose file is missing, one that is no archive, a table that breaks off.
+    let scene = fs::read_dir(desk.path("half/scenes")).unwrap().next().unwrap().unwrap().path();
+    let name = scene.file_name().unwrap().to_str().unwrap().to_owned();
+    let whole = fs::read(&scene).unwrap();
+    fs::write(&scene, &whole[..whole.len() / 2]).unwrap();
+    assert!(desk.refused("convert --from half --out other").contains(&name));
+    fs::remove_file(&scene).unwrap();
+    assert!(desk.refused("convert --from half --out another").contains(&name));
+    fs::write(&scene, whole).unwrap();
+    let table = fs::read_to_string(desk.path("half/grasps.csv")).unwrap();
+    fs::write(desk.path("half/grasps.csv"), &table[..table.len() - 9]).unwrap();
+    let said = desk.refused("convert --from half --out third");
+    assert!(said.contains("half/grasps.csv, line 16"), "{said}");
+    // Labelling mends it: the last scene is made again.
+    desk.run("label --scene pile --points 5 --scenes 3 --format processed --out half");
+    assert_eq!(fs::read_to_string(desk.path("half/grasps.csv")).unwrap(), table);
+}
