@@ -9,7 +9,7 @@ use rand::{Rng, RngExt};
 use rand_distr::{Distribution, StandardNormal};
 
 use crate::TABLE_HEIGHT;
-use crate::objects::{Object, ObjectSet};
+use crate::objects::{Object, ObjectSet, SMALLEST_SCALE};
 use crate::physics::{STEPS_PER_SECOND, World};
 
 /// The two ways in which a scene is made.
@@ -26,9 +26,6 @@ const PILE_SCALE: Range<f64> = 0.8..1.0;
 
 /// Those of packed ones.
 const PACKED_SCALE: Range<f64> = SMALLEST_SCALE..0.9;
-
-/// The smallest of all.
-pub(crate) const SMALLEST_SCALE: f64 = 0.7;
 
 /// Velocity norm (m/s and rad/s together) at which a body counts as resting.
 const REST_SPEED: f64 = 0.01;

@@ -234,7 +234,7 @@ impl<'a> Watcher<'a> {
             let planner: String = planner.chars().map(|c| if c.is_alphanumeric() { c } else { '-' }).collect();
             let name = format!("{planner}-{seed}-{round:04}-{number:02}-{outcome}.png");
             let color = if attempt.outcome.is_success() { quality_color(1.0) } else { quality_color(0.0) };
-            let mut picture = Picture::of_workspace(800, 600, TABLE_HEIGHT);
+            let mut picture = Picture::of_workspace(480, 360, TABLE_HEIGHT);
             picture.scene(before).hand(&attempt.grasp.pose, attempt.grasp.width, color);
             for grasp in proposals.iter().skip(1) {
                 picture.gripper(&grasp.pose, grasp.width, quality_color(f64::from(grasp.quality)));

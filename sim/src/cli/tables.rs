@@ -26,7 +26,7 @@ use super::{Scene, parse_views};
 #[derive(Args)]
 pub struct Tables {
     /// Folder of our networks: NAME-packed.onnx and NAME-pile.onnx learnt from one scenario, NAME.onnx from both;
-    /// gpd.onnx is the classifier of GPD.
+    /// classifiers/gpd.onnx is GPD's.
     #[arg(long, default_value = "models/zoo")]
     models: PathBuf,
 
@@ -123,6 +123,10 @@ impl Tables {
             anyhow::Ok(Entry { method: method.to_owned(), learnt, planner: planner.to_owned(), sha256 })
         };
         let mut entries = vec![entry("random", None, "random", None)?, entry("shaf", None, "shaf", None)?];
+        let classifier = self.models.join("classifiers/gpd.onnx");
+        if classifier.exists() {
+            entries.push(entry("gpd", None, &format!("gpd:{}", classifier.display()), Some(&classifier))?);
+        }
         let mut files: Vec<PathBuf> = fs::read_dir(&self.models)
             .and_then(|files| files.map(|file| Ok(file?.path())).collect())
             .with_context(|| self.models.display().to_string())?;
@@ -130,10 +134,6 @@ impl Tables {
         files.sort();
         for path in &files {
             let (name, planner) = (path.file_stem().unwrap_or_default().to_string_lossy(), path.display().to_string());
-            if name == "gpd" {
-                entries.push(entry("gpd", None, &format!("gpd:{planner}"), Some(path))?);
-                continue;
-            }
             let scenario = SCENARIOS.into_iter().find(|scenario| name.ends_with(&format!("-{scenario}")));
             let method = match scenario {
                 Some(scenario) => name.trim_end_matches(&format!("-{scenario}")).to_owned(),

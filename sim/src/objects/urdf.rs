@@ -12,9 +12,8 @@ use rayon::prelude::*;
 use roxmltree::{Document, Node};
 use thiserror::Error;
 
-use super::Object;
+use super::{Object, SMALLEST_SCALE};
 use crate::mesh::Mesh;
-use crate::scene::SMALLEST_SCALE;
 
 /// PyBullet's friction for a link that states none.
 const DEFAULT_FRICTION: f64 = 0.5;
