@@ -55,7 +55,7 @@ impl Dataset {
     /// # Errors
     /// [`DataError`] names the file that cannot be used.
     pub fn open(folders: &[PathBuf]) -> Result<Self, DataError> {
-        let mut dataset = Self { resolution: 0, sources: Vec::new(), scenes: Vec::new() };
+        let mut dataset = Self::none();
         for folder in folders {
             let source = match Form::of(folder)? {
                 Form::Packed => Source::Packed(packed::Reader::open(folder)?),
@@ -80,10 +80,16 @@ impl Dataset {
         Ok(dataset)
     }
 
+    /// No scenes at all.
+    #[must_use]
+    pub fn none() -> Self {
+        Self { resolution: 0, sources: Vec::new(), scenes: Vec::new() }
+    }
+
     /// Scenes that are in memory already; `None` unless all their volumes are cubes of one size.
     #[must_use]
     pub fn of(scenes: Vec<Scene>) -> Option<Self> {
-        let mut dataset = Self { resolution: 0, sources: Vec::new(), scenes: Vec::new() };
+        let mut dataset = Self::none();
         dataset.add(Source::Memory(scenes)).ok()?;
         Some(dataset)
     }

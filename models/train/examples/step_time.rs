@@ -34,7 +34,7 @@ fn main() -> anyhow::Result<()> {
     for bf16 in [false, true] {
         for channels_last in [false, true] {
             let executor = Executor::new(build(network, 0)?, Execution { device, bf16, channels_last })?;
-            let mut adam = Adam::new(executor.parameters());
+            let mut adam = Adam::new(executor.parameters(), 0.0);
             let mut times: Vec<f64> = Vec::new();
             for _ in 0..STEPS {
                 let start = Instant::now();

@@ -1,8 +1,10 @@
 use tch::{Tensor, no_grad};
 
 /// Adam (Kingma and Ba, "Adam: A Method for Stochastic Optimization", ICLR 2015, algorithm 1) with its default
-/// constants. libtorch's own keeps its state to itself, so that training could not be resumed.
+/// constants, and with weights that decay by themselves (Loshchilov and Hutter, "Decoupled Weight Decay Regularization",
+/// ICLR 2019). libtorch's own keeps its state to itself, so that training could not be resumed.
 pub struct Adam {
+    weight_decay: f64,
     /// Steps taken: t.
     pub(crate) steps: u64,
     /// First and second moments of each parameter: m and v.
@@ -13,11 +15,11 @@ const BETA: [f64; 2] = [0.9, 0.999];
 const EPSILON: f64 = 1e-8;
 
 impl Adam {
-    /// For parameters of these shapes.
+    /// For parameters of these shapes. Those of one dimension, biases and scales, do not decay.
     #[must_use]
-    pub fn new(parameters: &[(String, Tensor)]) -> Self {
+    pub fn new(parameters: &[(String, Tensor)], weight_decay: f64) -> Self {
         let moments = parameters.iter().map(|(_, weight)| [0, 1].map(|_| weight.zeros_like().set_requires_grad(false)));
-        Self { steps: 0, moments: moments.collect() }
+        Self { weight_decay, steps: 0, moments: moments.collect() }
     }
 
     /// How many steps were taken.
@@ -40,6 +42,9 @@ impl Adam {
                 let _ = mean.lerp_(&gradient, 1.0 - BETA[0]);
                 let _ = square.lerp_(&gradient.square(), 1.0 - BETA[1]);
                 let change = &*mean / ((&*square / second).sqrt() + EPSILON);
+                if self.weight_decay > 0.0 && weight.dim() > 1 {
+                    weight *= 1.0 - learning_rate * self.weight_decay;
+                }
                 weight -= change * (learning_rate / first);
                 weight.zero_grad();
             }

@@ -12,6 +12,7 @@ use tch::{Tensor, no_grad};
 use thiserror::Error;
 
 use crate::adam::Adam;
+use crate::average::Average;
 use crate::execute::{Executor, tensor_of, values_of};
 use crate::loss::Sums;
 
@@ -35,7 +36,8 @@ pub struct Checkpoint {
     /// Adam's steps.
     #[prost(uint64, tag = "5")]
     pub steps: u64,
-    /// The smallest validation loss so far.
+    /// The least so far of what decides which weights are the best: the loss on the scenes held out, or the failures in a
+    /// simulator.
     #[prost(double, optional, tag = "6")]
     pub best: Option<f64>,
     /// The weights; those in the network's file may be the best instead of the last.
@@ -47,6 +49,12 @@ pub struct Checkpoint {
     /// How many scenes of each folder the run has come to know: folders may have grown since.
     #[prost(uint64, repeated, tag = "9")]
     pub scenes: Vec<u64>,
+    /// The moving average of the weights, if there is one.
+    #[prost(message, repeated, tag = "10")]
+    pub average: Vec<TensorProto>,
+    /// How often in a row it was not better than the best.
+    #[prost(uint64, tag = "11")]
+    pub worse: u64,
 }
 
 /// Why a run cannot go on from a checkpoint.
@@ -110,15 +118,21 @@ impl Checkpoint {
     }
 
     /// Stores the weights and the optimiser's state.
-    pub(crate) fn keep(&mut self, executor: &Executor, adam: &Adam) {
+    pub(crate) fn keep(&mut self, executor: &Executor, adam: &Adam, average: Option<&Average>) {
         let store = |name: &str, tensor: &Tensor| TensorProto::from_f32(name, &tensor.size(), &values_of(tensor));
         self.weights = executor.parameters().iter().map(|(name, weight)| store(name, weight)).collect();
         self.moments = adam.moments.iter().flatten().map(|moment| store("", moment)).collect();
+        self.average = average.iter().flat_map(|average| &average.weights).map(|weight| store("", weight)).collect();
         self.steps = adam.steps;
     }
 
     /// Puts them back.
-    pub(crate) fn restore(&self, executor: &Executor, adam: &mut Adam) -> Result<(), CheckpointError> {
+    pub(crate) fn restore(
+        &self,
+        executor: &Executor,
+        adam: &mut Adam,
+        average: Option<&Average>,
+    ) -> Result<(), CheckpointError> {
         let parameters = executor.parameters();
         if self.weights.len() != parameters.len() || self.moments.len() != 2 * parameters.len() {
             let reason = format!("it has {} weights, the network {}", self.weights.len(), parameters.len());
@@ -132,6 +146,14 @@ impl Checkpoint {
         }
         for (stored, moment) in self.moments.iter().zip(adam.moments.iter().flatten()) {
             copy(stored, moment)?;
+        }
+        let averages = average.map_or(0, |average| average.weights.len());
+        if self.average.len() != averages {
+            let reason = format!("it has averages of {} weights, the run {averages}", self.average.len());
+            return Err(CheckpointError::Weights(reason));
+        }
+        for (stored, weight) in self.average.iter().zip(average.iter().flat_map(|average| &average.weights)) {
+            copy(stored, weight)?;
         }
         adam.steps = self.steps;
         Ok(())

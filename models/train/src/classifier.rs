@@ -63,7 +63,7 @@ impl<'a> Learner<'a> {
         let (learnt, held_out) = examples.split(validation);
         let weight = examples.classes(&learnt).map(|count| learnt.len() as f32 / (2.0 * count.max(1) as f32));
         let weight = Tensor::from_slice(&weight).to_device(executor.device());
-        let adam = Adam::new(executor.parameters());
+        let adam = Adam::new(executor.parameters(), 0.0);
         let rng = ChaCha8Rng::seed_from_u64(seed);
         Ok(Self { executor, adam, examples, learnt, held_out, weight, settings, rng })
     }

@@ -9,7 +9,7 @@ use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
 
-use crate::trainer::{Record, Validation};
+use crate::record::{Record, Validation};
 
 const SIZE: (u32, u32) = (1000, 420);
 

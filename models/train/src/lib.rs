@@ -7,6 +7,8 @@
 
 mod adam;
 mod augment;
+mod average;
+mod batch;
 mod checkpoint;
 mod classifier;
 pub mod curves;
@@ -14,6 +16,8 @@ mod examples;
 mod execute;
 mod heads;
 mod loss;
+mod record;
+mod settings;
 mod trainer;
 
 pub use adam::Adam;
@@ -23,4 +27,6 @@ pub use classifier::{ClassifierSettings, Learner, Tally};
 pub use examples::Examples;
 pub use execute::{ExecuteError, Execution, Executor, Outputs};
 pub use loss::{Loss, LossError, Sums, Targets};
-pub use trainer::{Epoch, Record, Settings, TrainError, Trainer, Validation};
+pub use record::{Record, Success, Validation};
+pub use settings::Settings;
+pub use trainer::{Epoch, TrainError, Trainer};

@@ -1,6 +1,7 @@
 //! Trains grasp networks, or writes one with random weights.
 
 mod classify;
+mod evaluate;
 mod run;
 
 use std::path::PathBuf;
@@ -64,6 +65,9 @@ struct Training {
     /// Scenes in a step [default: 32 for vgn, 64 for the transformers].
     #[arg(long)]
     batch: Option<usize>,
+    /// Batches whose gradients make a step together.
+    #[arg(long, default_value_t = 1)]
+    accumulate: usize,
     /// Adam's learning rate [default: 3e-4 for vgn, 1e-4 for the transformers].
     #[arg(long)]
     lr: Option<f64>,
@@ -73,15 +77,32 @@ struct Training {
     /// Let the learning rate fall to 0 along half a cosine.
     #[arg(long)]
     cosine: bool,
+    /// What is taken off the weights in every step, times the learning rate (AdamW).
+    #[arg(long, default_value_t = 0.0)]
+    weight_decay: f64,
+    /// Validate and write a moving average of the weights that keeps this share of itself in every step, such as 0.999.
+    #[arg(long)]
+    ema: Option<f64>,
     /// Decides the random weights, the order of the scenes and how they are changed.
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Share of the scenes that are held out to validate on.
     #[arg(long, default_value_t = 0.1)]
     val: f64,
-    /// Which weights the model holds in the end: the last, as in the paper, or those of the smallest validation loss.
+    /// Which weights the model holds in the end: the last, as in the paper, or the best: by --evaluate, else by the
+    /// validation loss.
     #[arg(long, value_enum, default_value_t = Keep::Last)]
     keep: Keep,
+    /// Try the model with this command, in which {} stands for its file, and which prints objects with `gsr` and `dr`:
+    /// `grasp-sim bench --planner {} --rounds 40`.
+    #[arg(long, value_name = "COMMAND")]
+    evaluate: Option<String>,
+    /// Do so after every so many epochs, and after the last.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
+    evaluate_every: u64,
+    /// Stop when the model was not better than the best so often in a row, by --evaluate, else by the validation loss.
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
+    patience: Option<u64>,
     /// Where in its voxel a grasp stands: corner as in VGN, or center, which keeps turned and mirrored scenes exact
     /// [default: center, or what the model given by --from says].
     #[arg(long, value_enum)]

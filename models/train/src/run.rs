@@ -11,11 +11,12 @@ use grasp::VoxelOrigin;
 use grasp_data::Dataset;
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Metadata, build};
-use grasp_train::{Augmentation, Checkpoint, Epoch, Execution, Record, Settings, Trainer, curves};
+use grasp_train::{Augmentation, Checkpoint, Epoch, Execution, Record, Settings, Success, Trainer, curves};
 use indicatif::{ProgressBar, ProgressStyle};
 use tch::Device;
 use time::OffsetDateTime;
 
+use crate::evaluate::{PLACE, evaluate};
 use crate::{Change, Keep, Origin, Training};
 
 /// Trains as told, until the last epoch or Ctrl-C.
@@ -24,6 +25,13 @@ pub(crate) fn train(training: &Training) -> Result<()> {
         tch::set_num_threads(i32::try_from(threads).context("--threads")?);
     }
     ensure!((0.0..1.0).contains(&training.val), "--val is {}, must be at least 0 and below 1", training.val);
+    ensure!(training.weight_decay >= 0.0, "--weight-decay is {}, must be at least 0", training.weight_decay);
+    if let Some(decay) = training.ema {
+        ensure!((0.0..1.0).contains(&decay), "--ema is {decay}, must be at least 0 and below 1");
+    }
+    if let Some(command) = &training.evaluate {
+        ensure!(command.contains(PLACE), "--evaluate is `{command}`, in which {PLACE} must stand for the model");
+    }
     let files = Files::beside(&training.out)?;
     let (model, mut metadata) = start_from(training)?;
     let settings = settings(training, &metadata);
@@ -39,11 +47,11 @@ pub(crate) fn train(training: &Training) -> Result<()> {
     let mut trainer = Trainer::new(model, dataset, settings.clone(), execution)?;
 
     let mut records = Vec::new();
-    let mut best = None;
+    let mut progress = Progress::default();
     if training.resume {
         let checkpoint = Checkpoint::read(&files.state)?;
         trainer.resume(&checkpoint)?;
-        best = checkpoint.best;
+        progress = Progress { best: checkpoint.best, worse: checkpoint.worse };
         records = files.read_log(trainer.epochs())?;
     }
     report(&trainer);
@@ -52,7 +60,7 @@ pub(crate) fn train(training: &Training) -> Result<()> {
     let signal = Arc::clone(&stop);
     ctrlc::set_handler(move || signal.store(true, Ordering::Relaxed)).context("cannot listen for Ctrl-C")?;
 
-    while trainer.epochs() < settings.epochs {
+    while trainer.epochs() < settings.epochs && training.patience.is_none_or(|patience| progress.worse < patience) {
         if training.follow && trainer.follow()? > 0 {
             report(&trainer);
         }
@@ -62,29 +70,57 @@ pub(crate) fn train(training: &Training) -> Result<()> {
             bar.set_message(format!("{loss:.4}"));
         })?;
         bar.finish_and_clear();
-        let mut better = best.is_none();
+        let mut better = progress.best.is_none();
         let interrupted = matches!(epoch, Epoch::Interrupted);
-        if let Epoch::Done(record) = epoch {
-            println!("{}", serde_json::to_string(&record)?);
-            if let Some(validation) = record.validation {
-                better = best.is_none_or(|best| validation.loss < best);
-                best = if better { Some(validation.loss) } else { best };
+        if let Epoch::Done(mut record) = epoch {
+            describe(training, &settings, trainer.dataset(), &mut metadata);
+            let due = trainer.epochs().is_multiple_of(training.evaluate_every) || trainer.epochs() == settings.epochs;
+            if let Some(command) = training.evaluate.as_deref().filter(|_| due) {
+                write_model(&mut trainer, &metadata, Some(&record), &files.tried)?;
+                record.success = Some(evaluate(command, &files.tried)?);
             }
+            println!("{}", serde_json::to_string(&record)?);
+            better = progress.take(training, &record);
             records.push(record);
             files.write_log(&records)?;
             curves::draw(&files.curves, &records)?;
         }
         if training.keep == Keep::Last || better {
             describe(training, &settings, trainer.dataset(), &mut metadata);
-            write_model(&trainer, &metadata, records.last(), &training.out)?;
+            write_model(&mut trainer, &metadata, records.last(), &training.out)?;
         }
-        Checkpoint { best, ..trainer.checkpoint() }.write(&files.state)?;
+        let Progress { best, worse } = progress;
+        Checkpoint { best, worse, ..trainer.checkpoint() }.write(&files.state)?;
         if interrupted {
             eprintln!("stopped after step {}; go on with --resume", trainer.steps());
             return Ok(());
         }
     }
     Ok(())
+}
+
+/// How good it has been.
+#[derive(Clone, Copy, Default)]
+struct Progress {
+    /// The least so far of what is to be small.
+    best: Option<f64>,
+    /// How often in a row it was not less since.
+    worse: u64,
+}
+
+impl Progress {
+    /// Whether this epoch is the best so far; if nothing can be said of it, whether there is none before it.
+    fn take(&mut self, training: &Training, record: &Record) -> bool {
+        let cost = match (&training.evaluate, record.success) {
+            // Failures of grasps and objects left on the table weigh the same.
+            (Some(_), success) => success.map(|Success { gsr, dr }| 1.0 - (gsr + dr) / 2.0),
+            (None, _) => record.validation.map(|validation| validation.loss),
+        };
+        let Some(cost) = cost else { return self.best.is_none() };
+        let better = self.best.is_none_or(|best| cost < best);
+        *self = if better { Self { best: Some(cost), worse: 0 } } else { Self { worse: self.worse + 1, ..*self } };
+        better
+    }
 }
 
 fn report(trainer: &Trainer) {
@@ -128,9 +164,12 @@ fn settings(training: &Training, metadata: &Metadata) -> Settings {
     Settings {
         epochs: training.epochs.unwrap_or(epochs),
         batch: training.batch.unwrap_or(batch),
+        accumulate: training.accumulate,
         learning_rate: training.lr.unwrap_or(learning_rate),
         warmup: training.warmup,
         cosine: training.cosine,
+        weight_decay: training.weight_decay,
+        average: training.ema,
         seed: training.seed,
         validation: training.val,
         augmentation: Augmentation {
@@ -162,13 +201,16 @@ fn describe(training: &Training, settings: &Settings, dataset: &Dataset, metadat
     }
 }
 
-fn write_model(trainer: &Trainer, metadata: &Metadata, last: Option<&Record>, path: &Path) -> Result<()> {
+fn write_model(trainer: &mut Trainer, metadata: &Metadata, last: Option<&Record>, path: &Path) -> Result<()> {
     let mut metadata = metadata.clone();
     let mut note = |key: &str, value: String| metadata.provenance.insert(key.to_owned(), value);
     note("epochs", trainer.epochs().to_string());
     note("steps", trainer.steps().to_string());
     if let Some(record) = last {
         note("loss", record.loss.to_string());
+        if let Some(Success { gsr, dr }) = record.success {
+            note("evaluation", format!("GSR {gsr:.3}, DR {dr:.3}"));
+        }
         if let Some(validation) = record.validation {
             note("validation_loss", validation.loss.to_string());
             note("validation_accuracy", validation.accuracy.to_string());
@@ -190,6 +232,8 @@ struct Files {
     state: PathBuf,
     log: PathBuf,
     curves: PathBuf,
+    /// The model while it is tried.
+    tried: PathBuf,
 }
 
 impl Files {
@@ -201,6 +245,7 @@ impl Files {
             state: model.with_extension("state"),
             log: model.with_extension("jsonl"),
             curves: model.with_extension("png"),
+            tried: model.with_extension("tried"),
         })
     }
 

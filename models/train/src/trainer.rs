@@ -1,102 +1,22 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use grasp::VoxelOrigin;
 use grasp_data::{DataError, Dataset};
 use grasp_models::onnx::ModelProto;
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
 use tch::{TchError, Tensor, no_grad};
 use thiserror::Error;
 
 use crate::adam::Adam;
-use crate::augment::{Augmentation, Transform};
+use crate::average::Average;
+use crate::batch::{Batch, Example, read_ahead};
 use crate::checkpoint::{Checkpoint, CheckpointError};
 use crate::execute::{ExecuteError, Execution, Executor};
-use crate::loss::{Loss, LossError, Sums, Targets};
-
-/// Everything that decides the outcome of a run, besides the network it starts from and the data.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Settings {
-    /// Times every scene is seen.
-    pub epochs: u64,
-    /// Scenes in a step.
-    pub batch: usize,
-    /// Adam's learning rate, after the warm-up.
-    pub learning_rate: f64,
-    /// Steps over which the learning rate rises from 0.
-    pub warmup: u64,
-    /// Whether it then falls to 0 along half a cosine, instead of staying.
-    pub cosine: bool,
-    /// Decides the order of the scenes and how they are changed.
-    pub seed: u64,
-    /// Share of the scenes that are held out.
-    pub validation: f64,
-    /// How scenes are changed.
-    pub augmentation: Augmentation,
-    /// Whether failures and successes weigh the same in the quality's loss, however many there are of each. Otherwise
-    /// the data decide, which VGN balances beforehand.
-    pub balance: bool,
-    /// Where in its voxel a grasp stands, `corner` or `center`.
-    #[serde(serialize_with = "origin_name")]
-    pub voxel_origin: VoxelOrigin,
-    /// Whether convolutions and matrix products are computed in bf16.
-    pub bf16: bool,
-}
-
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks for a reference")]
-fn origin_name<S: serde::Serializer>(origin: &VoxelOrigin, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.serialize_str(match origin {
-        VoxelOrigin::Corner => "corner",
-        VoxelOrigin::Center => "center",
-    })
-}
-
-/// One epoch, as it is logged.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Record {
-    /// Counted from 1.
-    pub epoch: u64,
-    /// Steps since the start.
-    pub steps: u64,
-    /// Learning rate of the last step.
-    pub learning_rate: f64,
-    /// Mean loss over the labelled voxels.
-    pub loss: f64,
-    /// Its parts: cross-entropy of the quality,
-    pub loss_quality: f64,
-    /// rotation,
-    pub loss_rotation: f64,
-    /// and width.
-    pub loss_width: f64,
-    /// The same over the scenes held out, if any.
-    pub validation: Option<Validation>,
-    /// Time this epoch took, without the part before an interruption.
-    pub seconds: f64,
-    /// Training speed.
-    pub volumes_per_second: f64,
-}
-
-/// How the network does on scenes it does not learn from.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Validation {
-    /// Mean loss over the labelled voxels.
-    pub loss: f64,
-    /// Its parts: cross-entropy of the quality,
-    pub loss_quality: f64,
-    /// rotation,
-    pub loss_rotation: f64,
-    /// and width.
-    pub loss_width: f64,
-    /// Share of voxels on the right side of a quality of 0.5.
-    pub accuracy: f64,
-    /// Share of successes among the voxels above it.
-    pub precision: Option<f64>,
-    /// Share of the successes above it.
-    pub recall: Option<f64>,
-}
+use crate::loss::{Loss, LossError, Sums};
+use crate::record::{Record, Validation};
+use crate::settings::Settings;
 
 /// Why training stopped.
 #[derive(Debug, Error)]
@@ -136,15 +56,6 @@ pub enum Epoch {
     Interrupted,
 }
 
-/// What a step sees of a scene.
-#[derive(Clone, Copy, Debug, Default)]
-struct Example {
-    scene: usize,
-    /// Which of its volumes.
-    look: usize,
-    transform: Transform,
-}
-
 /// A run: a network, its optimiser, the data, and how far it has come.
 pub struct Trainer {
     settings: Settings,
@@ -156,6 +67,7 @@ pub struct Trainer {
     fingerprint: String,
     executor: Executor,
     adam: Adam,
+    average: Option<Average>,
     /// Epochs completed, batches done of the next, and their losses.
     epoch: u64,
     batch: u64,
@@ -174,7 +86,8 @@ impl Trainer {
         execution: Execution,
     ) -> Result<Self, TrainError> {
         let executor = Executor::new(model, execution)?;
-        let adam = Adam::new(executor.parameters());
+        let adam = Adam::new(executor.parameters(), settings.weight_decay);
+        let average = settings.average.map(|decay| Average::new(decay, executor.parameters()));
         let mut trainer = Self {
             settings,
             dataset,
@@ -184,6 +97,7 @@ impl Trainer {
             fingerprint: String::new(),
             executor,
             adam,
+            average,
             epoch: 0,
             batch: 0,
             sums: Sums::default(),
@@ -210,14 +124,16 @@ impl Trainer {
     /// Everything that depends on the scenes at hand.
     fn look_over(&mut self) -> Result<(), TrainError> {
         let (training, validation) = self.dataset.split(self.settings.validation);
-        if training.is_empty() || self.settings.batch == 0 {
+        let Settings { batch, accumulate, .. } = self.settings;
+        if training.is_empty() || batch == 0 || accumulate == 0 {
             let (scenes, held_out) = (self.dataset.len(), validation.len());
-            let batch = self.settings.batch;
-            let reason = format!("nothing to learn from: {scenes} scenes, {held_out} held out, batches of {batch}");
+            let reason = format!(
+                "nothing to learn from: {scenes} scenes, {held_out} held out, steps of {accumulate} times {batch}"
+            );
             return Err(TrainError::Settings(reason));
         }
         self.class_weights = if self.settings.balance { class_weights(&self.dataset, &training)? } else { [1.0; 2] };
-        self.fingerprint = fingerprint(&self.settings, &self.dataset, training.len(), validation.len());
+        self.fingerprint = self.settings.fingerprint(&self.dataset, training.len(), validation.len());
         (self.training, self.validation) = (training, validation);
         Ok(())
     }
@@ -249,13 +165,26 @@ impl Trainer {
     /// Steps in an epoch.
     #[must_use]
     pub fn steps_per_epoch(&self) -> u64 {
-        self.training.len().div_ceil(self.settings.batch) as u64
+        let Settings { batch, accumulate, .. } = self.settings;
+        self.training.len().div_ceil(batch).div_ceil(accumulate) as u64
     }
 
-    /// The network as it is now.
+    /// The network as it is now, with the average of the weights if there is one.
     #[must_use]
-    pub fn model(&self) -> ModelProto {
-        self.executor.to_model()
+    pub fn model(&mut self) -> ModelProto {
+        self.averaged(|trainer| trainer.executor.to_model())
+    }
+
+    /// Works with the average of the weights, if there is one.
+    fn averaged<R>(&mut self, work: impl FnOnce(&Self) -> R) -> R {
+        if let Some(average) = &mut self.average {
+            average.swap(self.executor.parameters());
+        }
+        let result = work(self);
+        if let Some(average) = &mut self.average {
+            average.swap(self.executor.parameters());
+        }
+        result
     }
 
     /// Where the run stands.
@@ -269,7 +198,7 @@ impl Trainer {
             scenes: self.dataset.sizes().into_iter().map(|size| size as u64).collect(),
             ..Checkpoint::default()
         };
-        checkpoint.keep(&self.executor, &self.adam);
+        checkpoint.keep(&self.executor, &self.adam, self.average.as_ref());
         checkpoint
     }
 
@@ -288,46 +217,50 @@ impl Trainer {
             return Err(CheckpointError::Settings { theirs, ours }.into());
         }
         let sums = Sums::from_list(&checkpoint.sums).ok_or(CheckpointError::Sums(checkpoint.sums.len()))?;
-        checkpoint.restore(&self.executor, &mut self.adam)?;
+        checkpoint.restore(&self.executor, &mut self.adam, self.average.as_ref())?;
         self.epoch = checkpoint.epoch;
         self.batch = checkpoint.batch;
         self.sums = sums;
         Ok(())
     }
 
-    /// Trains for the rest of an epoch, unless `stop` is set meanwhile; `report` hears of every step: batches done and
-    /// the mean loss of the epoch so far.
+    /// Trains for the rest of an epoch, unless `stop` is set meanwhile; `report` hears of every step: how many of the
+    /// epoch are done, and its mean loss so far.
     ///
     /// # Errors
     /// [`TrainError`] when the network or the loss fails.
     pub fn epoch(&mut self, stop: &AtomicBool, mut report: impl FnMut(u64, f64)) -> Result<Epoch, TrainError> {
         let start = Instant::now();
         let plan = self.plan();
+        let Settings { batch, accumulate, voxel_origin, .. } = self.settings;
+        let plan: Vec<&[Example]> = plan.chunks(batch).skip(self.batch as usize).collect();
         let mut volumes = 0;
         let mut learning_rate = 0.0;
-        for batch in plan.chunks(self.settings.batch).skip(self.batch as usize) {
-            if stop.load(Ordering::Relaxed) {
-                return Ok(Epoch::Interrupted);
-            }
-            learning_rate = self.learning_rate();
-            if let Some(Loss { mean, sums }) = self.loss(batch)? {
-                if !sums.loss().is_finite() {
-                    return Err(self.diverged());
+        // Out of the way of what the steps change; back in its place before anything is returned.
+        let dataset = std::mem::replace(&mut self.dataset, Dataset::none());
+        let done: Result<bool, TrainError> = read_ahead(&dataset, &plan, voxel_origin, |mut batches| {
+            let mut left = plan.len();
+            while left > 0 {
+                if stop.load(Ordering::Relaxed) {
+                    return Ok(false);
                 }
-                mean.f_backward()?;
-                self.adam.step(self.executor.parameters(), learning_rate);
-                self.sums.add(&sums);
+                let passes = accumulate.min(left);
+                learning_rate = self.settings.learning_rate_at(self.steps(), self.steps_per_epoch());
+                volumes += self.step(batches.by_ref().take(passes), passes, learning_rate)?;
+                left -= passes;
+                self.batch += passes as u64;
+                report(self.batch.div_ceil(accumulate as u64), self.sums.loss());
             }
-            volumes += batch.len();
-            self.batch += 1;
-            report(self.batch, self.sums.loss());
+            Ok(true)
+        });
+        self.dataset = dataset;
+        if !done? {
+            return Ok(Epoch::Interrupted);
         }
         let seconds = start.elapsed().as_secs_f64();
-        let (sums, batches) = (self.sums, self.batch);
+        let sums = std::mem::take(&mut self.sums);
         self.epoch += 1;
         self.batch = 0;
-        self.sums = Sums::default();
-        debug_assert_eq!(batches, self.steps_per_epoch());
         Ok(Epoch::Done(Record {
             epoch: self.epoch,
             steps: self.steps(),
@@ -336,30 +269,53 @@ impl Trainer {
             loss_quality: sums.quality / sums.voxels,
             loss_rotation: sums.rotation / sums.voxels,
             loss_width: sums.width / sums.voxels,
-            validation: self.validate()?,
+            validation: self.averaged(Self::validate)?,
+            success: None,
             seconds,
             volumes_per_second: volumes as f64 / seconds,
         }))
     }
 
-    /// The loss over the scenes held out, as they are; none if there are none.
-    fn validate(&self) -> Result<Option<Validation>, TrainError> {
-        let mut sums = Sums::default();
-        let scenes: Vec<_> = self.validation.iter().map(|&scene| Example { scene, ..Example::default() }).collect();
-        for batch in scenes.chunks(self.settings.batch) {
-            if let Some(loss) = no_grad(|| self.loss(batch))? {
-                sums.add(&loss.sums);
+    /// One step over so many batches, whose gradients weigh the same; says how many volumes they were.
+    fn step(
+        &mut self,
+        batches: impl Iterator<Item = Batch>,
+        passes: usize,
+        learning_rate: f64,
+    ) -> Result<usize, TrainError> {
+        let (mut volumes, mut learnt) = (0, false);
+        for batch in batches {
+            volumes += batch.len;
+            let Some(Loss { mean, sums }) = self.loss(&batch)? else { continue };
+            if !sums.loss().is_finite() {
+                return Err(self.diverged());
+            }
+            (mean / passes as f64).f_backward()?;
+            self.sums.add(&sums);
+            learnt = true;
+        }
+        if learnt {
+            self.adam.step(self.executor.parameters(), learning_rate);
+            if let Some(average) = &mut self.average {
+                average.update(self.executor.parameters(), self.adam.steps());
             }
         }
-        Ok((sums.voxels > 0.0).then(|| Validation {
-            loss: sums.loss(),
-            loss_quality: sums.quality / sums.voxels,
-            loss_rotation: sums.rotation / sums.voxels,
-            loss_width: sums.width / sums.voxels,
-            accuracy: sums.accuracy(),
-            precision: Some(sums.precision()).filter(|share| share.is_finite()),
-            recall: Some(sums.recall()).filter(|share| share.is_finite()),
-        }))
+        Ok(volumes)
+    }
+
+    /// The loss over the scenes held out, as they are; none if there are none.
+    fn validate(&self) -> Result<Option<Validation>, TrainError> {
+        let scenes: Vec<_> = self.validation.iter().map(|&scene| Example { scene, ..Example::default() }).collect();
+        let plan: Vec<&[Example]> = scenes.chunks(self.settings.batch).collect();
+        read_ahead(&self.dataset, &plan, self.settings.voxel_origin, |batches| {
+            let mut sums = Sums::default();
+            for batch in batches {
+                if let Some(loss) = no_grad(|| self.loss(&batch))? {
+                    sums.add(&loss.sums);
+                }
+            }
+            Ok(Validation::of(&sums))
+        })
     }
 
     /// The order of an epoch's scenes and how each is changed: a function of the seed and the epoch.
@@ -376,39 +332,16 @@ impl Trainer {
         scenes.into_iter().map(&mut example).collect()
     }
 
-    fn learning_rate(&self) -> f64 {
-        let Settings { epochs, learning_rate, warmup, cosine, .. } = self.settings;
-        let step = self.steps();
-        if step < warmup {
-            return learning_rate * (step + 1) as f64 / warmup as f64;
-        }
-        if !cosine {
-            return learning_rate;
-        }
-        let last = (epochs * self.steps_per_epoch()).max(warmup + 1);
-        let progress = (step - warmup) as f64 / (last - warmup) as f64;
-        learning_rate * 0.5 * (1.0 + (std::f64::consts::PI * progress.min(1.0)).cos())
-    }
-
-    /// One forward pass over some scenes; none when no grasp of theirs lies inside its volume.
-    fn loss(&self, batch: &[Example]) -> Result<Option<Loss>, TrainError> {
-        let n = self.dataset.resolution();
-        let mut values = vec![0.0; batch.len() * n.pow(3)];
-        let mut targets = Targets::default();
-        for (index, (example, out)) in batch.iter().zip(values.chunks_exact_mut(n.pow(3))).enumerate() {
-            let &Example { scene, look, transform } = example;
-            transform.volume(self.dataset.volume(scene, look), n, out);
-            for trial in self.dataset.trials(scene) {
-                targets.push(index, &transform.trial(&trial, n), n, self.settings.voxel_origin);
-            }
-        }
-        if targets.is_empty() {
+    /// One forward pass; none when no grasp of the scenes lies inside its volume.
+    fn loss(&self, batch: &Batch) -> Result<Option<Loss>, TrainError> {
+        if batch.targets.is_empty() {
             return Ok(None);
         }
-        let edge = n as i64;
-        let volumes = Tensor::f_from_slice(&values)?.f_reshape([batch.len() as i64, 1, edge, edge, edge])?;
-        let outputs = self.executor.forward_at(&volumes.to_device(self.executor.device()), targets.cells())?;
-        match targets.loss(&outputs, self.class_weights) {
+        let edge = (batch.volumes.len() as f64 / batch.len as f64).cbrt().round() as i64;
+        let volumes = Tensor::f_from_slice(&batch.volumes)?.f_reshape([batch.len as i64, 1, edge, edge, edge])?;
+        let volumes = volumes.to_device(self.executor.device());
+        let outputs = self.executor.forward_at(&volumes, batch.targets.cells())?;
+        match batch.targets.loss(&outputs, self.class_weights) {
             Err(LossError::NotANumber) => Err(self.diverged()),
             loss => Ok(Some(loss?)),
         }
@@ -417,17 +350,6 @@ impl Trainer {
     fn diverged(&self) -> TrainError {
         TrainError::Diverged { step: self.steps() }
     }
-}
-
-/// What must be the same for a run to go on: the settings, the scenes and their grasps. A run at a constant learning rate
-/// may be made longer.
-fn fingerprint(settings: &Settings, dataset: &Dataset, training: usize, validation: usize) -> String {
-    let mut settings = settings.clone();
-    if !settings.cosine {
-        settings.epochs = 0;
-    }
-    let settings = serde_json::to_string(&settings).unwrap_or_default();
-    format!("{settings} over {training} + {validation} scenes (labels {})", dataset.fingerprint())
 }
 
 /// Weights that make both classes count the same: n / (2 n_class).

@@ -99,6 +99,29 @@ fn a_run_goes_on_where_it_stopped() {
 }
 
 #[test]
+fn a_run_ends_when_the_simulator_says_so() {
+    let folder = prepare();
+    // Worse each time: 0.9, 0.8, 0.7…
+    let script =
+        r#"n=$(cat n 2>/dev/null || echo 9); echo $((n - 1)) > n; test -s {} && echo "{\"gsr\":0.$n,\"dr\":0.$n}""#;
+    let arguments =
+        "train --from start.onnx --data data --threads 1 --epochs 9 --keep best --patience 2 --out out.onnx";
+    let output = command(folder.path(), arguments).args(["--evaluate", script]).output().unwrap();
+    assert!(output.status.success(), "{}", said(&output));
+    let lines = String::from_utf8(output.stdout).unwrap();
+    let records: Vec<Record> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let rates: Vec<f64> = records.iter().map(|record| record.success.unwrap().gsr).collect();
+    assert_eq!(rates, [0.9, 0.8, 0.7], "twice in a row it was no better");
+    let path = folder.path().join("out.onnx");
+    let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
+    assert_eq!(metadata.provenance["epochs"], "1");
+    assert_eq!(metadata.provenance["evaluation"], "GSR 0.900, DR 0.900");
+    // Told again, it knows that it has ended.
+    let again = command(folder.path(), &format!("{arguments} --resume")).args(["--evaluate", script]).output().unwrap();
+    assert!(again.status.success() && again.stdout.is_empty());
+}
+
+#[test]
 fn ctrl_c_leaves_a_checkpoint() {
     let folder = prepare();
     let arguments = "train --from start.onnx --data data --batch 1 --threads 1 --epochs 100000 --out out.onnx";
@@ -132,6 +155,10 @@ fn what_cannot_be_done_is_said() {
     for (arguments, expected) in [
         ("train --network vng --data data --out x.onnx", "there is no network `vng`"),
         ("train --network vgn --data data --out x.onnx", "the data have 16³ voxels, the network reads 40³"),
+        ("train --network vgn --data data --ema 1 --out x.onnx", "--ema is 1"),
+        ("train --network vgn --data data --weight-decay=-1 --out x.onnx", "--weight-decay is -1"),
+        ("train --network vgn --data data --evaluate true --out x.onnx", "in which {} must stand for the model"),
+        ("train --from start.onnx --data data --accumulate 0 --out x.onnx", "nothing to learn from"),
         ("train --network vgn --data nowhere --out x.onnx", "nowhere: No such file"),
         ("train --network vgn --data data --out x.onnx --val 1", "--val is 1"),
         ("train --from start.onnx --data data --out x.onnx --resume", "x.state: No such file"),

@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use grasp::VoxelOrigin;
 use grasp_data::{Dataset, Setup, Trial, packed};
 use grasp_models::Architecture;
+use grasp_models::onnx::ModelProto;
 use grasp_train::{
     Augmentation, Checkpoint, CheckpointError, Epoch, Execution, Outputs, Record, Settings, Targets, TrainError,
     Trainer,
@@ -21,9 +22,12 @@ fn settings() -> Settings {
     Settings {
         epochs: 3,
         batch: 3,
+        accumulate: 1,
         learning_rate: 3e-3,
         warmup: 0,
         cosine: false,
+        weight_decay: 0.0,
+        average: None,
         seed: 5,
         validation: 0.0,
         augmentation: Augmentation::default(),
@@ -49,22 +53,94 @@ fn epoch(trainer: &mut Trainer) -> Record {
 
 #[test]
 fn eight_scenes_are_learnt_by_heart() {
-    for bf16 in [false, true] {
-        let settings = Settings { batch: 8, learning_rate: 1e-3, warmup: 20, bf16, ..settings() };
-        let mut trainer = trainer(support::dataset(8, N), &settings, Execution { bf16, ..EXECUTION });
+    for (network, learning_rate, epochs, bf16) in [
+        (Architecture::Vgn, 1e-3, 120, false),
+        (Architecture::Vgn, 1e-3, 120, true),
+        (Architecture::TransformerSmall, 1e-3, 80, true),
+        (Architecture::Transformer, 2e-4, 40, true),
+    ] {
+        let settings = Settings { batch: 8, learning_rate, warmup: 10, bf16, ..settings() };
+        tch::set_num_threads(1);
+        let model = network.build(N, 0).unwrap();
+        let execution = Execution { bf16, ..EXECUTION };
+        let mut trainer = Trainer::new(model, support::dataset(8, N), settings, execution).unwrap();
         let first = epoch(&mut trainer);
-        let last = (0..120).map(|_| epoch(&mut trainer)).last().unwrap();
-        println!("bf16 {bf16}: loss {:.4} → {:.5}", first.loss, last.loss);
-        assert!(first.loss > 0.5, "{first:?}");
-        assert!(last.loss < 0.01, "{last:?}");
+        let last = (0..epochs).map(|_| epoch(&mut trainer)).last().unwrap();
+        println!("{network:?}, bf16 {bf16}: loss {:.4} → {:.5}", first.loss, last.loss);
+        assert!(first.loss > 0.5, "{network:?}: {first:?}");
+        assert!(last.loss < 0.01, "{network:?}: {last:?}");
     }
+}
+
+/// The greatest difference between two networks' weights.
+fn difference(a: &ModelProto, b: &ModelProto) -> f32 {
+    let weights = |model: &ModelProto| model.graph.as_ref().unwrap().initializer.clone();
+    let pairs = weights(a).into_iter().zip(weights(b));
+    let floats = pairs.filter_map(|(a, b)| Some((a.to_f32().ok()?, b.to_f32().ok()?)));
+    floats.flat_map(|(a, b)| a.into_iter().zip(b).map(|(a, b)| (a - b).abs()).collect::<Vec<_>>()).fold(0.0, f32::max)
+}
+
+#[test]
+fn two_batches_in_a_step_are_one_of_twice_the_size() {
+    let run = |batch: usize, accumulate: usize| {
+        let settings = Settings { batch, accumulate, learning_rate: 1e-3, ..settings() };
+        // Scenes of as many grasps each, so that a mean of means is the mean.
+        let mut trainer = trainer(support::dataset(8, N), &settings, EXECUTION);
+        epoch(&mut trainer);
+        assert_eq!(trainer.steps(), (8 / batch / accumulate) as u64);
+        trainer.model()
+    };
+    let (halves, whole, other) = (run(2, 2), run(4, 1), run(8, 1));
+    let close = difference(&halves, &whole);
+    assert!(close < 2e-4, "{close}");
+    assert!(difference(&halves, &other) > 1e-3);
+}
+
+#[test]
+fn the_average_of_the_weights_lags_behind_them() {
+    let run = |average: Option<f64>| {
+        let mut trainer = trainer(support::dataset(8, N), &Settings { average, ..settings() }, EXECUTION);
+        for _ in 0..2 {
+            epoch(&mut trainer);
+        }
+        trainer.model()
+    };
+    let (plain, none, some) = (run(None), run(Some(0.0)), run(Some(0.9)));
+    assert_eq!(difference(&plain, &none), 0.0, "an average that forgets at once is the weights");
+    let start = Architecture::Vgn.build(N, 0).unwrap();
+    let (lag, way) = (difference(&plain, &some), difference(&plain, &start));
+    assert!(lag > 0.0 && lag < way, "{lag} of {way}");
+}
+
+#[test]
+fn weights_decay() {
+    let norm = |weight_decay: f64| {
+        let mut trainer = trainer(support::dataset(8, N), &Settings { weight_decay, ..settings() }, EXECUTION);
+        for _ in 0..3 {
+            epoch(&mut trainer);
+        }
+        let weights = trainer.model().graph.unwrap().initializer;
+        weights.iter().filter_map(|w| w.to_f32().ok()).flatten().map(|w| f64::from(w).powi(2)).sum::<f64>()
+    };
+    let (kept, decayed) = (norm(0.0), norm(1.0));
+    assert!(decayed < 0.97 * kept, "{decayed} and {kept}");
 }
 
 #[test]
 fn a_resumed_run_is_the_uninterrupted_run() {
     let dataset = || support::dataset(8, N);
     let augmentation = Augmentation { turns: true, mirror: true, shift: 1 };
-    let settings = Settings { augmentation, validation: 0.5, cosine: true, warmup: 2, ..settings() };
+    let settings = Settings {
+        augmentation,
+        validation: 0.5,
+        cosine: true,
+        warmup: 2,
+        batch: 1,
+        accumulate: 2,
+        weight_decay: 0.1,
+        average: Some(0.9),
+        ..settings()
+    };
     let mut whole = trainer(dataset(), &settings, EXECUTION);
     assert!(whole.scenes().1 > 0, "some are held out");
     let records: Vec<_> = (0..3).map(|_| epoch(&mut whole)).collect();

@@ -1,0 +1,54 @@
+//! Trying a network where it will be used, by another program: this crate knows no physics.
+
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use anyhow::{Context, Result, bail, ensure};
+use grasp_train::Success;
+
+/// What stands for the network's file in the command.
+pub(crate) const PLACE: &str = "{}";
+
+/// Runs `command` on a network. Every line that it prints must be an object with `gsr` and `dr`, as `grasp-sim bench`
+/// prints; the result is their mean.
+pub(crate) fn evaluate(command: &str, network: &Path) -> Result<Success> {
+    let quoted = format!("'{}'", network.display().to_string().replace('\'', "'\\''"));
+    let command = command.replace(PLACE, &quoted);
+    // Its errors are for who watches the training.
+    let run = Command::new("sh").args(["-c", &command]).stderr(Stdio::inherit()).output();
+    let output = run.with_context(|| format!("--evaluate `{command}`"))?;
+    ensure!(output.status.success(), "--evaluate `{command}` failed: {}", output.status);
+    let text = String::from_utf8_lossy(&output.stdout);
+    let mut all = Vec::new();
+    for line in text.lines().filter(|line| !line.trim().is_empty()) {
+        match serde_json::from_str::<Success>(line) {
+            Ok(Success { gsr, dr }) if gsr.is_finite() && dr.is_finite() => all.push([gsr, dr]),
+            _ => bail!("--evaluate `{command}` printed `{line}`, which is no object with `gsr` and `dr`"),
+        }
+    }
+    ensure!(!all.is_empty(), "--evaluate `{command}` printed nothing");
+    let mean = |index: usize| all.iter().map(|figures| figures[index]).sum::<f64>() / all.len() as f64;
+    Ok(Success { gsr: mean(0), dr: mean(1) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_printed_is_averaged() {
+        let command = r#"test -e {} && echo '{"gsr":0.5,"dr":0.25,"more":1}' && echo '{"gsr":1,"dr":0.75}'"#;
+        let folder = tempfile::tempdir().unwrap();
+        let network = folder.path().join("it's a network.onnx");
+        std::fs::write(&network, "").unwrap();
+        assert_eq!(evaluate(command, &network).unwrap(), Success { gsr: 0.75, dr: 0.5 });
+    }
+
+    #[test]
+    fn what_cannot_be_used_is_said() {
+        let refused = |command: &str| evaluate(command, Path::new("network.onnx")).unwrap_err().to_string();
+        assert!(refused("false").contains("failed"));
+        assert!(refused("true").contains("printed nothing"));
+        assert!(refused("echo GSR 80").contains("printed `GSR 80`"));
+    }
+}

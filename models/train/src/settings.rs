@@ -1,0 +1,77 @@
+use grasp::VoxelOrigin;
+use grasp_data::Dataset;
+use serde::Serialize;
+
+use crate::augment::Augmentation;
+
+/// Everything that decides the outcome of a run, besides the network it starts from and the data.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Settings {
+    /// Times every scene is seen.
+    pub epochs: u64,
+    /// Scenes in a forward pass.
+    pub batch: usize,
+    /// Forward passes in a step.
+    pub accumulate: usize,
+    /// Adam's learning rate, after the warm-up.
+    pub learning_rate: f64,
+    /// Steps over which the learning rate rises from 0.
+    pub warmup: u64,
+    /// Whether it then falls to 0 along half a cosine, instead of staying.
+    pub cosine: bool,
+    /// What is taken off the weights in every step, times the learning rate.
+    pub weight_decay: f64,
+    /// Share of itself that the moving average of the weights keeps in every step; the average is what is validated and
+    /// written. None: the weights themselves are.
+    pub average: Option<f64>,
+    /// Decides the order of the scenes and how they are changed.
+    pub seed: u64,
+    /// Share of the scenes that are held out.
+    pub validation: f64,
+    /// How scenes are changed.
+    pub augmentation: Augmentation,
+    /// Whether failures and successes weigh the same in the quality's loss, however many there are of each. Otherwise
+    /// the data decide, which VGN balances beforehand.
+    pub balance: bool,
+    /// Where in its voxel a grasp stands, `corner` or `center`.
+    #[serde(serialize_with = "origin_name")]
+    pub voxel_origin: VoxelOrigin,
+    /// Whether convolutions and matrix products are computed in bf16.
+    pub bf16: bool,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks for a reference")]
+fn origin_name<S: serde::Serializer>(origin: &VoxelOrigin, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(match origin {
+        VoxelOrigin::Corner => "corner",
+        VoxelOrigin::Center => "center",
+    })
+}
+
+impl Settings {
+    /// The learning rate of a step, of which there are so many in an epoch.
+    #[must_use]
+    pub fn learning_rate_at(&self, step: u64, steps_per_epoch: u64) -> f64 {
+        let Self { epochs, learning_rate, warmup, cosine, .. } = *self;
+        if step < warmup {
+            return learning_rate * (step + 1) as f64 / warmup as f64;
+        }
+        if !cosine {
+            return learning_rate;
+        }
+        let last = (epochs * steps_per_epoch).max(warmup + 1);
+        let progress = (step - warmup) as f64 / (last - warmup) as f64;
+        learning_rate * 0.5 * (1.0 + (std::f64::consts::PI * progress.min(1.0)).cos())
+    }
+
+    /// What must be the same for a run to go on: the settings, the scenes and their grasps. A run at a constant learning
+    /// rate may be made longer.
+    pub(crate) fn fingerprint(&self, dataset: &Dataset, training: usize, validation: usize) -> String {
+        let mut settings = self.clone();
+        if !settings.cosine {
+            settings.epochs = 0;
+        }
+        let settings = serde_json::to_string(&settings).unwrap_or_default();
+        format!("{settings} over {training} + {validation} scenes (labels {})", dataset.fingerprint())
+    }
+}
