@@ -16,6 +16,7 @@ mod examples;
 mod execute;
 mod heads;
 mod loss;
+mod operators;
 mod record;
 mod settings;
 mod trainer;

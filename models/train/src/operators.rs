@@ -1,0 +1,289 @@
+//! What each operator of ONNX is in libtorch.
+
+use grasp_models::onnx::{AttributeProto, NodeProto};
+use tch::{Device, Kind, TchError, Tensor};
+
+use crate::execute::{ExecuteError, Execution, values_of};
+use crate::heads::cubes;
+
+/// An operator as ONNX names it, with the settings of it that are understood.
+const OPERATORS: &[(&str, &[&str])] = &[
+    ("Add", &[]),
+    ("Clip", &[]),
+    ("Concat", &["axis"]),
+    ("Constant", &["value"]),
+    ("Conv", &["dilations", "group", "kernel_shape", "pads", "strides"]),
+    ("ConvTranspose", &["dilations", "group", "kernel_shape", "pads", "strides"]),
+    ("Div", &[]),
+    ("Erf", &[]),
+    ("Expand", &[]),
+    ("Flatten", &["axis"]),
+    ("InstanceNormalization", &["epsilon"]),
+    ("LayerNormalization", &["axis", "epsilon"]),
+    ("LeakyRelu", &["alpha"]),
+    ("MatMul", &[]),
+    ("MaxPool", &["ceil_mode", "dilations", "kernel_shape", "pads", "strides"]),
+    ("Mul", &[]),
+    ("ReduceL2", &["axes", "keepdims", "noop_with_empty_axes"]),
+    ("Relu", &[]),
+    ("Reshape", &[]),
+    ("Resize", &["coordinate_transformation_mode", "cubic_coeff_a", "mode", "nearest_mode"]),
+    ("Shape", &[]),
+    ("Sigmoid", &[]),
+    ("Slice", &[]),
+    ("Softmax", &["axis"]),
+    ("Split", &["axis"]),
+    ("Transpose", &["perm"]),
+];
+
+/// The operators there are.
+pub(crate) fn supported() -> String {
+    OPERATORS.iter().map(|&(op, _)| op).collect::<Vec<_>>().join(", ")
+}
+
+/// Refuses what would not be understood: an operator or a setting that was skipped would train another network.
+pub(crate) fn check(node: &NodeProto) -> Result<(), ExecuteError> {
+    let (name, op) = (node.name().to_owned(), node.op_type().to_owned());
+    let known = OPERATORS.iter().find(|(known, _)| *known == op && node.domain().is_empty());
+    let Some((_, settings)) = known else { return Err(ExecuteError::Operator { node: name, op }) };
+    match node.attribute.iter().find(|attribute| !settings.contains(&attribute.name())) {
+        Some(unknown) => {
+            Err(ExecuteError::Setting { node: name, op, what: format!("the setting `{}`", unknown.name()) })
+        }
+        None => Ok(()),
+    }
+}
+
+/// One node with the values it reads.
+pub(crate) struct Step<'a> {
+    pub node: &'a NodeProto,
+    pub inputs: Vec<Option<&'a Tensor>>,
+    pub execution: Execution,
+}
+
+impl Step<'_> {
+    /// What it computes.
+    pub fn run(&self) -> Result<Vec<Tensor>, ExecuteError> {
+        let one = |result: Result<Tensor, TchError>| Ok(vec![result.map_err(|source| self.torch(source))?]);
+        match self.node.op_type() {
+            "Add" => one(self.input(0)?.f_add(self.input(1)?)),
+            "Clip" => one(self.input(0)?.f_clamp_tensor(self.optional(1), self.optional(2))),
+            "Concat" => {
+                let values: Vec<&Tensor> = self.inputs.iter().copied().flatten().collect();
+                one(Tensor::f_cat(&values, self.int("axis", 0)))
+            }
+            "Conv" => self.convolution(false),
+            "ConvTranspose" => self.convolution(true),
+            "Div" => one(self.input(0)?.f_div(self.input(1)?)),
+            "Erf" => one(self.input(0)?.f_erf()),
+            "Expand" => one(self.input(0)?.f_broadcast_to(self.whole(1)?)),
+            "Flatten" => {
+                let x = self.input(0)?;
+                let size = x.size();
+                let axis = self.axis("axis", 1, size.len())?;
+                one(x.f_reshape([size[..axis].iter().product(), -1]))
+            }
+            "InstanceNormalization" => {
+                let [x, scale, bias] = [self.input(0)?, self.input(1)?, self.input(2)?];
+                let epsilon = self.float("epsilon", 1e-5);
+                one(x.f_instance_norm(Some(scale), Some(bias), None, None, true, 0.0, epsilon, false))
+            }
+            "LayerNormalization" => {
+                let [x, scale, bias] = [self.full(0)?, self.full(1)?, self.full(2)?];
+                let size = x.size();
+                let axis = self.axis("axis", -1, size.len())?;
+                one(x.f_layer_norm(&size[axis..], Some(scale), Some(bias), self.float("epsilon", 1e-5), false))
+            }
+            "LeakyRelu" => {
+                let (x, slope) = (self.input(0)?, self.float("alpha", 0.01));
+                if slope as f32 == 0.01 {
+                    one(x.f_leaky_relu())
+                } else {
+                    // The binding has that slope built in; PReLU is the same function with any, and six times slower.
+                    one(x.f_prelu(&Tensor::from(slope).to_kind(x.kind()).to_device(x.device())))
+                }
+            }
+            "MatMul" => one(self.reduced(0)?.f_matmul(&self.reduced(1)?)),
+            "MaxPool" => self.max_pool(),
+            "Mul" => one(self.input(0)?.f_mul(self.input(1)?)),
+            "ReduceL2" => {
+                // A setting until opset 17, an input since.
+                let axes = if self.optional(1).is_some() { self.whole(1)? } else { self.ints("axes", &[]) };
+                if axes.is_empty() && self.int("noop_with_empty_axes", 0) != 0 {
+                    return Err(self.setting("`noop_with_empty_axes`".to_owned()));
+                }
+                one(self.full(0)?.f_norm_scalaropt_dim(2, axes, self.int("keepdims", 1) != 0))
+            }
+            "Relu" => one(self.input(0)?.f_relu()),
+            "Reshape" => one(self.input(0)?.f_reshape(self.new_shape()?)),
+            "Resize" => one(self.nearest()?),
+            "Shape" => one(Tensor::f_from_slice(&self.input(0)?.size())),
+            "Sigmoid" => one(self.full(0)?.f_sigmoid()),
+            "Slice" => self.slice(),
+            "Softmax" => one(self.full(0)?.f_softmax(self.int("axis", -1), Kind::Float)),
+            "Split" => {
+                let sizes = self.whole(1)?;
+                let split = self.input(0)?.f_split_with_sizes(sizes, self.int("axis", 0));
+                split.map_err(|source| self.torch(source))
+            }
+            "Transpose" => {
+                let x = self.input(0)?;
+                let reversed: Vec<i64> = (0..x.dim() as i64).rev().collect();
+                one(x.f_permute(self.ints("perm", &reversed)))
+            }
+            op => Err(ExecuteError::Operator { node: self.node.name().to_owned(), op: op.to_owned() }),
+        }
+    }
+
+    fn convolution(&self, transposed: bool) -> Result<Vec<Tensor>, ExecuteError> {
+        // oneDNN's bf16 gradient of a weight reads memory it never wrote when a volume is narrower than the kernel.
+        let narrow =
+            self.input(0)?.size().iter().zip(self.input(1)?.size()).skip(2).any(|(size, kernel)| *size < kernel);
+        let [x, weight] = if narrow { [self.full(0)?, self.full(1)?] } else { [self.reduced(0)?, self.reduced(1)?] };
+        let bias = self.optional(2).map(|bias| bias.to_kind(x.kind()));
+        let axes = weight.dim().saturating_sub(2);
+        let (ones, zeros) = (vec![1; axes], vec![0; axes]);
+        let pads = self.ints("pads", &[0].repeat(2 * axes));
+        let (begin, end) = pads.split_at(axes);
+        if begin != end {
+            return Err(self.setting(format!("a padding of {begin:?} before and {end:?} after")));
+        }
+        let y = x.f_convolution(
+            &weight,
+            bias.as_ref(),
+            self.ints("strides", &ones),
+            begin,
+            self.ints("dilations", &ones),
+            transposed,
+            &zeros,
+            self.int("group", 1),
+        );
+        Ok(vec![y.map_err(|source| self.torch(source))?])
+    }
+
+    /// The maximum over windows of images.
+    fn max_pool(&self) -> Result<Vec<Tensor>, ExecuteError> {
+        let x = self.input(0)?;
+        let kernel = self.ints("kernel_shape", &[]);
+        if x.dim() != 4 || kernel.len() != 2 {
+            return Err(self.setting(format!("a window of {kernel:?} over {:?}", x.size())));
+        }
+        let pads = self.ints("pads", &[0; 4]);
+        let (begin, end) = pads.split_at(2);
+        if begin != end {
+            return Err(self.setting(format!("a padding of {begin:?} before and {end:?} after")));
+        }
+        let (strides, dilations) = (self.ints("strides", &[1; 2]), self.ints("dilations", &[1; 2]));
+        let y = x.f_max_pool2d(kernel, strides, begin, dilations, self.int("ceil_mode", 0) != 0);
+        Ok(vec![y.map_err(|source| self.torch(source))?])
+    }
+
+    /// A convolution that keeps the size, at some voxels: `[voxels, channels, 1, 1, 1]`. In f32, there are few of them.
+    pub fn convolution_at(&self, cells: &[i64]) -> Result<Tensor, ExecuteError> {
+        let (x, weight) = (self.input(0)?, self.input(1)?);
+        let edge = weight.size().last().copied().unwrap_or(1);
+        // Channels fastest, as in the cubes.
+        let compute = || {
+            let weight = weight.f_permute([0, 2, 3, 4, 1])?.f_reshape([weight.size()[0], -1])?;
+            let y = cubes(x, cells, edge)?.f_linear(&weight, self.optional(2))?;
+            y.f_reshape([cells.len() as i64, -1, 1, 1, 1])
+        };
+        compute().map_err(|source| self.torch(source))
+    }
+
+    /// Repeats voxels: `Resize` as far as it agrees with libtorch's `nearest`.
+    fn nearest(&self) -> Result<Result<Tensor, TchError>, ExecuteError> {
+        for (name, expected) in
+            [("mode", "nearest"), ("coordinate_transformation_mode", "asymmetric"), ("nearest_mode", "floor")]
+        {
+            let got = self.node.attribute(name).map(AttributeProto::s).unwrap_or_default();
+            if got != expected.as_bytes() {
+                let got = String::from_utf8_lossy(got);
+                return Err(self.setting(format!("{name} `{got}` (only `{expected}`)")));
+            }
+        }
+        let x = self.input(0)?;
+        let size = match (self.optional(2).filter(|scales| scales.numel() > 0), self.optional(3)) {
+            (Some(scales), _) => {
+                let scales = values_of(scales);
+                x.size().iter().zip(scales).map(|(&size, scale)| (size as f32 * scale).floor() as i64).collect()
+            }
+            (None, Some(_)) => self.whole(3)?,
+            (None, None) => return Err(self.setting("neither scales nor sizes".to_owned())),
+        };
+        if x.dim() != 5 || size.len() != 5 || size[..2] != x.size()[..2] {
+            return Err(self.setting(format!("enlarging {:?} to {size:?}", x.size())));
+        }
+        Ok(x.f_upsample_nearest3d(&size[2..], None, None, None))
+    }
+
+    fn slice(&self) -> Result<Vec<Tensor>, ExecuteError> {
+        let mut x = self.input(0)?.shallow_clone();
+        let [starts, ends] = [self.whole(1)?, self.whole(2)?];
+        let axes = if self.optional(3).is_some() { self.whole(3)? } else { (0..starts.len() as i64).collect() };
+        let steps = if self.optional(4).is_some() { self.whole(4)? } else { vec![1; starts.len()] };
+        for (((axis, start), end), step) in axes.into_iter().zip(starts).zip(ends).zip(steps) {
+            x = x.f_slice(axis, start, end, step).map_err(|source| self.torch(source))?;
+        }
+        Ok(vec![x])
+    }
+
+    /// The target of a `Reshape`, where 0 means the size there is.
+    fn new_shape(&self) -> Result<Vec<i64>, ExecuteError> {
+        let size = self.input(0)?.size();
+        let shape = self.whole(1)?.into_iter().enumerate();
+        Ok(shape.map(|(axis, dim)| if dim == 0 { size.get(axis).copied().unwrap_or(0) } else { dim }).collect())
+    }
+
+    fn optional(&self, index: usize) -> Option<&Tensor> {
+        self.inputs.get(index).copied().flatten()
+    }
+
+    fn input(&self, index: usize) -> Result<&Tensor, ExecuteError> {
+        self.optional(index).ok_or_else(|| self.setting(format!("leaving out input {index}")))
+    }
+
+    /// An input in f32: where bf16 would cost accuracy.
+    fn full(&self, index: usize) -> Result<Tensor, ExecuteError> {
+        Ok(self.input(index)?.to_kind(Kind::Float))
+    }
+
+    /// An input in the precision of convolutions and matrix products.
+    fn reduced(&self, index: usize) -> Result<Tensor, ExecuteError> {
+        let kind = if self.execution.bf16 { Kind::BFloat16 } else { Kind::Float };
+        Ok(self.input(index)?.to_kind(kind))
+    }
+
+    /// An input of whole numbers.
+    fn whole(&self, index: usize) -> Result<Vec<i64>, ExecuteError> {
+        let tensor = self.input(index)?;
+        Vec::<i64>::try_from(tensor.to_device(Device::Cpu)).map_err(|source| self.torch(source))
+    }
+
+    fn int(&self, name: &str, default: i64) -> i64 {
+        self.node.attribute(name).and_then(|attribute| attribute.i).unwrap_or(default)
+    }
+
+    fn float(&self, name: &str, default: f32) -> f64 {
+        self.node.attribute(name).and_then(|attribute| attribute.f).unwrap_or(default).into()
+    }
+
+    fn ints(&self, name: &str, default: &[i64]) -> Vec<i64> {
+        self.node.attribute(name).map_or_else(|| default.to_vec(), |attribute| attribute.ints.clone())
+    }
+
+    /// An axis, counted from the end when negative.
+    fn axis(&self, name: &str, default: i64, dims: usize) -> Result<usize, ExecuteError> {
+        let axis = self.int(name, default);
+        let from_start = if axis < 0 { axis + dims as i64 } else { axis };
+        usize::try_from(from_start).ok().filter(|&axis| axis < dims).ok_or_else(|| self.setting(format!("axis {axis}")))
+    }
+
+    fn setting(&self, what: String) -> ExecuteError {
+        ExecuteError::Setting { node: self.node.name().to_owned(), op: self.node.op_type().to_owned(), what }
+    }
+
+    fn torch(&self, source: TchError) -> ExecuteError {
+        ExecuteError::Torch { node: self.node.name().to_owned(), op: self.node.op_type().to_owned(), source }
+    }
+}
