@@ -6,6 +6,7 @@
 
 pub mod gpd;
 mod graph;
+mod half;
 mod heads;
 mod metadata;
 mod networks;
@@ -15,6 +16,7 @@ mod store;
 mod transformer;
 mod vgn;
 
+pub use half::{with_full_weights, with_half_weights};
 pub use metadata::{Metadata, MetadataError, ValueConvention};
 pub use networks::{Architecture, BuildError, build};
 pub use runtime::{Classifier, LoadError, LoadReason, Network, Options, Output, RuntimeError, RuntimeInfo, init};

@@ -3,7 +3,7 @@
 use std::process::Command;
 
 use grasp_models::onnx::{ModelProto, TensorProto};
-use grasp_models::{Architecture, BuildError, build, gpd};
+use grasp_models::{Architecture, BuildError, build, gpd, with_full_weights, with_half_weights};
 use prost::Message;
 
 #[test]
@@ -91,11 +91,36 @@ fn tensors_are_read_in_every_form() {
 }
 
 #[test]
+fn weights_are_stored_as_halves_and_restored() {
+    let model = build("vgn", 5).unwrap();
+    let halves = with_half_weights(&model).unwrap();
+    let (before, after) = (model.encode_to_vec().len(), halves.encode_to_vec().len());
+    assert!(after < before * 55 / 100, "{after} of {before} bytes");
+    assert_eq!(with_half_weights(&halves).unwrap(), halves, "once is enough");
+    let restored = with_full_weights(&halves).unwrap();
+    let (graph, original) = (restored.graph.as_ref().unwrap(), model.graph.as_ref().unwrap());
+    assert_eq!(graph.node, original.node);
+    for (weight, original) in graph.initializer.iter().zip(&original.initializer) {
+        assert_eq!((weight.name(), &weight.dims), (original.name(), &original.dims));
+        if original.is_float() {
+            let pairs = weight.to_f32().unwrap().into_iter().zip(original.to_f32().unwrap());
+            assert!(pairs.into_iter().all(|(half, full)| (half - full).abs() <= full.abs() / 2048.0 + 1e-7));
+        }
+    }
+    let mut large = model.clone();
+    let weight = &mut large.graph.as_mut().unwrap().initializer[0];
+    weight.set_f32(&vec![1e5; weight.elements()]);
+    let kept = with_half_weights(&large).unwrap().graph.unwrap().initializer[0].clone();
+    assert_eq!(kept, large.graph.unwrap().initializer[0], "what f16 does not hold stays f32");
+}
+
+#[test]
 fn the_onnx_checker_accepts_every_network() {
     let python = std::env::var("GRASPD_PYTHON").expect("GRASPD_PYTHON is not set: run the tests by `make test`");
     let folder = tempfile::tempdir().unwrap();
     let networks = Architecture::ALL.map(|architecture| (architecture.name(), architecture.build(40, 0).unwrap()));
-    for (name, model) in networks.into_iter().chain([("gpd", gpd::gpd(0))]) {
+    let half = with_half_weights(&build("vgn", 0).unwrap()).unwrap();
+    for (name, model) in networks.into_iter().chain([("gpd", gpd::gpd(0)), ("half", half)]) {
         let path = folder.path().join(format!("{name}.onnx"));
         model.write(&path).unwrap();
         let script = "import onnx, sys; onnx.checker.check_model(sys.argv[1], full_check=True)";

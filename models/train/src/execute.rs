@@ -9,6 +9,7 @@ use std::collections::{HashMap, HashSet};
 use std::ops::RangeInclusive;
 
 use grasp_models::onnx::{ModelProto, NodeProto, OperatorSetIdProto, TensorError, TensorProto};
+use grasp_models::with_full_weights;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 use thiserror::Error;
 
@@ -115,11 +116,12 @@ pub struct Outputs {
 }
 
 impl Executor {
-    /// Takes over a model: checks that every node can be executed and makes its weights trainable.
+    /// Takes over a model, its weights as f32: checks that every node can be executed and makes its weights trainable.
     ///
     /// # Errors
     /// [`ExecuteError`] names the node that cannot be executed, or the opset.
     pub fn new(model: ModelProto, execution: Execution) -> Result<Self, ExecuteError> {
+        let model = with_full_weights(&model)?;
         let graph = model.graph.as_ref().ok_or(ExecuteError::NoGraph)?;
         let standard = model.opset_import.iter().find(|opset| matches!(opset.domain(), "" | "ai.onnx"));
         // A file that does not say is of the first.

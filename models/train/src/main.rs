@@ -2,6 +2,7 @@
 
 mod classify;
 mod evaluate;
+mod export;
 mod run;
 
 use std::path::PathBuf;
@@ -35,6 +36,8 @@ enum Command {
     Train(Box<Training>),
     /// Trains GPD's classifier on tried candidates.
     Classify(classify::Classify),
+    /// Writes a network with its weights in another precision.
+    Export(export::Export),
 }
 
 /// How a network is trained. Where VGN's training and the paper's differ, the default follows the network.
@@ -155,5 +158,6 @@ fn main() -> anyhow::Result<()> {
         Command::Init { network, seed, out } => Ok(build(&network, seed)?.write(&out)?),
         Command::Train(training) => run::train(&training),
         Command::Classify(command) => command.run(),
+        Command::Export(command) => command.run(),
     }
 }

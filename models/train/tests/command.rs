@@ -150,6 +150,33 @@ fn a_network_is_written_with_random_weights() {
 }
 
 #[test]
+fn an_export_is_half_the_file_and_computes_the_same() {
+    let folder = prepare();
+    let arguments = "export --from start.onnx --precision fp16 --out half.onnx --data data --volumes 5";
+    let output = command(folder.path(), arguments).output().unwrap();
+    assert!(output.status.success(), "{}", said(&output));
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let number = |pointer: &str| report.pointer(pointer).and_then(serde_json::Value::as_f64).unwrap();
+    assert!(number("/out_bytes") < 0.55 * number("/from_bytes"), "{report}");
+    assert_eq!(number("/compared/volumes"), 5.0);
+    for output in ["quality", "rotation", "width_voxels"] {
+        let (largest, mean) =
+            (number(&format!("/compared/{output}/largest")), number(&format!("/compared/{output}/mean")));
+        assert!(largest > 0.0 && largest < 5e-3 && mean < largest, "{output}: {report}");
+    }
+    // What was stored as f16 is trained, and stored as f32, again.
+    for arguments in [
+        "train --from half.onnx --data data --threads 1 --epochs 1 --out trained.onnx",
+        "export --from half.onnx --precision fp32 --out full.onnx",
+    ] {
+        let output = command(folder.path(), arguments).output().unwrap();
+        assert!(output.status.success(), "{arguments}: {}", said(&output));
+    }
+    let size = |name: &str| fs::metadata(folder.path().join(name)).unwrap().len();
+    assert!(size("full.onnx") == size("start.onnx") && size("trained.onnx") > size("half.onnx"));
+}
+
+#[test]
 fn what_cannot_be_done_is_said() {
     let folder = prepare();
     for (arguments, expected) in [
