@@ -184,6 +184,12 @@ pub enum DataType {
     Undefined = 0,
     /// 32-bit floating point.
     Float = 1,
+    /// 8-bit integer, unsigned.
+    Uint8 = 2,
+    /// 8-bit integer.
+    Int8 = 3,
+    /// 32-bit integer.
+    Int32 = 6,
     /// 64-bit integer.
     Int64 = 7,
     /// 16-bit floating point (IEEE 754 binary16).
@@ -388,11 +394,33 @@ impl TensorProto {
     /// A tensor of i64.
     #[must_use]
     pub fn from_i64(name: &str, dims: &[i64], values: &[i64]) -> Self {
+        Self::from_bytes(name, dims, DataType::Int64, values.iter().flat_map(|value| value.to_le_bytes()).collect())
+    }
+
+    /// A tensor of i32.
+    #[must_use]
+    pub fn from_i32(name: &str, dims: &[i64], values: &[i32]) -> Self {
+        Self::from_bytes(name, dims, DataType::Int32, values.iter().flat_map(|value| value.to_le_bytes()).collect())
+    }
+
+    /// A tensor of i8.
+    #[must_use]
+    pub fn from_i8(name: &str, dims: &[i64], values: &[i8]) -> Self {
+        Self::from_bytes(name, dims, DataType::Int8, values.iter().map(|&value| value as u8).collect())
+    }
+
+    /// A tensor of u8.
+    #[must_use]
+    pub fn from_u8(name: &str, dims: &[i64], values: &[u8]) -> Self {
+        Self::from_bytes(name, dims, DataType::Uint8, values.to_vec())
+    }
+
+    fn from_bytes(name: &str, dims: &[i64], data_type: DataType, bytes: Vec<u8>) -> Self {
         Self {
             dims: dims.to_vec(),
-            data_type: Some(DataType::Int64.into()),
+            data_type: Some(data_type.into()),
             name: Some(name.to_owned()),
-            raw_data: Some(values.iter().flat_map(|value| value.to_le_bytes()).collect()),
+            raw_data: Some(bytes),
             ..Self::default()
         }
     }

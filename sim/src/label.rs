@@ -3,6 +3,7 @@
 use std::f64::consts::PI;
 
 use grasp::{FINGER_DEPTH, Grasp, MAX_OPENING, RESOLUTION, SurfacePoint};
+use grasp_data::{TURNS, Trial};
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -15,7 +16,7 @@ use crate::scene::{SceneKind, generate};
 use crate::trial;
 
 /// Yaws at which a point is tried, evenly from 0 to 180° inclusive.
-pub const YAWS: usize = 6;
+pub const YAWS: usize = TURNS + 1;
 
 /// Resolution of the second volume, whose surface the points are drawn from.
 const CLOUD_RESOLUTION: usize = 120;
@@ -89,6 +90,16 @@ impl Point {
     #[must_use]
     pub fn success(&self) -> bool {
         self.lifted.contains(&true)
+    }
+
+    /// The grasp to learn in voxels of `voxel_size`, or with 1 in metres, and which turns of it hold too.
+    #[must_use]
+    pub fn trial(&self, voxel_size: f64) -> Trial {
+        let turns = (1..TURNS).filter(|turn| self.success() && self.lifted[(self.yaw + turn) % TURNS]);
+        Trial {
+            turns: turns.fold(0, |bits, turn| bits | 1 << turn),
+            ..Trial::new(&self.grasp, self.success(), voxel_size)
+        }
     }
 }
 
@@ -180,13 +191,13 @@ fn sample(cloud: &[SurfacePoint], rng: &mut impl Rng) -> (SurfacePoint, Isometry
 fn try_point(world: &World, cloud: &[SurfacePoint], rng: &mut impl Rng) -> Point {
     let (surface, pose) = sample(cloud, rng);
     let turned =
-        |yaw: usize| pose * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw as f64 * PI / (YAWS - 1) as f64);
-    let tried: [Option<f64>; YAWS - 1] = std::array::from_fn(|yaw| match trial::label(world, &turned(yaw)) {
+        |yaw: usize| pose * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw as f64 * PI / TURNS as f64);
+    let tried: [Option<f64>; TURNS] = std::array::from_fn(|yaw| match trial::label(world, &turned(yaw)) {
         trial::Outcome::Lifted { width, .. } => Some(width),
         _ => None,
     });
     // The last yaw is the first one turned by half a turn, and the hand is symmetric.
-    let widths: [Option<f64>; YAWS] = std::array::from_fn(|yaw| tried[yaw % tried.len()]);
+    let widths: [Option<f64>; YAWS] = std::array::from_fn(|yaw| tried[yaw % TURNS]);
     let lifted = widths.map(|width| width.is_some());
     let object = world.nearest(&surface.position);
     let best = middle_of_widest_run(&lifted).and_then(|yaw| widths[yaw].map(|width| (yaw, width)));

@@ -4,7 +4,8 @@ use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, UnitQuaterni
 use rand::Rng;
 use rand::seq::index;
 
-use super::{Cloud, Hand};
+use super::Cloud;
+use crate::Hand;
 use crate::SurfacePoint;
 
 /// How candidates are looked for; the defaults are those of GPD's code.
@@ -34,7 +35,7 @@ impl Params {
     #[must_use]
     pub fn above(lowest: f64) -> Self {
         Self {
-            hand: Hand::default(),
+            hand: Hand::GPD,
             samples: 500,
             frame_radius: 0.01,
             rotations: 8,
@@ -201,7 +202,7 @@ mod tests {
     #[test]
     fn no_candidate_goes_through_the_table_or_the_object() {
         let (cloud, found) = of(standing_box(), 2);
-        let hand = Hand::default();
+        let hand = Hand::GPD;
         for candidate in &found {
             assert!(hand.lowest_point(&candidate.pose) >= TABLE);
             let mut points = cloud.points().iter().map(|p| candidate.pose.inverse_transform_point(&p.position));

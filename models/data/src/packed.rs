@@ -1,6 +1,6 @@
 //! The packed form: a few large files that only ever grow.
 //!
-//! A folder holds `setup.json` and `scenes-NNNNN.pack`. A file is a header, 16 bytes (`graspack`, the version 1 and N as
+//! A folder holds `setup.json` and `scenes-NNNNN.pack`. A file is a header, 16 bytes (`graspack`, the version 2 and N as
 //! little-endian u32), and records one after the other, each a scene:
 //!
 //! | bytes | what |
@@ -9,7 +9,7 @@
 //! | 4 | its CRC-32 |
 //! | 8 | the scene's number |
 //! | 4, 4 | how many trials, how many volumes |
-//! | 33 a trial | position (voxels), quaternion x y z w, width (voxels): eight f32; 1 for a success, else 0 |
+//! | 33 a trial | position (voxels), quaternion x y z w, width (voxels): eight f32; bit 0: a success; bit k: turned by k · 36° about its approach it is one too |
 //! | N³ a volume | [`quantise`]d values, `[x][y][z]` |
 //!
 //! All numbers are little-endian. A record that is not complete yet, at the end of a file, is not there for a reader. A
@@ -27,7 +27,8 @@ use crate::error::{At, DataError};
 use crate::{Setup, Trial, edge_of, quantise};
 
 const MAGIC: &[u8; 8] = b"graspack";
-const VERSION: u32 = 1;
+/// Version 1 knew nothing of turns.
+const VERSION: u32 = 2;
 const HEADER: usize = 16;
 /// Length and checksum, before a record's content.
 const PREFIX: usize = 8;
@@ -85,12 +86,12 @@ impl Writer {
         self.record.extend(number.to_le_bytes());
         self.record.extend((trials.len() as u32).to_le_bytes());
         self.record.extend((volumes.len() as u32).to_le_bytes());
-        for Trial { position: p, rotation, width, success } in trials {
+        for Trial { position: p, rotation, width, success, turns } in trials {
             let q = rotation.coords;
             for number in [p.x, p.y, p.z, q.x, q.y, q.z, q.w, *width] {
                 self.record.extend((number as f32).to_le_bytes());
             }
-            self.record.push(u8::from(*success));
+            self.record.push(u8::from(*success) | turns);
         }
         volumes.iter().for_each(|volume| self.record.extend(volume));
         let content = &self.record[PREFIX..];
@@ -263,7 +264,8 @@ impl Reader {
                     position: Point3::new(x, y, z),
                     rotation: UnitQuaternion::from_quaternion(Quaternion::new(qw, qx, qy, qz)),
                     width,
-                    success: trial[32] == 1,
+                    success: trial[32] & 1 != 0,
+                    turns: trial[32] & !1,
                 }
             })
             .collect()
@@ -306,8 +308,8 @@ fn check_header(path: &Path, bytes: &[u8]) -> Result<usize, DataError> {
         return Err(damaged("the file does not begin with `graspack`".to_owned()));
     }
     match u32_at(bytes, 8) {
-        VERSION => Ok(u32_at(bytes, 12) as usize),
-        version => Err(damaged(format!("version {version}, this program reads version {VERSION}"))),
+        1..=VERSION => Ok(u32_at(bytes, 12) as usize),
+        version => Err(damaged(format!("version {version}, this program reads up to {VERSION}"))),
     }
 }
 

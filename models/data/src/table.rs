@@ -68,7 +68,7 @@ impl TableWriter {
     /// Appends a scene's trials, in the table's unit, in one write.
     pub(crate) fn append(&mut self, id: &str, trials: &[Trial]) -> Result<(), DataError> {
         let mut rows = String::new();
-        for Trial { position: p, rotation, width, success } in trials {
+        for Trial { position: p, rotation, width, success, .. } in trials {
             let (q, label) = (rotation.coords, u8::from(*success));
             // Writing to a string cannot fail.
             let _ = writeln!(
@@ -164,6 +164,7 @@ impl Row {
             rotation: UnitQuaternion::from_quaternion(rotation),
             width,
             success,
+            turns: 0,
         })
     }
 }

@@ -1,5 +1,8 @@
 use grasp::Grasp;
-use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion};
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
+
+/// Turns of the hand about its approach at which a point is tried, evenly over half a turn, after which it is the same.
+pub const TURNS: usize = 5;
 
 /// A grasp that was tried, in the volume's frame, lengths in voxels.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -12,10 +15,13 @@ pub struct Trial {
     pub width: f64,
     /// Whether it held.
     pub success: bool,
+    /// Of a success: which turns about its approach held too, bit k for k/[`TURNS`] of half a turn, from 1 on. None in the
+    /// forms of VGN and GIGA, which do not say.
+    pub turns: u8,
 }
 
 impl Trial {
-    /// A grasp in the volume's frame (metres), in voxels of `voxel_size` metres.
+    /// A grasp in the volume's frame (metres), in voxels of `voxel_size` metres, of whose turns nothing is known.
     #[must_use]
     pub fn new(grasp: &Grasp, success: bool, voxel_size: f64) -> Self {
         Self {
@@ -23,7 +29,17 @@ impl Trial {
             rotation: grasp.pose.rotation,
             width: grasp.width / voxel_size,
             success,
+            turns: 0,
         }
+    }
+
+    /// The rotations that held: its own and those [turned](Self::turns) about its approach.
+    pub fn rotations(&self) -> impl Iterator<Item = UnitQuaternion<f64>> {
+        let turn = |k: usize| {
+            UnitQuaternion::from_axis_angle(&Vector3::z_axis(), k as f64 * std::f64::consts::PI / TURNS as f64)
+        };
+        let (own, turns) = (self.rotation, self.turns);
+        (0..TURNS).filter(move |&k| k == 0 || turns & (1 << k) != 0).map(move |k| own * turn(k))
     }
 
     /// The grasp in metres; its quality is 1 for a success and 0 for a failure.

@@ -23,8 +23,14 @@ fn setup() -> Setup {
 
 fn trials(number: u64) -> Vec<Trial> {
     let rotation = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 0.1 * number as f64);
-    let trial = |success| Trial { position: Point3::new(1.5, 2.0, number as f64), rotation, width: 3.25, success };
-    vec![trial(true), trial(false)]
+    let trial = |success, turns| Trial {
+        position: Point3::new(1.5, 2.0, number as f64),
+        rotation,
+        width: 3.25,
+        success,
+        turns,
+    };
+    vec![trial(true, 0b1_0010), trial(false, 0)]
 }
 
 fn volumes(number: u64) -> Vec<Vec<f32>> {
@@ -60,6 +66,7 @@ fn packed_scenes_are_read_as_they_were_written() {
     for (index, number) in [0, 1, 3].into_iter().enumerate() {
         assert_eq!(dataset.id(index), format!("{number:08}"));
         assert_same(&dataset.trials(index), &trials(number));
+        assert_eq!(dataset.trials(index)[0].turns, 0b1_0010, "which other forms do not keep");
         assert_eq!(dataset.volumes(index), 2);
         for (look, volume) in volumes(number).iter().enumerate() {
             let read: Vec<f32> = dataset.volume(index, look).iter().map(|&byte| grasp_data::value(byte)).collect();

@@ -26,7 +26,8 @@ fn main() -> anyhow::Result<()> {
     for index in 0..batch {
         for label in 0..24 {
             let position = Point3::from([5, 7, 11].map(|step| f64::from(label * step % 36 + 2)));
-            let label = Trial { position, rotation: UnitQuaternion::identity(), width: 5.0, success: label % 2 == 0 };
+            let rotation = UnitQuaternion::identity();
+            let label = Trial { position, rotation, width: 5.0, success: label % 2 == 0, turns: 0 };
             targets.push(index, &label, 40, VoxelOrigin::Corner);
         }
     }

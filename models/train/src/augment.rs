@@ -4,7 +4,7 @@
 //! axis of the cube is exact; only which voxel a grasp falls into depends on the network's convention. (VGN's code turns
 //! indices about 20 instead, which moves the volume against the grasps by a voxel.)
 
-use grasp_data::Trial;
+use grasp_data::{TURNS, Trial};
 use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
 use rand::{Rng, RngExt};
 use serde::Serialize;
@@ -69,7 +69,7 @@ impl Transform {
     #[must_use]
     pub fn trial(self, trial: &Trial, n: usize) -> Trial {
         let edge = n as f64;
-        let Trial { mut position, mut rotation, .. } = *trial;
+        let Trial { mut position, mut rotation, mut turns, .. } = *trial;
         if self.mirror {
             position.x = edge - position.x;
             // The mirror image of a rotation about an axis is the opposite rotation about the mirrored axis. Of the
@@ -77,12 +77,14 @@ impl Transform {
             // approach (z) and the axis along which the fingers close (y) are the mirrored ones.
             let [x, y, z, w]: [f64; 4] = rotation.coords.into();
             rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, x, -y, -z));
+            // And turns go round the other way.
+            turns = (1..TURNS).fold(0, |mirrored, k| mirrored | (turns >> k & 1) << (TURNS - k));
         }
         for _ in 0..self.turns {
             position = Point3::new(edge - position.y, position.x, position.z);
             rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2) * rotation;
         }
         position.z += f64::from(self.shift);
-        Trial { position, rotation, ..*trial }
+        Trial { position, rotation, turns, ..*trial }
     }
 }

@@ -71,9 +71,9 @@ pub enum ExecuteError {
         /// What it said.
         source: TchError,
     },
-    /// The graph does not compute this output.
-    #[error("the graph has no output `{0}`")]
-    Output(&'static str),
+    /// The graph does not compute this.
+    #[error("the graph computes no `{0}`")]
+    Output(String),
     /// The voxels asked for are not in the batch.
     #[error("these voxels cannot be taken from the maps: {0}")]
     Cells(TchError),
@@ -129,6 +129,7 @@ impl Executor {
         if !OPSETS.contains(&opset) {
             return Err(ExecuteError::Opset(opset));
         }
+        graph.node.iter().try_for_each(check)?;
         let settings: HashSet<&str> = graph.node.iter().flat_map(settings_of).map(String::as_str).collect();
         let mut parameters = Vec::new();
         let mut constants = HashMap::new();
@@ -142,7 +143,6 @@ impl Executor {
             }
         }
         for node in &graph.node {
-            check(node)?;
             if node.op_type() == "Constant"
                 && let Some(value) = node.attribute("value").and_then(|value| value.t.as_ref())
             {
@@ -190,8 +190,18 @@ impl Executor {
     ///
     /// # Errors
     /// [`ExecuteError`] names the node at which it failed, or the output that there is not.
-    pub fn output(&self, input: &Tensor, name: &'static str) -> Result<Tensor, ExecuteError> {
+    pub fn output(&self, input: &Tensor, name: &str) -> Result<Tensor, ExecuteError> {
         take(&mut self.execute(input, None)?, name)
+    }
+
+    /// Runs any graph with one input, and returns values inside it by their names, in f32.
+    ///
+    /// # Errors
+    /// [`ExecuteError`] names the node at which it failed, or the value that there is not.
+    pub fn inside(&self, input: &Tensor, names: &[String]) -> Result<Vec<Tensor>, ExecuteError> {
+        let values = self.execute(input, None)?;
+        let value = |name: &String| values.get(name).map(|value| value.to_kind(Kind::Float));
+        names.iter().map(|name| value(name).ok_or_else(|| ExecuteError::Output(name.clone()))).collect()
     }
 
     /// Runs the network as far as some voxels need it, which are given as flat indices into `[batch, N, N, N]`.
@@ -253,8 +263,8 @@ impl Executor {
 }
 
 /// An output among the values, in f32.
-fn take(values: &mut HashMap<String, Tensor>, name: &'static str) -> Result<Tensor, ExecuteError> {
-    values.remove(name).map(|value| value.to_kind(Kind::Float)).ok_or(ExecuteError::Output(name))
+fn take(values: &mut HashMap<String, Tensor>, name: &str) -> Result<Tensor, ExecuteError> {
+    values.remove(name).map(|value| value.to_kind(Kind::Float)).ok_or_else(|| ExecuteError::Output(name.to_owned()))
 }
 
 impl Execution {

@@ -2,7 +2,8 @@
 //! are those of VGN's code, which the paper builds on).
 
 use grasp::VoxelOrigin;
-use grasp_data::Trial;
+use grasp_data::{TURNS, Trial};
+use nalgebra::UnitQuaternion;
 use tch::{Kind, Reduction, TchError, Tensor};
 use thiserror::Error;
 
@@ -18,8 +19,8 @@ pub struct Targets {
     cells: Vec<i64>,
     /// 1 for a success, 0 for a failure.
     labels: Vec<f32>,
-    /// The rotation and the same turned by 180° about its z, x y z w each.
-    rotations: Vec<[[f32; 4]; 2]>,
+    /// The rotations that hold, each also turned by 180° about its z: x y z w; where there are fewer, the first again.
+    rotations: Vec<[[[f32; 4]; 2]; TURNS]>,
     /// Voxels.
     widths: Vec<f32>,
 }
@@ -39,7 +40,7 @@ pub struct Sums {
     pub voxels: f64,
     /// Binary cross-entropy of the quality.
     pub quality: f64,
-    /// 1 − |r·r*|, successes only.
+    /// 1 − |r·r*| to the nearest rotation that holds, successes only.
     pub rotation: f64,
     /// Weighted squared error of the width, successes only.
     pub width: f64,
@@ -66,11 +67,16 @@ impl Targets {
     /// Adds a grasp in the volume number `index` of the batch; without effect when it lies outside the volume.
     pub fn push(&mut self, index: usize, trial: &Trial, n: usize, origin: VoxelOrigin) {
         let Some(cell) = voxel_of(trial, n, origin) else { return };
-        let [x, y, z, w]: [f32; 4] = trial.rotation.coords.map(|c| c as f32).into();
         self.cells.push((index * n.pow(3) + cell) as i64);
         self.labels.push(f32::from(u8::from(trial.success)));
-        // The second is q · (0, 0, 1, 0): turned by 180° about its own z.
-        self.rotations.push([[x, y, z, w], [y, -x, w, -z]]);
+        let both = |rotation: &UnitQuaternion<f64>| {
+            let [x, y, z, w]: [f32; 4] = rotation.coords.map(|c| c as f32).into();
+            // The second is q · (0, 0, 1, 0): turned by 180° about its own z.
+            [[x, y, z, w], [y, -x, w, -z]]
+        };
+        let mut rotations = [both(&trial.rotation); TURNS];
+        trial.rotations().zip(&mut rotations).for_each(|(rotation, place)| *place = both(&rotation));
+        self.rotations.push(rotations);
         self.widths.push(trial.width as f32);
     }
 
@@ -109,9 +115,10 @@ impl Targets {
         let weights = &labels * (success - failure) + failure;
         let quality_loss = quality.f_binary_cross_entropy(&labels, Some(&weights), Reduction::Sum)?;
 
-        let both = Tensor::f_from_slice(self.rotations.as_flattened().as_flattened())?.to_device(device);
+        let hold = self.rotations.as_flattened().as_flattened().as_flattened();
+        let hold = Tensor::f_from_slice(hold)?.to_device(device).f_reshape([-1, 2 * TURNS as i64, 4])?;
         let rotation = outputs.rotation.f_reshape([-1, 1, 4])?;
-        let cosines = rotation.f_mul(&both.f_reshape([-1, 2, 4])?)?.sum_dim_intlist(-1, false, None).abs();
+        let cosines = rotation.f_mul(&hold)?.sum_dim_intlist(-1, false, None).abs();
         let rotation_loss: Tensor = &labels * (1.0 - cosines.amax([1], false));
         let rotation_loss = rotation_loss.sum(None);
 

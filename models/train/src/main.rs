@@ -1,5 +1,6 @@
 //! Trains grasp networks, or writes one with random weights.
 
+mod calibrate;
 mod classify;
 mod evaluate;
 mod export;

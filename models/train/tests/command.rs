@@ -177,6 +177,26 @@ fn an_export_is_half_the_file_and_computes_the_same() {
 }
 
 #[test]
+fn an_export_in_8_bits_is_a_third_of_the_file_and_computes_nearly_the_same() {
+    let folder = prepare();
+    let arguments = "export --from start.onnx --precision int8 --out int8.onnx --data data --calibrate 4";
+    let output = command(folder.path(), arguments).output().unwrap();
+    assert!(output.status.success(), "{}", said(&output));
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let number = |pointer: &str| report.pointer(pointer).and_then(serde_json::Value::as_f64).unwrap();
+    assert!(number("/out_bytes") < 0.35 * number("/from_bytes"), "{report}");
+    for output in ["quality", "rotation", "width_voxels"] {
+        let (largest, mean) =
+            (number(&format!("/compared/{output}/largest")), number(&format!("/compared/{output}/mean")));
+        assert!(largest > 0.0 && largest < 0.1 && mean < 0.02, "{output}: {report}");
+    }
+    // It is made to be served, not to be trained on.
+    let arguments = "train --from int8.onnx --data data --epochs 1 --out trained.onnx";
+    let output = command(folder.path(), arguments).output().unwrap();
+    assert!(said(&output).contains("the operator `QuantizeLinear` cannot be trained"), "{}", said(&output));
+}
+
+#[test]
 fn what_cannot_be_done_is_said() {
     let folder = prepare();
     for (arguments, expected) in [
@@ -190,6 +210,7 @@ fn what_cannot_be_done_is_said() {
         ("train --network vgn --data data --out x.onnx --val 1", "--val is 1"),
         ("train --from start.onnx --data data --out x.onnx --resume", "x.state: No such file"),
         ("train --data data --out x.onnx", "--network"),
+        ("export --from start.onnx --precision int8 --out x.onnx", "name folders of them with --data"),
     ] {
         let output = command(folder.path(), arguments).output().unwrap();
         assert!(!output.status.success());

@@ -257,6 +257,7 @@ fn the_loss_is_the_papers() {
         rotation: UnitQuaternion::from_euler_angles(0.3, -0.8, 1.1),
         width: 4.0,
         success: true,
+        turns: 0,
     };
     let mut targets = Targets::default();
     targets.push(1, &label, n, VoxelOrigin::Center);
@@ -276,6 +277,23 @@ fn the_loss_is_the_papers() {
             assert_eq!((loss.sums.accuracy(), loss.sums.precision(), loss.sums.recall()), (0.5, 0.5, 1.0));
         }
     }
+    // A turn that holds, too, is as good.
+    let turns = |k: u8| {
+        let mut targets = Targets::default();
+        targets.push(0, &Trial { turns: 1 << k, ..label }, n, VoxelOrigin::Center);
+        targets
+    };
+    let turned = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), 2.0 * std::f64::consts::PI / 5.0);
+    let rotation: [f32; 4] = (label.rotation * turned).coords.map(|c| c as f32).into();
+    let rotation_loss = |targets: &Targets| {
+        let Outputs { quality, rotation, width } = outputs(0.8, rotation, 4.0);
+        let first = |map: Tensor| map.narrow(0, 0, 1);
+        let outputs = Outputs { quality: first(quality), rotation: first(rotation), width: first(width) };
+        targets.loss(&outputs, [1.0, 1.0]).unwrap().sums.rotation
+    };
+    assert!(rotation_loss(&turns(2)).abs() < 1e-5);
+    let off_by_a_step = 1.0 - (std::f64::consts::PI / 10.0).cos();
+    assert!((rotation_loss(&turns(1)) - off_by_a_step).abs() < 1e-5);
     let quarter = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
     let rotation: [f32; 4] = (label.rotation * quarter).coords.map(|c| c as f32).into();
     let loss = targets.loss(&outputs(0.8, rotation, 4.0), [1.0, 3.0]).unwrap();
@@ -290,6 +308,7 @@ fn a_grasp_stands_for_the_voxel_of_its_convention() {
         rotation: UnitQuaternion::identity(),
         width: 4.0,
         success: true,
+        turns: 0,
     };
     let cell = |x: i64, y: i64, z: i64| (x * 4 + y) * 4 + z;
     let cells = |label: &Trial, origin| {

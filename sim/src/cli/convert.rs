@@ -65,7 +65,10 @@ impl Convert {
                 let kept: Vec<Trial> = trials
                     .iter()
                     .filter(inside)
-                    .map(|trial| Trial::new(&trial.grasp(1.0), trial.success, voxel_size))
+                    .map(|trial| Trial {
+                        turns: trial.turns,
+                        ..Trial::new(&trial.grasp(1.0), trial.success, voxel_size)
+                    })
                     .collect();
                 dropped += trials.len() - kept.len();
                 if kept.is_empty() { Ok(()) } else { writer.append(index, id, &volume, &kept) }

@@ -134,9 +134,7 @@ impl Writer {
     }
 
     fn append(&mut self, number: u64, mut scene: LabelledScene) -> anyhow::Result<()> {
-        let trials = |unit: f64| -> Vec<Trial> {
-            scene.points.iter().map(|point| Trial::new(&point.grasp, point.success(), unit)).collect()
-        };
+        let trials = |unit: f64| -> Vec<Trial> { scene.points.iter().map(|point| point.trial(unit)).collect() };
         let voxel_size = WORKSPACE_SIZE / RESOLUTION as f64;
         let id = format!("{number:08}");
         match self {

@@ -22,8 +22,8 @@ pub fn scene(seed: u64, n: usize) -> Scene {
         id: format!("{seed:06x}"),
         volumes: vec![(0..n.pow(3)).map(value).collect()],
         trials: vec![
-            Trial { position: at(0.5), rotation: yaw * down, width, success: true },
-            Trial { position: at(-0.3), rotation: yaw, width: 10.0, success: false },
+            Trial { position: at(0.5), rotation: yaw * down, width, success: true, turns: 0 },
+            Trial { position: at(-0.3), rotation: yaw, width: 10.0, success: false, turns: 0 },
         ],
     }
 }

@@ -1,0 +1,247 @@
+//! Weights and activations as 8-bit integers, in ONNX's QDQ form: what an integer kernel is to read passes through a
+//! `QuantizeLinear` and a `DequantizeLinear`, which a runtime fuses with the operator between them, or executes as they
+//! stand where it has no such kernel.
+//!
+//! The scheme is that of ONNX Runtime's static quantisation: weights symmetric with a scale for each output channel,
+//! activations u8 with one scale and a zero point, taken from the range that was observed on real volumes.
+
+use std::collections::{HashMap, HashSet};
+
+use thiserror::Error;
+
+use crate::onnx::{AttributeProto, GraphProto, ModelProto, NodeProto, TensorError, TensorProto};
+
+/// The values that an activation takes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Range {
+    /// The least.
+    pub low: f32,
+    /// The greatest.
+    pub high: f32,
+}
+
+/// Why a network cannot be quantised.
+#[derive(Debug, Error)]
+pub enum QuantizeError {
+    /// An activation was not observed.
+    #[error("the range of `{0}` is not known")]
+    Range(String),
+    /// A weight cannot be read.
+    #[error(transparent)]
+    Tensor(#[from] TensorError),
+}
+
+/// A product with a weight, which integers can compute.
+struct Product<'a> {
+    node: &'a NodeProto,
+    weight: &'a TensorProto,
+    /// The axis of the weight's output channels.
+    axis: usize,
+}
+
+/// The activations whose ranges [`with_int8`] needs.
+#[must_use]
+pub fn quantized_activations(model: &ModelProto) -> Vec<String> {
+    let Some(graph) = &model.graph else { return Vec::new() };
+    let mut names: Vec<String> = products(graph)
+        .iter()
+        .flat_map(|product| [product.input(), product.output(graph)])
+        .map(str::to_owned)
+        .collect();
+    names.sort();
+    names.dedup();
+    names
+}
+
+/// The model with the products of its f32 weights computed in 8 bits. The last, from which the outputs come, stay f32:
+/// their rounding would reach the grasps directly.
+///
+/// # Errors
+/// [`QuantizeError`] names the activation whose range is missing, or the weight that cannot be read.
+pub fn with_int8(model: &ModelProto, ranges: &HashMap<String, Range>) -> Result<ModelProto, QuantizeError> {
+    let Some(graph) = &model.graph else { return Ok(model.clone()) };
+    let products = products(graph);
+    let mut quantized = GraphProto { node: Vec::new(), initializer: Vec::new(), ..graph.clone() };
+    let mut activations = HashMap::new();
+    for name in products.iter().flat_map(|product| [product.input(), product.output(graph)]) {
+        let range = ranges.get(name).ok_or_else(|| QuantizeError::Range(name.to_owned()))?;
+        activations.insert(name, range.scale());
+    }
+
+    // Weights that only products read are no longer needed as f32.
+    let replaced: HashSet<&str> =
+        products.iter().flat_map(|product| &product.node.input[1..]).map(String::as_str).collect();
+    let kept = |tensor: &&TensorProto| !replaced.contains(tensor.name());
+    quantized.initializer.extend(graph.initializer.iter().filter(kept).cloned());
+
+    if let Some(input) = graph.input.first().map(|input| input.name())
+        && let Some(&scale) = activations.get(input)
+    {
+        quantize_activation(&mut quantized, input, scale);
+    }
+    for node in &graph.node {
+        let mut node = node.clone();
+        let product = products.iter().find(|product| product.node.output == node.output);
+        for input in &mut node.input {
+            // An integer kernel reads quantised values; whatever else reads them gets what that kernel would.
+            if activations.contains_key(input.as_str()) {
+                *input = dequantized(input);
+            }
+        }
+        if let Some(product) = product {
+            let scales = quantize_weight(&mut quantized, product)?;
+            node.input[1] = dequantized(product.weight.name());
+            if let Some(bias) = product.node.input.get(2).filter(|bias| !bias.is_empty()) {
+                let (scale, _) = activations[product.input()];
+                quantize_bias(&mut quantized, graph, bias, &scales, scale)?;
+                node.input[2] = dequantized(bias);
+            }
+        }
+        let outputs = node.output.clone();
+        quantized.node.push(node);
+        for output in &outputs {
+            if let Some(&scale) = activations.get(output.as_str()) {
+                quantize_activation(&mut quantized, output, scale);
+            }
+        }
+    }
+    Ok(ModelProto { graph: Some(quantized), ..model.clone() })
+}
+
+/// The products that are quantised, in the order of the graph.
+fn products<'a>(graph: &'a GraphProto) -> Vec<Product<'a>> {
+    let last = last(graph);
+    let weights: HashMap<&str, &TensorProto> = graph.initializer.iter().map(|tensor| (tensor.name(), tensor)).collect();
+    let mut readers: HashMap<&str, usize> = HashMap::new();
+    for input in graph.node.iter().flat_map(|node| &node.input) {
+        *readers.entry(input).or_default() += 1;
+    }
+    let product = |node: &'a NodeProto| {
+        let weight = *weights.get(node.input.get(1)?.as_str())?;
+        let axis = match (node.op_type(), weight.dims.len()) {
+            ("Conv", _) => 0,
+            ("ConvTranspose", _) | ("MatMul", 2) => 1,
+            _ => return None,
+        };
+        // Weight and bias are replaced, which another reader would notice.
+        let own = node.input[1..].iter().all(|name| name.is_empty() || readers[name.as_str()] == 1);
+        (own && weight.is_float() && !last.contains(node.output[0].as_str())).then_some(Product { node, weight, axis })
+    };
+    graph.node.iter().filter_map(product).collect()
+}
+
+/// The outputs of those products that no other product follows.
+fn last(graph: &GraphProto) -> HashSet<&str> {
+    let (mut followed, mut last) = (HashSet::new(), HashSet::new());
+    for node in graph.node.iter().rev() {
+        let is_product = matches!(node.op_type(), "Conv" | "ConvTranspose" | "MatMul");
+        let followed_here = node.output.iter().any(|output| followed.contains(output.as_str()));
+        if is_product && !followed_here {
+            last.extend(node.output.iter().map(String::as_str));
+        }
+        if is_product || followed_here {
+            followed.extend(node.input.iter().map(String::as_str));
+        }
+    }
+    last
+}
+
+impl Product<'_> {
+    fn input(&self) -> &str {
+        &self.node.input[0]
+    }
+
+    /// What it is quantised after: a ReLU, if that alone follows, which then costs nothing.
+    fn output<'a>(&'a self, graph: &'a GraphProto) -> &'a str {
+        let output = self.node.output[0].as_str();
+        let mut readers = graph.node.iter().filter(|node| node.input.iter().any(|input| input == output));
+        match (readers.next(), readers.next()) {
+            (Some(reader), None) if reader.op_type() == "Relu" => &reader.output[0],
+            _ => output,
+        }
+    }
+}
+
+impl Range {
+    /// The scale and zero point of u8 over this range and 0, which must be exact: it pads.
+    fn scale(self) -> (f32, u8) {
+        let (low, high) = (self.low.min(0.0), self.high.max(0.0));
+        let scale = if high > low { (high - low) / 255.0 } else { 1.0 };
+        (scale, (-low / scale).round().clamp(0.0, 255.0) as u8)
+    }
+}
+
+fn dequantized(name: &str) -> String {
+    format!("{name}.dequantized")
+}
+
+/// An activation through u8 and back.
+fn quantize_activation(graph: &mut GraphProto, name: &str, (scale, zero): (f32, u8)) {
+    let (scale_name, zero_name, quantized) =
+        (format!("{name}.scale"), format!("{name}.zero"), format!("{name}.quantized"));
+    graph.initializer.push(TensorProto::from_f32(&scale_name, &[], &[scale]));
+    graph.initializer.push(TensorProto::from_u8(&zero_name, &[], &[zero]));
+    graph.node.push(node("QuantizeLinear", [name, &scale_name, &zero_name], &quantized, None));
+    graph.node.push(node("DequantizeLinear", [&quantized, &scale_name, &zero_name], &dequantized(name), None));
+}
+
+/// The product's weight as i8; returns the scales of its output channels.
+fn quantize_weight(graph: &mut GraphProto, product: &Product) -> Result<Vec<f32>, TensorError> {
+    let Product { weight, axis, .. } = *product;
+    let values = weight.to_f32()?;
+    let dims: Vec<usize> = weight.dims.iter().map(|&dim| dim as usize).collect();
+    let inner: usize = dims[axis + 1..].iter().product();
+    let channel = |index: usize| index / inner % dims[axis];
+
+    let mut scales = vec![0.0_f32; dims[axis]];
+    for (index, value) in values.iter().enumerate() {
+        let scale = &mut scales[channel(index)];
+        *scale = scale.max(value.abs() / 127.0);
+    }
+    for scale in scales.iter_mut().filter(|scale| **scale == 0.0) {
+        *scale = 1.0;
+    }
+    let round = |(index, value): (usize, &f32)| (value / scales[channel(index)]).round() as i8;
+    let values: Vec<i8> = values.iter().enumerate().map(round).collect();
+
+    let name = weight.name();
+    let [stored, scale, zero] = ["i8", "scale", "zero"].map(|suffix| format!("{name}.{suffix}"));
+    let channels = [scales.len() as i64];
+    graph.initializer.push(TensorProto::from_i8(&stored, &weight.dims, &values));
+    graph.initializer.push(TensorProto::from_f32(&scale, &channels, &scales));
+    graph.initializer.push(TensorProto::from_i8(&zero, &channels, &vec![0; scales.len()]));
+    graph.node.push(node("DequantizeLinear", [&stored, &scale, &zero], &dequantized(name), Some(axis)));
+    Ok(scales)
+}
+
+/// A bias as i32 in the units of the product's sums, as integer kernels take it.
+fn quantize_bias(
+    graph: &mut GraphProto,
+    from: &GraphProto,
+    name: &str,
+    weight_scales: &[f32],
+    input_scale: f32,
+) -> Result<(), QuantizeError> {
+    let bias = from.initializer.iter().find(|tensor| tensor.name() == name);
+    let values = bias.ok_or_else(|| QuantizeError::Range(name.to_owned()))?.to_f32()?;
+    let scales: Vec<f32> = weight_scales.iter().map(|scale| scale * input_scale).collect();
+    let values: Vec<i32> = values.iter().zip(&scales).map(|(value, scale)| (value / scale).round() as i32).collect();
+    let [stored, scale, zero] = ["i32", "scale", "zero"].map(|suffix| format!("{name}.{suffix}"));
+    let channels = [scales.len() as i64];
+    graph.initializer.push(TensorProto::from_i32(&stored, &channels, &values));
+    graph.initializer.push(TensorProto::from_f32(&scale, &channels, &scales));
+    graph.initializer.push(TensorProto::from_i32(&zero, &channels, &vec![0; scales.len()]));
+    graph.node.push(node("DequantizeLinear", [&stored, &scale, &zero], &dequantized(name), Some(0)));
+    Ok(())
+}
+
+fn node(op: &str, inputs: [&str; 3], output: &str, axis: Option<usize>) -> NodeProto {
+    NodeProto {
+        op_type: Some(op.to_owned()),
+        name: Some(output.to_owned()),
+        input: inputs.map(str::to_owned).to_vec(),
+        output: vec![output.to_owned()],
+        attribute: axis.map(|axis| AttributeProto::int("axis", axis as i64)).into_iter().collect(),
+        ..NodeProto::default()
+    }
+}

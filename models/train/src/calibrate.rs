@@ -1,0 +1,36 @@
+//! The ranges of a network's activations, observed on real volumes.
+
+use std::collections::HashMap;
+
+use anyhow::{Context, Result};
+use grasp_data::Dataset;
+use grasp_models::onnx::ModelProto;
+use grasp_models::{Range, quantized_activations};
+use grasp_train::{Execution, Executor};
+use tch::{Device, Tensor, no_grad};
+
+/// The range of each activation that 8 bits must hold: the mean, over the volumes, of its least and its greatest value.
+/// The range over all volumes would be that of the strangest one, and coarser for every other.
+pub(crate) fn ranges(
+    model: &ModelProto,
+    data: &Dataset,
+    scenes: impl ExactSizeIterator<Item = usize>,
+) -> Result<HashMap<String, Range>> {
+    let names = quantized_activations(model);
+    let execution = Execution { device: Device::Cpu, bf16: false, channels_last: false };
+    let executor = Executor::new(model.clone(), execution)?;
+    let (n, share) = (data.resolution() as i64, 1.0 / scenes.len() as f32);
+    let mut ranges: HashMap<String, Range> =
+        names.iter().map(|name| (name.clone(), Range { low: 0.0, high: 0.0 })).collect();
+    for scene in scenes {
+        let values: Vec<f32> = data.volume(scene, 0).iter().map(|&byte| grasp_data::value(byte)).collect();
+        let volume = Tensor::from_slice(&values).reshape([1, 1, n, n, n]);
+        let activations = no_grad(|| executor.inside(&volume, &names))?;
+        for (name, activation) in names.iter().zip(activations) {
+            let range = ranges.get_mut(name).context("an activation is named twice")?;
+            range.low += share * f32::try_from(activation.min())?;
+            range.high += share * f32::try_from(activation.max())?;
+        }
+    }
+    Ok(ranges)
+}
