@@ -1,4 +1,4 @@
-//! How long the domain's two stages take on one core: `cargo run --release -p grasp --example speed`.
+//! How long the domain's two stages take on one core: `cargo run --release -p grasp --example fuse_and_decode`.
 
 use std::hint::black_box;
 use std::time::Instant;
