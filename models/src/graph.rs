@@ -88,7 +88,13 @@ impl Builder {
 
     /// A constant list of numbers.
     pub fn numbers(&mut self, values: &[f32]) -> String {
-        self.constant(TensorProto::from_f32("", &[values.len() as i64], values))
+        self.tensor(&[values.len()], values)
+    }
+
+    /// A constant tensor of numbers.
+    pub fn tensor(&mut self, dims: &[usize], values: &[f32]) -> String {
+        let dims: Vec<i64> = dims.iter().map(|&dim| dim as i64).collect();
+        self.constant(TensorProto::from_f32("", &dims, values))
     }
 
     fn constant(&mut self, value: TensorProto) -> String {

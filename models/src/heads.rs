@@ -3,6 +3,37 @@
 use crate::graph::{Builder, Conv};
 use crate::onnx::AttributeProto;
 
+/// What a network regresses of a grasp's orientation. Its output is a quaternion either way.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Orientation {
+    /// The four numbers of a quaternion, as in VGN and in the paper. A hand turned by 180° is the same hand, and so are
+    /// q and −q; no continuous choice of q covers all orientations, and near every jump the network answers in between.
+    #[default]
+    Quaternion,
+    /// The direction of the approach, and of the line along which the fingers close: six numbers that no turn of the hand
+    /// by 180° changes, and that nowhere jump, except for an approach from straight below.
+    Axes,
+}
+
+impl Orientation {
+    /// Its name.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Quaternion => "quaternion",
+            Self::Axes => "axes",
+        }
+    }
+
+    /// How many numbers are regressed.
+    fn channels(self) -> usize {
+        match self {
+            Self::Quaternion => 4,
+            Self::Axes => 6,
+        }
+    }
+}
+
 /// Declares the network's input and returns it: the volume, `[batch, 1, N, N, N]`.
 pub(crate) fn volume(b: &mut Builder, resolution: usize) -> String {
     b.input("tsdf", &[1, resolution, resolution, resolution])
@@ -11,17 +42,79 @@ pub(crate) fn volume(b: &mut Builder, resolution: usize) -> String {
 /// Declares the three outputs over `features`, `[batch, channels, N, N, N]`:
 /// quality (sigmoid), rotation (a unit quaternion x y z w) and width (linear, in voxels).
 ///
-/// The three 5³ convolutions read the same features, so they are one convolution with six channels: the mathematics
-/// is the same and it takes half the time of the whole of VGN.
-pub(crate) fn heads(b: &mut Builder, features: &str, channels: usize, resolution: usize) {
-    let all = b.conv("heads", features, Conv { inputs: channels, outputs: 6, kernel: 5, stride: 1, bias: true });
-    let sizes = b.whole(&[1, 4, 1]);
+/// The 5³ convolutions of all three read the same features, so they are one convolution: the mathematics is the same
+/// and it takes half the time of the whole of VGN.
+pub(crate) fn heads(b: &mut Builder, features: &str, channels: usize, resolution: usize, orientation: Orientation) {
+    let outputs = 1 + orientation.channels() + 1;
+    let all = b.conv("heads", features, Conv { inputs: channels, outputs, kernel: 5, stride: 1, bias: true });
+    let sizes = b.whole(&[1, orientation.channels() as i64, 1]);
     let [quality, rotation, width] = b.nodes("Split", &[&all, &sizes], vec![AttributeProto::int("axis", 1)]);
     let quality = b.node("Sigmoid", &[&quality], vec![]);
-    let rotation = normalize(b, &rotation);
+    let rotation = match orientation {
+        Orientation::Quaternion => normalize(b, &rotation),
+        Orientation::Axes => from_axes(b, &rotation),
+    };
     for (name, value, channels) in [("quality", quality, 1), ("rotation", rotation, 4), ("width", width, 1)] {
         b.output(name, &value, &[channels, resolution, resolution, resolution]);
     }
+}
+
+/// The quaternion of an approach (−z, x, y), of 2ψ (its cosine, its sine), and of how level the fingers close, none of unit
+/// length yet: the hand points down with its axes along x, −y, −z, is tilted the shortest way until its z is the approach,
+/// and turns by −ψ about it.
+///
+/// After an approach from the azimuth α the fingers close level when ψ = α, and upright when ψ = α + 90°. What is level
+/// thus winds twice around (cos 2ψ, sin 2ψ) as an object is walked around once, although it is the same grasp; the last
+/// number, times (x + iy)², which is the level direction as long as the approach is flat, says it once for all azimuths.
+fn from_axes(b: &mut Builder, axes: &str) -> String {
+    let sizes = b.whole(&[3, 2, 1]);
+    let [approach, turn, level] = b.nodes("Split", &[axes, &sizes], vec![AttributeProto::int("axis", 1)]);
+
+    // The tilt takes (1, 0, 0) to the approach; half-way between them stands its rotation (1 + approach, normalised).
+    // Times the half turn about x that points the hand down it is the quaternion (a, 0, x, −y).
+    let approach = normalize(b, &approach);
+    let tilt = half_way(b, &approach, 3);
+    let [a, x, y] = split(b, &tilt);
+
+    let direction = level_direction(b, &approach);
+    let level = b.node("Mul", &[&direction, &level], vec![]);
+    let turn = b.node("Add", &[&turn, &level], vec![]);
+    // Half an angle, and again half of it: the quaternion (0, 0, −s, c) turns by −ψ.
+    let turn = normalize(b, &turn);
+    let turn = half_way(b, &turn, 2);
+    let turn = half_way(b, &turn, 2);
+    let [c, s] = split(b, &turn);
+
+    let [ac, r#as, xc, xs, yc, ys] = [[&a, &c], [&a, &s], [&x, &c], [&x, &s], [&y, &c], [&y, &s]]
+        .map(|[left, right]| b.node("Mul", &[left, right], vec![]));
+    let z = b.node("Add", &[&xc, &ys], vec![]);
+    let w = b.node("Sub", &[&xs, &yc], vec![]);
+    b.node("Concat", &[&ac, &r#as, &z, &w], vec![AttributeProto::int("axis", 1)])
+}
+
+/// (x + iy)² of an approach (−z, x, y): its real and its imaginary part.
+fn level_direction(b: &mut Builder, approach: &str) -> String {
+    let [_, x, y] = split(b, approach);
+    let [minus, plus] = ["Sub", "Add"].map(|op| b.node(op, &[&x, &y], vec![]));
+    let re = b.node("Mul", &[&minus, &plus], vec![]);
+    let half = b.node("Mul", &[&x, &y], vec![]);
+    let im = b.node("Add", &[&half, &half], vec![]);
+    b.node("Concat", &[&re, &im], vec![AttributeProto::int("axis", 1)])
+}
+
+/// The unit vector half-way between (1, 0, …) and a unit vector.
+fn half_way(b: &mut Builder, x: &str, channels: usize) -> String {
+    let mut first = vec![0.0; channels];
+    first[0] = 1.0;
+    let first = b.tensor(&[1, channels, 1, 1, 1], &first);
+    let sum = b.node("Add", &[x, &first], vec![]);
+    normalize(b, &sum)
+}
+
+/// The channels one by one.
+fn split<const N: usize>(b: &mut Builder, x: &str) -> [String; N] {
+    let sizes = b.whole(&[1; N]);
+    b.nodes("Split", &[x, &sizes], vec![AttributeProto::int("axis", 1)])
 }
 
 /// Scales to length 1 over the channels; no length below 1e-12 is divided by (PyTorch's `normalize`).

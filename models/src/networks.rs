@@ -5,6 +5,7 @@ use std::str::FromStr;
 use grasp::{RESOLUTION, Volume, VoxelOrigin};
 use thiserror::Error;
 
+use crate::heads::Orientation;
 use crate::onnx::ModelProto;
 use crate::transformer::{Config, transformer};
 use crate::vgn::vgn;
@@ -57,20 +58,33 @@ impl Architecture {
         }
     }
 
-    /// The network with random weights for volumes of `resolution`³ voxels. The same seed gives the same bytes.
+    /// The network with random weights for volumes of `resolution`³ voxels, as published: it regresses quaternions. The
+    /// same seed gives the same bytes.
+    ///
+    /// # Errors
+    /// As [`build_with`](Self::build_with).
+    pub fn build(self, resolution: usize, seed: u64) -> Result<ModelProto, BuildError> {
+        self.build_with(resolution, Orientation::Quaternion, seed)
+    }
+
+    /// The same, with a choice of what it regresses.
     ///
     /// # Errors
     /// [`BuildError::Resolution`] unless the resolution is a multiple of 8 that a [`Volume`] can have.
-    pub fn build(self, resolution: usize, seed: u64) -> Result<ModelProto, BuildError> {
+    pub fn build_with(self, resolution: usize, orientation: Orientation, seed: u64) -> Result<ModelProto, BuildError> {
         if !(8..=Volume::MAX_RESOLUTION).contains(&resolution) || !resolution.is_multiple_of(8) {
             return Err(BuildError::Resolution(resolution));
         }
         let mut model = match self {
-            Self::Vgn => vgn(resolution, seed),
-            Self::Transformer => transformer(&Config::PAPER, resolution, seed),
-            Self::TransformerSmall => transformer(&Config::SMALL, resolution, seed),
+            Self::Vgn => vgn(resolution, orientation, seed),
+            Self::Transformer => transformer(&Config::PAPER, resolution, orientation, seed),
+            Self::TransformerSmall => transformer(&Config::SMALL, resolution, orientation, seed),
         };
-        let provenance = [("architecture", self.name().to_owned()), ("seed", seed.to_string())];
+        let provenance = [
+            ("architecture", self.name().to_owned()),
+            ("orientation", orientation.name().to_owned()),
+            ("seed", seed.to_string()),
+        ];
         let metadata = Metadata {
             name: self.name().to_owned(),
             version: "1".to_owned(),

@@ -3,7 +3,7 @@
 //! Where the paper is silent, layers and initialisation are those of the UNETR code in MONAI.
 
 use crate::graph::{Builder, Conv, Init};
-use crate::heads::{heads, volume};
+use crate::heads::{Orientation, heads, volume};
 use crate::onnx::{AttributeProto, ModelProto};
 
 /// Edge of a patch, voxels: the decoder doubles the size three times.
@@ -39,7 +39,7 @@ impl Config {
 }
 
 /// The transformer over volumes of `resolution`³ voxels, a multiple of 8.
-pub(crate) fn transformer(config: &Config, resolution: usize, seed: u64) -> ModelProto {
+pub(crate) fn transformer(config: &Config, resolution: usize, orientation: Orientation, seed: u64) -> ModelProto {
     let Config { hidden, features, skips, .. } = *config;
     let mut builder = Builder::new("transformer", seed);
     let b = &mut builder;
@@ -72,7 +72,7 @@ pub(crate) fn transformer(config: &Config, resolution: usize, seed: u64) -> Mode
         x = residual_block(b, name, &x, 2 * outputs, outputs);
         inputs = outputs;
     }
-    heads(b, &x, features, resolution);
+    heads(b, &x, features, resolution, orientation);
     builder.finish()
 }
 

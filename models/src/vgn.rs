@@ -2,11 +2,12 @@
 //! Clutter", CoRL 2020, with the layer sizes of its released code.
 
 use crate::graph::{Builder, Conv};
-use crate::heads::{heads, volume};
+use crate::heads::{Orientation, heads, volume};
 use crate::onnx::{AttributeProto, ModelProto};
 
-/// VGN over volumes of `resolution`³ voxels (a multiple of 8): 313,238 parameters, whatever the resolution.
-pub(crate) fn vgn(resolution: usize, seed: u64) -> ModelProto {
+/// VGN over volumes of `resolution`³ voxels (a multiple of 8): 313,238 parameters with quaternions, whatever the
+/// resolution.
+pub(crate) fn vgn(resolution: usize, orientation: Orientation, seed: u64) -> ModelProto {
     let mut builder = Builder::new("vgn", seed);
     let b = &mut builder;
     let mut x = volume(b, resolution);
@@ -18,7 +19,7 @@ pub(crate) fn vgn(resolution: usize, seed: u64) -> ModelProto {
         x = conv_relu(b, &format!("decoder.{layer}"), &x, Conv { inputs, outputs, kernel, stride: 1, bias: true });
         x = double(b, &x);
     }
-    heads(b, &x, 16, resolution);
+    heads(b, &x, 16, resolution, orientation);
     builder.finish()
 }
 

@@ -3,7 +3,10 @@
 use std::process::Command;
 
 use grasp_models::onnx::{ModelProto, TensorProto};
-use grasp_models::{Architecture, BuildError, build, gpd, with_full_weights, with_half_weights};
+use grasp_models::{
+    Architecture, BuildError, Orientation, Range, build, gpd, quantized_activations, with_full_weights,
+    with_half_weights, with_int8,
+};
 use prost::Message;
 
 #[test]
@@ -119,8 +122,13 @@ fn the_onnx_checker_accepts_every_network() {
     let python = std::env::var("GRASPD_PYTHON").expect("GRASPD_PYTHON is not set: run the tests by `make test`");
     let folder = tempfile::tempdir().unwrap();
     let networks = Architecture::ALL.map(|architecture| (architecture.name(), architecture.build(40, 0).unwrap()));
-    let half = with_half_weights(&build("vgn", 0).unwrap()).unwrap();
-    for (name, model) in networks.into_iter().chain([("gpd", gpd::gpd(0)), ("half", half)]) {
+    let vgn = build("vgn", 0).unwrap();
+    let half = with_half_weights(&vgn).unwrap();
+    let ranges = quantized_activations(&vgn).into_iter().map(|name| (name, Range { low: -1.0, high: 2.0 })).collect();
+    let int8 = with_int8(&vgn, &ranges).unwrap();
+    let axes = Architecture::Vgn.build_with(40, Orientation::Axes, 0).unwrap();
+    let others = [("gpd", gpd::gpd(0)), ("half", half), ("int8", int8), ("axes", axes)];
+    for (name, model) in networks.into_iter().chain(others) {
         let path = folder.path().join(format!("{name}.onnx"));
         model.write(&path).unwrap();
         let script = "import onnx, sys; onnx.checker.check_model(sys.argv[1], full_check=True)";

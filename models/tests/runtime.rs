@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use grasp::gpd::{Candidate, Cloud, Image};
 use grasp::{SurfacePoint, Volume};
 use grasp_models::onnx::{Dimension, ModelProto, ValueInfoProto};
-use grasp_models::{Architecture, Classifier, Network, Options, RuntimeError, build, gpd, init};
-use nalgebra::{Isometry3, Point3, Vector3};
+use grasp_models::{Architecture, Classifier, Network, Options, Orientation, RuntimeError, build, gpd, init};
+use nalgebra::{Isometry3, Point3, Quaternion, UnitQuaternion, Vector3};
 use tempfile::TempDir;
 
 fn save(model: &ModelProto) -> (TempDir, PathBuf) {
@@ -51,6 +51,55 @@ fn vgn_gives_qualities_unit_quaternions_and_widths() {
         let length: f32 = (0..4).map(|c| maps.rotation[c * voxels + voxel].powi(2)).sum();
         assert!((length - 1.0).abs() < 1e-4, "voxel {voxel}: |r|² = {length}");
     }
+}
+
+/// The rotation that a network which regresses axes gives for these six numbers.
+fn rotation_of(axes: [f32; 6]) -> UnitQuaternion<f64> {
+    let mut model = Architecture::Vgn.build_with(8, Orientation::Axes, 0).unwrap();
+    for weight in &mut model.graph.as_mut().unwrap().initializer {
+        let mut values = vec![0.0; weight.elements()];
+        if weight.name() == "heads.bias" {
+            values[1..7].copy_from_slice(&axes);
+        }
+        weight.set_f32(&values);
+    }
+    let mut network = load(&model);
+    let output = network.infer(&[&volume(8, 0)]).unwrap();
+    let [x, y, z, w] = [0, 1, 2, 3].map(|channel| f64::from(output.maps(0).rotation[channel * 8 * 8 * 8]));
+    let quaternion = Quaternion::new(w, x, y, z);
+    assert!((quaternion.norm() - 1.0).abs() < 1e-5, "{quaternion}");
+    UnitQuaternion::from_quaternion(quaternion)
+}
+
+#[test]
+fn axes_become_the_rotation_they_mean() {
+    for approach in [[0.0, 0.0, -1.0], [0.6, 0.0, -0.8], [-0.6, 0.64, -0.48], [0.0, 1.0, 0.0], [0.8, -0.36, 0.48]] {
+        let [x, y, z] = approach;
+        // No length matters but those against each other.
+        let given = [-3.0 * z, 3.0 * x, 3.0 * y];
+        let rotation =
+            |turn: [f32; 2], level: f32| rotation_of([given[0], given[1], given[2], turn[0], turn[1], level]);
+        let closing = |turn, level| rotation(turn, level) * Vector3::y();
+        let approach = Vector3::new(f64::from(x), f64::from(y), f64::from(z));
+        let along = |a: Vector3<f64>, b: Vector3<f64>| (a.dot(&b).abs() - 1.0).abs() < 1e-3;
+        let across = |a: Vector3<f64>, b: Vector3<f64>| a.dot(&b).abs() < 2e-3;
+        for turn in [[1.0, 0.02], [0.5, 0.5], [-0.7, 0.1], [0.2, -0.9]] {
+            assert!((rotation(turn, 0.0) * Vector3::z() - approach).norm() < 1e-5, "{approach} turned by {turn:?}");
+            assert!(across(closing(turn, 0.0), closing(turn.map(|t| -t), 0.0)), "the opposite is a quarter turn off");
+        }
+        // Half an angle: the second is 45° on from the first.
+        let cosine = closing([1.0, 0.0], 0.0).dot(&closing([0.0, 1.0], 0.0)).abs();
+        assert!((cosine - 0.5_f64.sqrt()).abs() < 1e-5, "{cosine}");
+        if x != 0.0 || y != 0.0 {
+            let level = Vector3::z().cross(&approach).normalize();
+            assert!(
+                along(closing([1e-3, 2e-3], 9.0), level) && across(closing([1e-3, 2e-3], -9.0), level),
+                "{approach}"
+            );
+        }
+    }
+    let down = |turn| rotation_of([1.0, 0.0, 0.0, turn, 1e-3, 0.0]) * Vector3::y();
+    assert!((down(1.0).y.abs() - 1.0).abs() < 1e-5 && (down(-1.0).x.abs() - 1.0).abs() < 1e-3, "from above");
 }
 
 #[test]

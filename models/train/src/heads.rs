@@ -63,12 +63,12 @@ fn is_head(node: &NodeProto) -> bool {
 /// An operation that treats every voxel on its own.
 fn is_pointwise(graph: &GraphProto, node: &NodeProto) -> bool {
     match node.op_type() {
-        "Add" | "Clip" | "Div" | "Expand" | "LeakyRelu" | "Mul" | "Relu" | "Shape" | "Sigmoid" => true,
+        "Add" | "Clip" | "Div" | "Expand" | "LeakyRelu" | "Mul" | "Relu" | "Shape" | "Sigmoid" | "Sub" => true,
         "ReduceL2" => match node.input.get(1) {
             Some(axes) => constant(graph, axes).is_some_and(|axes| axes == [1]),
             None => ints(node, "axes") == [1],
         },
-        "Split" => node.attribute("axis").is_some_and(|axis| axis.i() == 1),
+        "Concat" | "Split" => node.attribute("axis").is_some_and(|axis| axis.i() == 1),
         _ => false,
     }
 }

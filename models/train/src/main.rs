@@ -9,7 +9,8 @@ mod run;
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use grasp_models::{build, gpd};
+use grasp::RESOLUTION;
+use grasp_models::{Architecture, Orientation, gpd};
 
 /// Trains the networks of graspd in libtorch by executing the very ONNX graph that is served.
 #[derive(Parser)]
@@ -26,6 +27,9 @@ enum Command {
         /// vgn, transformer, transformer-small, or gpd, the classifier of grasp candidates.
         #[arg(long)]
         network: String,
+        /// What a grasp network regresses of a grasp's orientation.
+        #[arg(long, value_enum, default_value_t = Regressed::Quaternion)]
+        orientation: Regressed,
         /// Decides the weights.
         #[arg(long, default_value_t = 0)]
         seed: u64,
@@ -47,6 +51,10 @@ struct Training {
     /// vgn, transformer or transformer-small, from random weights.
     #[arg(long, required_unless_present = "from")]
     network: Option<String>,
+    /// What --network regresses of a grasp's orientation: a quaternion, as published, or approach and closing axes,
+    /// which do not jump.
+    #[arg(long, value_enum, default_value_t = Regressed::Quaternion, conflicts_with = "from")]
+    orientation: Regressed,
     /// Start from this model's weights instead (fine-tuning).
     #[arg(long, conflicts_with = "network")]
     from: Option<PathBuf>,
@@ -141,6 +149,21 @@ enum Keep {
 }
 
 #[derive(Clone, Copy, ValueEnum)]
+enum Regressed {
+    Quaternion,
+    Axes,
+}
+
+impl From<Regressed> for Orientation {
+    fn from(regressed: Regressed) -> Self {
+        match regressed {
+            Regressed::Quaternion => Self::Quaternion,
+            Regressed::Axes => Self::Axes,
+        }
+    }
+}
+
+#[derive(Clone, Copy, ValueEnum)]
 enum Origin {
     Corner,
     Center,
@@ -155,8 +178,11 @@ enum Change {
 
 fn main() -> anyhow::Result<()> {
     match Cli::parse().command {
-        Command::Init { network, seed, out } if network == "gpd" => Ok(gpd::gpd(seed).write(&out)?),
-        Command::Init { network, seed, out } => Ok(build(&network, seed)?.write(&out)?),
+        Command::Init { network, seed, out, .. } if network == "gpd" => Ok(gpd::gpd(seed).write(&out)?),
+        Command::Init { network, orientation, seed, out } => {
+            let model = network.parse::<Architecture>()?.build_with(RESOLUTION, orientation.into(), seed)?;
+            Ok(model.write(&out)?)
+        }
         Command::Train(training) => run::train(&training),
         Command::Classify(command) => command.run(),
         Command::Export(command) => command.run(),

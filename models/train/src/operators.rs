@@ -33,6 +33,7 @@ const OPERATORS: &[(&str, &[&str])] = &[
     ("Slice", &[]),
     ("Softmax", &["axis"]),
     ("Split", &["axis"]),
+    ("Sub", &[]),
     ("Transpose", &["perm"]),
 ];
 
@@ -126,6 +127,7 @@ impl Step<'_> {
                 let split = self.input(0)?.f_split_with_sizes(sizes, self.int("axis", 0));
                 split.map_err(|source| self.torch(source))
             }
+            "Sub" => one(self.input(0)?.f_sub(self.input(1)?)),
             "Transpose" => {
                 let x = self.input(0)?;
                 let reversed: Vec<i64> = (0..x.dim() as i64).rev().collect();

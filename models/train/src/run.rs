@@ -7,10 +7,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result, ensure};
-use grasp::VoxelOrigin;
+use grasp::{RESOLUTION, VoxelOrigin};
 use grasp_data::Dataset;
 use grasp_models::onnx::ModelProto;
-use grasp_models::{Metadata, build};
+use grasp_models::{Architecture, Metadata};
 use grasp_train::{Augmentation, Checkpoint, Epoch, Execution, Record, Settings, Success, Trainer, curves};
 use indicatif::{ProgressBar, ProgressStyle};
 use tch::Device;
@@ -137,7 +137,10 @@ fn all_grasps(dataset: &Dataset) -> (usize, usize) {
 fn start_from(training: &Training) -> Result<(ModelProto, Metadata)> {
     let model = match (&training.from, &training.network) {
         (Some(path), _) => ModelProto::read(path)?,
-        (None, Some(network)) => build(network, training.seed)?,
+        (None, Some(network)) => {
+            let architecture: Architecture = network.parse()?;
+            architecture.build_with(RESOLUTION, training.orientation.into(), training.seed)?
+        }
         (None, None) => anyhow::bail!("give --network or --from"),
     };
     let path = training.from.as_deref().unwrap_or(&training.out);

@@ -1,7 +1,7 @@
 //! What the executor understands of ONNX, beyond what the networks here use, and what it refuses.
 
 use grasp_models::onnx::{AttributeProto, GraphProto, ModelProto, NodeProto, OperatorSetIdProto, TensorProto};
-use grasp_models::{Architecture, gpd};
+use grasp_models::{Architecture, Orientation, gpd};
 use grasp_train::{Adam, ExecuteError, Execution, Executor, Outputs};
 use tch::{Device, Kind, Tensor, no_grad};
 
@@ -201,6 +201,7 @@ fn single_voxels_are_those_of_the_whole_maps() {
         vgn(),
         as_exported(vgn()),
         with_axes_as_input(vgn()),
+        Architecture::Vgn.build_with(N, Orientation::Axes, 0).unwrap(),
         Architecture::TransformerSmall.build(N, 0).unwrap(),
         whole,
     ] {

@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use grasp::VoxelOrigin;
 use grasp_data::{Dataset, Setup, Trial, packed};
-use grasp_models::Architecture;
 use grasp_models::onnx::ModelProto;
+use grasp_models::{Architecture, Orientation};
 use grasp_train::{
     Augmentation, Checkpoint, CheckpointError, Epoch, Execution, Outputs, Record, Settings, Targets, TrainError,
     Trainer,
@@ -53,20 +53,22 @@ fn epoch(trainer: &mut Trainer) -> Record {
 
 #[test]
 fn eight_scenes_are_learnt_by_heart() {
-    for (network, learning_rate, epochs, bf16) in [
-        (Architecture::Vgn, 1e-3, 120, false),
-        (Architecture::Vgn, 1e-3, 120, true),
-        (Architecture::TransformerSmall, 1e-3, 80, true),
-        (Architecture::Transformer, 2e-4, 40, true),
+    use Orientation::{Axes, Quaternion};
+    for (network, orientation, learning_rate, epochs, bf16) in [
+        (Architecture::Vgn, Quaternion, 1e-3, 120, false),
+        (Architecture::Vgn, Quaternion, 1e-3, 120, true),
+        (Architecture::Vgn, Axes, 1e-3, 120, true),
+        (Architecture::TransformerSmall, Axes, 1e-3, 80, true),
+        (Architecture::Transformer, Quaternion, 2e-4, 40, true),
     ] {
         let settings = Settings { batch: 8, learning_rate, warmup: 10, bf16, ..settings() };
         tch::set_num_threads(1);
-        let model = network.build(N, 0).unwrap();
+        let model = network.build_with(N, orientation, 0).unwrap();
         let execution = Execution { bf16, ..EXECUTION };
         let mut trainer = Trainer::new(model, support::dataset(8, N), settings, execution).unwrap();
         let first = epoch(&mut trainer);
         let last = (0..epochs).map(|_| epoch(&mut trainer)).last().unwrap();
-        println!("{network:?}, bf16 {bf16}: loss {:.4} → {:.5}", first.loss, last.loss);
+        println!("{network:?}, {orientation:?}, bf16 {bf16}: loss {:.4} → {:.5}", first.loss, last.loss);
         assert!(first.loss > 0.5, "{network:?}: {first:?}");
         assert!(last.loss < 0.01, "{network:?}: {last:?}");
     }
