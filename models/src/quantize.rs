@@ -123,8 +123,9 @@ fn products<'a>(graph: &'a GraphProto) -> Vec<Product<'a>> {
             ("ConvTranspose", _) | ("MatMul", 2) => 1,
             _ => return None,
         };
-        // Weight and bias are replaced, which another reader would notice.
-        let own = node.input[1..].iter().all(|name| name.is_empty() || readers[name.as_str()] == 1);
+        // Weight and bias are replaced: they must be stored, and no other node may read them.
+        let stored = |name: &str| name.is_empty() || (weights.contains_key(name) && readers[name] == 1);
+        let own = node.input[1..].iter().all(|name| stored(name));
         (own && weight.is_float() && !last.contains(node.output[0].as_str())).then_some(Product { node, weight, axis })
     };
     graph.node.iter().filter_map(product).collect()

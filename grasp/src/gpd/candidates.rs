@@ -4,8 +4,7 @@ use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, UnitQuaterni
 use rand::Rng;
 use rand::seq::index;
 
-use super::Cloud;
-use crate::Hand;
+use super::{Cloud, Hand};
 use crate::SurfacePoint;
 
 /// How candidates are looked for; the defaults are those of GPD's code.
@@ -35,7 +34,7 @@ impl Params {
     #[must_use]
     pub fn above(lowest: f64) -> Self {
         Self {
-            hand: Hand::GPD,
+            hand: Hand::default(),
             samples: 500,
             frame_radius: 0.01,
             rotations: 8,
@@ -202,7 +201,7 @@ mod tests {
     #[test]
     fn no_candidate_goes_through_the_table_or_the_object() {
         let (cloud, found) = of(standing_box(), 2);
-        let hand = Hand::GPD;
+        let hand = Hand::default();
         for candidate in &found {
             assert!(hand.lowest_point(&candidate.pose) >= TABLE);
             let mut points = cloud.points().iter().map(|p| candidate.pose.inverse_transform_point(&p.position));

@@ -76,6 +76,18 @@ fn packed_scenes_are_read_as_they_were_written() {
 }
 
 #[test]
+fn the_first_version_of_the_packed_form_is_read_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let first: Vec<Trial> = trials(0).into_iter().map(|trial| Trial { turns: 0, ..trial }).collect();
+    packed::Writer::open(folder.path(), &setup()).unwrap().append(0, &volumes(0), &first).unwrap();
+    let path = folder.path().join("scenes-00000.pack");
+    let mut bytes = fs::read(&path).unwrap();
+    bytes[8] = 1;
+    fs::write(&path, bytes).unwrap();
+    assert_same(&Dataset::open(&[folder.path().to_owned()]).unwrap().trials(0), &first);
+}
+
+#[test]
 fn a_packed_run_cut_off_anywhere_goes_on_without_a_lost_or_doubled_scene() {
     let whole = tempfile::tempdir().unwrap();
     pack(whole.path(), [0, 1, 3]);

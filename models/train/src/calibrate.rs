@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 use grasp_data::Dataset;
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Range, quantized_activations};
@@ -20,17 +20,15 @@ pub(crate) fn ranges(
     let execution = Execution { device: Device::Cpu, bf16: false, channels_last: false };
     let executor = Executor::new(model.clone(), execution)?;
     let (n, share) = (data.resolution() as i64, 1.0 / scenes.len() as f32);
-    let mut ranges: HashMap<String, Range> =
-        names.iter().map(|name| (name.clone(), Range { low: 0.0, high: 0.0 })).collect();
+    let mut ranges = vec![Range { low: 0.0, high: 0.0 }; names.len()];
     for scene in scenes {
         let values: Vec<f32> = data.volume(scene, 0).iter().map(|&byte| grasp_data::value(byte)).collect();
         let volume = Tensor::from_slice(&values).reshape([1, 1, n, n, n]);
         let activations = no_grad(|| executor.inside(&volume, &names))?;
-        for (name, activation) in names.iter().zip(activations) {
-            let range = ranges.get_mut(name).context("an activation is named twice")?;
+        for (range, activation) in ranges.iter_mut().zip(activations) {
             range.low += share * f32::try_from(activation.min())?;
             range.high += share * f32::try_from(activation.max())?;
         }
     }
-    Ok(ranges)
+    Ok(names.into_iter().zip(ranges).collect())
 }
