@@ -2,6 +2,7 @@ use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use thiserror::Error;
 
 use crate::filter::{dilate, gaussian, is_window_maximum};
+use crate::obstacles::{Clearance, Obstacles};
 use crate::{Grasp, Volume};
 
 /// A network's output over a volume of N³ voxels, each array indexed `[channel][x][y][z]`, z fastest.
@@ -64,6 +65,8 @@ pub struct DecodeParams {
     pub force: Option<f32>,
     /// Edge of the cube in which only the best voxel is kept (VGN: 4).
     pub nms_size: usize,
+    /// How the hand must keep clear of what was observed, if it must: none of the papers asks.
+    pub clearance: Option<Clearance>,
     /// Where in its voxel a grasp stands.
     pub origin: VoxelOrigin,
 }
@@ -91,6 +94,7 @@ impl Default for DecodeParams {
             threshold: 0.9,
             force: None,
             nms_size: 4,
+            clearance: None,
             origin: VoxelOrigin::Corner,
         }
     }
@@ -119,6 +123,8 @@ pub struct Dropped {
     pub border: usize,
     /// A better grasp is near.
     pub suppressed: usize,
+    /// The open hand would meet what was observed.
+    pub collision: usize,
 }
 
 /// What [`decode`] found.
@@ -166,20 +172,26 @@ pub fn decode(volume: &Volume, maps: &Maps, params: &DecodeParams) -> Result<Dec
     let smooth = gaussian(maps.quality, n, params.sigma, params.radius);
     let near_surface = near_surface(volume, params);
 
-    // Only when nothing reaches the threshold is the floor asked, and then for the best voxel alone.
-    let select = |threshold| candidates(&smooth, maps.width, &near_surface, n, threshold, params);
-    let (mut cells, mut dropped) = select(params.threshold);
-    if let (true, Some(floor)) = (cells.is_empty(), params.force) {
-        (cells, dropped) = select(floor.min(params.threshold));
-        dropped.suppressed += cells.len().saturating_sub(1);
-        cells.truncate(1);
-    }
+    let select = |threshold| {
+        let (cells, mut dropped) = candidates(&smooth, maps.width, &near_surface, n, threshold, params);
+        let grasps = cells.iter().map(|&index| grasp_at(volume, maps, index, smooth[index], params.origin));
+        let mut grasps = grasps.collect::<Result<Vec<_>, _>>()?;
+        if let Some(clearance) = params.clearance {
+            let obstacles = Obstacles::observed(volume, clearance);
+            grasps.retain(|grasp| !obstacles.meet(&grasp.pose));
+            dropped.collision = cells.len() - grasps.len();
+        }
+        Ok(Decoded { grasps, dropped })
+    };
 
-    let grasps = cells
-        .iter()
-        .map(|&index| grasp_at(volume, maps, index, smooth[index], params.origin))
-        .collect::<Result<_, _>>()?;
-    Ok(Decoded { grasps, dropped })
+    // Only when nothing reaches the threshold is the floor asked, and then for the best voxel alone.
+    let mut decoded = select(params.threshold)?;
+    if let (true, Some(floor)) = (decoded.grasps.is_empty(), params.force) {
+        decoded = select(floor.min(params.threshold))?;
+        decoded.dropped.suppressed += decoded.grasps.len().saturating_sub(1);
+        decoded.grasps.truncate(1);
+    }
+    Ok(decoded)
 }
 
 /// The voxels that hold a grasp of at least `threshold`, best first, and why the others do not.
@@ -272,6 +284,7 @@ fn grasp_at(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Hand;
 
     const N: usize = 16;
 
@@ -299,7 +312,8 @@ mod tests {
             let maps = Maps { quality: &self.quality, rotation: &self.rotation, width: &self.width };
             let decoded = decode(&slab(), &maps, params).unwrap();
             let d = decoded.dropped;
-            let all = d.below_threshold + d.mask + d.width + d.border + d.suppressed + decoded.grasps.len();
+            let all =
+                d.below_threshold + d.mask + d.width + d.border + d.suppressed + d.collision + decoded.grasps.len();
             assert_eq!(all, N.pow(3), "every voxel is accounted for once");
             decoded
         }
@@ -339,8 +353,32 @@ mod tests {
         arrays.quality[index(1, 8, 9)] = 0.99; // border
         let decoded = arrays.decode(&DecodeParams { border: Some(Border { sides: 2, bottom: 7 }), ..sharp() });
         assert_eq!(decoded.grasps.len(), 1);
-        let expected = Dropped { below_threshold: N.pow(3) - 5, mask: 1, width: 1, border: 1, suppressed: 1 };
+        let expected =
+            Dropped { below_threshold: N.pow(3) - 5, mask: 1, width: 1, border: 1, suppressed: 1, collision: 0 };
         assert_eq!(decoded.dropped, expected);
+    }
+
+    #[test]
+    fn a_hand_that_would_meet_what_was_observed_is_no_answer() {
+        let mut arrays = Arrays::new();
+        arrays.quality[index(8, 8, 9)] = 0.99;
+        arrays.quality[index(3, 3, 9)] = 0.95;
+        // The identity points up, from inside the slab; half a turn about x points down, onto it.
+        let down = |arrays: &mut Arrays, index: usize| {
+            arrays.rotation[index] = 1.0;
+            arrays.rotation[3 * N.pow(3) + index] = 0.0;
+        };
+        down(&mut arrays, index(3, 3, 9));
+        // Too short to reach the slab from where the grasp stands.
+        let hand = Hand { depth: 0.005, ..Hand::PANDA };
+        let clearance = Some(Clearance { hand, ..Clearance::default() });
+        let grasps = |params: &DecodeParams| arrays.decode(params).grasps.iter().map(|g| g.quality).collect::<Vec<_>>();
+        assert_eq!(grasps(&sharp()), [0.99, 0.95]);
+        assert_eq!(grasps(&DecodeParams { clearance, ..sharp() }), [0.95]);
+        assert_eq!(arrays.decode(&DecodeParams { clearance, ..sharp() }).dropped.collision, 1);
+        // The best of those that are free, when nothing reaches the threshold.
+        let forced = DecodeParams { clearance, threshold: 1.0, force: Some(0.5), ..sharp() };
+        assert_eq!(grasps(&forced), [0.95]);
     }
 
     #[test]

@@ -6,12 +6,10 @@
 
 mod candidates;
 mod cloud;
-mod hand;
 mod image;
 mod shaf;
 
 pub use candidates::{Candidate, Params, candidates};
 pub use cloud::{Cloud, NORMALS_RADIUS, VOXEL_SIZE};
-pub use hand::Hand;
 pub use image::{CHANNELS, IMAGE_SIZE, Image};
 pub use shaf::highest_first;

@@ -13,6 +13,8 @@ mod filter;
 mod fusion;
 pub mod gpd;
 mod grasp;
+mod hand;
+mod obstacles;
 mod surface;
 mod volume;
 
@@ -20,6 +22,8 @@ pub use camera::{CameraError, DepthImage, Intrinsics};
 pub use decode::{Border, DecodeError, DecodeParams, Decoded, Dropped, Maps, VoxelOrigin, decode};
 pub use fusion::{DEPTH_MAX, Fusion, TRUNCATION_VOXELS};
 pub use grasp::{FINGER_DEPTH, Grasp, MAX_OPENING};
+pub use hand::Hand;
+pub use obstacles::Clearance;
 pub use surface::SurfacePoint;
 pub use volume::{Volume, VolumeError};
 

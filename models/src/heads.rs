@@ -3,6 +3,9 @@
 use crate::graph::{Builder, Conv};
 use crate::onnx::AttributeProto;
 
+/// The name of the heads' convolution.
+pub(crate) const HEADS: &str = "heads";
+
 /// What a network regresses of a grasp's orientation. Its output is a quaternion either way.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Orientation {
@@ -32,6 +35,11 @@ impl Orientation {
             Self::Axes => 6,
         }
     }
+
+    /// How many numbers the heads regress for a voxel: with the quality before these, and the width after them.
+    pub(crate) fn outputs(self) -> usize {
+        1 + self.channels() + 1
+    }
 }
 
 /// Declares the network's input and returns it: the volume, `[batch, 1, N, N, N]`.
@@ -45,8 +53,8 @@ pub(crate) fn volume(b: &mut Builder, resolution: usize) -> String {
 /// The 5³ convolutions of all three read the same features, so they are one convolution: the mathematics is the same
 /// and it takes half the time of the whole of VGN.
 pub(crate) fn heads(b: &mut Builder, features: &str, channels: usize, resolution: usize, orientation: Orientation) {
-    let outputs = 1 + orientation.channels() + 1;
-    let all = b.conv("heads", features, Conv { inputs: channels, outputs, kernel: 5, stride: 1, bias: true });
+    let outputs = orientation.outputs();
+    let all = b.conv(HEADS, features, Conv { inputs: channels, outputs, kernel: 5, stride: 1, bias: true });
     let sizes = b.whole(&[1, orientation.channels() as i64, 1]);
     let [quality, rotation, width] = b.nodes("Split", &[&all, &sizes], vec![AttributeProto::int("axis", 1)]);
     let quality = b.node("Sigmoid", &[&quality], vec![]);

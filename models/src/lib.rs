@@ -15,6 +15,7 @@ mod quantize;
 mod runtime;
 mod store;
 mod transformer;
+mod turns;
 mod vgn;
 
 pub use half::{with_full_weights, with_half_weights};
@@ -24,3 +25,4 @@ pub use networks::{Architecture, BuildError, build};
 pub use quantize::{QuantizeError, Range, quantized_activations, with_int8};
 pub use runtime::{Classifier, LoadError, LoadReason, Network, Options, Output, RuntimeError, RuntimeInfo, init};
 pub use store::{Entry, EntryError, Store, StoreError};
+pub use turns::{TurnsError, averaged_over_turns};

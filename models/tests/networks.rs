@@ -4,8 +4,8 @@ use std::process::Command;
 
 use grasp_models::onnx::{ModelProto, TensorProto};
 use grasp_models::{
-    Architecture, BuildError, Orientation, Range, build, gpd, quantized_activations, with_full_weights,
-    with_half_weights, with_int8,
+    Architecture, BuildError, Orientation, Range, averaged_over_turns, build, gpd, quantized_activations,
+    with_full_weights, with_half_weights, with_int8,
 };
 use prost::Message;
 
@@ -127,7 +127,8 @@ fn the_onnx_checker_accepts_every_network() {
     let ranges = quantized_activations(&vgn).into_iter().map(|name| (name, Range { low: -1.0, high: 2.0 })).collect();
     let int8 = with_int8(&vgn, &ranges).unwrap();
     let axes = Architecture::Vgn.build_with(40, Orientation::Axes, 0).unwrap();
-    let others = [("gpd", gpd::gpd(0)), ("half", half), ("int8", int8), ("axes", axes)];
+    let turns = averaged_over_turns(&axes).unwrap();
+    let others = [("gpd", gpd::gpd(0)), ("half", half), ("int8", int8), ("axes", axes), ("turns", turns)];
     for (name, model) in networks.into_iter().chain(others) {
         let path = folder.path().join(format!("{name}.onnx"));
         model.write(&path).unwrap();

@@ -6,7 +6,10 @@ use std::path::{Path, PathBuf};
 use grasp::gpd::{Candidate, Cloud, Image};
 use grasp::{SurfacePoint, Volume};
 use grasp_models::onnx::{Dimension, ModelProto, ValueInfoProto};
-use grasp_models::{Architecture, Classifier, Network, Options, Orientation, RuntimeError, build, gpd, init};
+use grasp_models::{
+    Architecture, Classifier, Network, Options, Orientation, RuntimeError, TurnsError, averaged_over_turns, build, gpd,
+    init,
+};
 use nalgebra::{Isometry3, Point3, Quaternion, UnitQuaternion, Vector3};
 use tempfile::TempDir;
 
@@ -69,6 +72,52 @@ fn rotation_of(axes: [f32; 6]) -> UnitQuaternion<f64> {
     let quaternion = Quaternion::new(w, x, y, z);
     assert!((quaternion.norm() - 1.0).abs() < 1e-5, "{quaternion}");
     UnitQuaternion::from_quaternion(quaternion)
+}
+
+/// The volume after a quarter turn about the vertical through its middle: what was at (x, y) is at (−y, x).
+fn turned(volume: &Volume) -> Volume {
+    let n = volume.resolution();
+    let value = |index: usize| {
+        let (x, y, z) = (index / (n * n), index / n % n, index % n);
+        volume.values()[(y * n + n - 1 - x) * n + z]
+    };
+    Volume::new(n, volume.voxel_size(), Isometry3::identity(), (0..n.pow(3)).map(value).collect()).unwrap()
+}
+
+#[test]
+fn an_average_over_turns_turns_with_the_volume() {
+    const N: usize = 16;
+    let single = Architecture::Vgn.build_with(N, Orientation::Axes, 3).unwrap();
+    let mut network = load(&averaged_over_turns(&single).unwrap());
+    let (volume, other) = (volume(N, 1), volume(N, 2));
+    let turned = turned(&volume);
+    let answers = network.infer(&[&volume, &turned, &other]).unwrap();
+    let (before, after) = (answers.maps(0), answers.maps(1));
+    let quarter = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
+    let voxels = N.pow(3);
+    let rotation = |map: &[f32], voxel: usize| {
+        let [x, y, z, w] = [0, 1, 2, 3].map(|channel| f64::from(map[channel * voxels + voxel]));
+        UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z))
+    };
+    for voxel in 0..voxels {
+        let (x, y, z) = (voxel / (N * N), voxel / N % N, voxel % N);
+        let from = (y * N + N - 1 - x) * N + z;
+        assert!((before.quality[from] - after.quality[voxel]).abs() < 1e-5);
+        assert!((before.width[from] - after.width[voxel]).abs() < 1e-4);
+        let (expected, got) = (quarter * rotation(before.rotation, from), rotation(after.rotation, voxel));
+        let same_hand = expected * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI);
+        let angle = got.angle_to(&expected).min(got.angle_to(&same_hand));
+        assert!(angle < 1e-2, "voxel {voxel}: {angle}");
+    }
+    let mut single = load(&single);
+    let alone = single.infer(&[&volume, &turned]).unwrap();
+    let difference = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(difference(alone.maps(0).quality, before.quality) > 1e-4, "the network alone does not turn");
+
+    let quaternions = build("vgn", 0).unwrap();
+    assert_eq!(averaged_over_turns(&quaternions), Err(TurnsError::NotAxes));
+    let averaged = averaged_over_turns(&Architecture::Vgn.build_with(N, Orientation::Axes, 3).unwrap()).unwrap();
+    assert_eq!(averaged_over_turns(&averaged), Err(TurnsError::Already));
 }
 
 #[test]

@@ -30,6 +30,7 @@ impl From<&Dropped> for pb::Dropped {
             width: count(dropped.width),
             border: count(dropped.border),
             suppressed: count(dropped.suppressed),
+            collision: count(dropped.collision),
             over_limit: 0,
         }
     }

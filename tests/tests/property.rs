@@ -123,8 +123,8 @@ fn check(request: &pb::DetectGraspsRequest, response: &pb::DetectGraspsResponse)
     }
     assert_eq!(response.dropped.is_some(), request.explain || response.grasps.is_empty());
     if let Some(dropped) = &response.dropped {
-        let pb::Dropped { below_threshold, mask, width, border, suppressed, over_limit } = *dropped;
-        let voxels = below_threshold + mask + width + border + suppressed + over_limit;
+        let pb::Dropped { below_threshold, mask, width, border, suppressed, collision, over_limit } = *dropped;
+        let voxels = below_threshold + mask + width + border + suppressed + collision + over_limit;
         assert_eq!(voxels as usize + response.grasps.len(), VALUES, "{dropped:?}");
     }
 }

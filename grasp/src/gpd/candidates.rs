@@ -1,17 +1,20 @@
 use std::f64::consts::{FRAC_PI_2, PI};
+use std::ops::RangeInclusive;
 
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use rand::Rng;
 use rand::seq::index;
 
-use super::{Cloud, Hand};
-use crate::SurfacePoint;
+use super::Cloud;
+use crate::{Hand, SurfacePoint};
 
 /// How candidates are looked for; the defaults are those of GPD's code.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Params {
     /// The hand that must fit.
     pub hand: Hand,
+    /// Extents along the closing axis that are worth grasping, metres.
+    pub aperture: RangeInclusive<f64>,
     /// Points of the cloud at which hands are fitted.
     pub samples: usize,
     /// Radius around a sample within which normals make its local frame, metres.
@@ -34,7 +37,8 @@ impl Params {
     #[must_use]
     pub fn above(lowest: f64) -> Self {
         Self {
-            hand: Hand::default(),
+            hand: Hand::GPD,
+            aperture: 0.01..=0.07,
             samples: 500,
             frame_radius: 0.01,
             rotations: 8,
@@ -137,7 +141,7 @@ fn fit(
     let held = in_hand(offset, bite).filter(|point| hand.holds(point)).map(|point| point.y);
     let (lower, upper) = held.fold((f64::MAX, f64::MIN), |(lower, upper), y| (lower.min(y), upper.max(y)));
     let width = upper - lower;
-    hand.aperture.contains(&width).then(|| Candidate { pose: pose(offset, bite), width, point: *sample })
+    params.aperture.contains(&width).then(|| Candidate { pose: pose(offset, bite), width, point: *sample })
 }
 
 /// The palm is broader than the fingers: other things can be in its way than in theirs.
@@ -201,13 +205,13 @@ mod tests {
     #[test]
     fn no_candidate_goes_through_the_table_or_the_object() {
         let (cloud, found) = of(standing_box(), 2);
-        let hand = Hand::default();
+        let Params { hand, aperture, .. } = Params::above(TABLE);
         for candidate in &found {
             assert!(hand.lowest_point(&candidate.pose) >= TABLE);
             let mut points = cloud.points().iter().map(|p| candidate.pose.inverse_transform_point(&p.position));
             assert!(points.clone().all(|point| !hand.finger_meets(&point) && !hand.palm_meets(&point)));
             assert!(points.any(|point| hand.holds(&point)), "something is between the fingers");
-            assert!(hand.aperture.contains(&candidate.width));
+            assert!(aperture.contains(&candidate.width));
         }
         let params = Params::above(TABLE + 0.06);
         let high = candidates(&cloud, &params, &mut ChaCha8Rng::seed_from_u64(2));

@@ -5,7 +5,7 @@ use std::sync::{Mutex, PoisonError};
 
 use anyhow::Context;
 use clap::{Args, ValueEnum};
-use grasp::{DecodeParams, Grasp};
+use grasp::{Clearance, DecodeParams, Grasp};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::{Benchmark, Event};
 use grasp_sim::picture::{Picture, quality_color};
@@ -81,6 +81,10 @@ struct DecodingArgs {
     /// Believe grasps at the borders of the volume too.
     #[arg(long)]
     no_border: bool,
+
+    /// Drop grasps whose open hand would meet what was observed.
+    #[arg(long)]
+    clear: bool,
 }
 
 #[derive(Clone, Copy)]
@@ -100,6 +104,7 @@ impl DecodingArgs {
             threshold: self.threshold,
             force: self.force.0,
             outside_above: self.out_th,
+            clearance: self.clear.then(Clearance::default),
             border: benchmark.border.filter(|_| !self.no_border),
             ..benchmark
         }

@@ -94,13 +94,14 @@ fn stages(latency: &Latency) -> [(&'static str, f64); 5] {
     ]
 }
 
-fn reasons(dropped: &Dropped) -> [(&'static str, u32); 6] {
+fn reasons(dropped: &Dropped) -> [(&'static str, u32); 7] {
     [
         ("below_threshold", dropped.below_threshold),
         ("mask", dropped.mask),
         ("width", dropped.width),
         ("border", dropped.border),
         ("suppressed", dropped.suppressed),
+        ("collision", dropped.collision),
         ("over_limit", dropped.over_limit),
     ]
 }

@@ -1,12 +1,10 @@
-use std::ops::RangeInclusive;
-
 use nalgebra::{Isometry3, Point3, Vector3};
 
-use crate::FINGER_DEPTH;
+use crate::{FINGER_DEPTH, MAX_OPENING};
 
-/// A parallel-jaw hand as candidates are fitted around: two finger boxes and a palm. Metres, in the grasp frame (z the
-/// approach, ±y the closing axis, origin at the finger base).
-#[derive(Clone, Debug, PartialEq)]
+/// An open parallel-jaw hand as boxes: two fingers and a palm. Metres, in the grasp frame (z the approach, ±y the closing
+/// axis, origin at the finger base).
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hand {
     /// Thickness of a finger along the closing axis (GPD: `finger_width`).
     pub finger_width: f64,
@@ -16,28 +14,25 @@ pub struct Hand {
     pub depth: f64,
     /// Breadth of the fingers along x, half of it to each side (GPD: `hand_height`).
     pub height: f64,
-    /// Extents along the closing axis that are worth grasping.
-    pub aperture: RangeInclusive<f64>,
-    /// The palm's box, smallest and largest coordinates: GPD's hand has none, but one that approaches from the side
-    /// would rest it on the table.
+    /// The palm's box, smallest and largest coordinates.
     pub palm: [[f64; 3]; 2],
 }
 
-impl Default for Hand {
-    /// The Panda hand with GPD's fingers, which open to [`MAX_OPENING`](crate::MAX_OPENING) too.
-    fn default() -> Self {
-        Self {
-            finger_width: 0.015,
-            outer_diameter: 0.11,
-            depth: FINGER_DEPTH,
-            height: 0.02,
-            aperture: 0.01..=0.07,
-            palm: [[-0.0316, -0.10, -0.088], [0.0316, 0.10, 0.004]],
-        }
-    }
-}
-
 impl Hand {
+    /// The Panda hand, its boxes those of VGN's URDF.
+    pub const PANDA: Self = Self {
+        finger_width: 0.0264,
+        outer_diameter: MAX_OPENING + 2.0 * 0.0264,
+        depth: 0.0502,
+        height: 0.021,
+        palm: [[-0.0316, -0.10, -0.088], [0.0316, 0.10, 0.004]],
+    };
+
+    /// The Panda hand with GPD's fingers, which open to [`MAX_OPENING`] too. GPD's own has no palm; one that approaches
+    /// from the side would rest it on the table.
+    pub const GPD: Self =
+        Self { finger_width: 0.015, outer_diameter: 0.11, depth: FINGER_DEPTH, height: 0.02, ..Self::PANDA };
+
     /// Half of the opening between the fingers.
     #[must_use]
     pub fn half_opening(&self) -> f64 {
@@ -50,6 +45,19 @@ impl Hand {
         point.x.abs() <= self.height / 2.0
             && (self.half_opening()..=self.outer_diameter / 2.0).contains(&point.y.abs())
             && point.z <= self.depth
+    }
+
+    /// Whether a point of the grasp frame is in the way of the open hand that comes `from` metres back along the
+    /// approach.
+    #[must_use]
+    pub fn meets(&self, point: &Point3<f64>, from: f64) -> bool {
+        let at_fingers = point.x.abs() <= self.height / 2.0
+            && (self.half_opening()..=self.outer_diameter / 2.0).contains(&point.y.abs())
+            && (-from..=self.depth).contains(&point.z);
+        let [lower, upper] = self.palm;
+        at_fingers
+            || (0..2).all(|axis| (lower[axis]..=upper[axis]).contains(&point[axis]))
+                && (lower[2] - from..=upper[2]).contains(&point.z)
     }
 
     /// Whether a point of the grasp frame is inside the palm.
@@ -90,8 +98,8 @@ mod tests {
 
     #[test]
     fn the_parts_of_the_hand_are_where_they_should_be() {
-        let hand = Hand::default();
-        assert!((2.0 * hand.half_opening() - crate::MAX_OPENING).abs() < 1e-12);
+        let hand = Hand::GPD;
+        assert!((2.0 * hand.half_opening() - MAX_OPENING).abs() < 1e-12);
         let between = Point3::new(0.0, 0.0, 0.03);
         assert!(hand.holds(&between) && !hand.finger_meets(&between) && !hand.palm_meets(&between));
         for y in [-0.045, 0.045] {
@@ -100,11 +108,13 @@ mod tests {
             assert!(!hand.finger_meets(&Point3::new(0.02, y, 0.03)) && !hand.finger_meets(&Point3::new(0.0, y, 0.06)));
         }
         assert!(hand.palm_meets(&Point3::new(0.03, 0.09, -0.05)));
+        assert!(hand.meets(&Point3::new(0.005, 0.045, -0.05), 0.05) && !hand.meets(&Point3::new(0.0, 0.0, 0.03), 0.05));
+        assert!(hand.meets(&Point3::new(0.0, 0.0, -0.13), 0.05) && !hand.meets(&Point3::new(0.0, 0.0, -0.13), 0.04));
     }
 
     #[test]
     fn its_lowest_point_is_a_fingertip_or_the_palm() {
-        let hand = Hand::default();
+        let hand = Hand::GPD;
         let at = |angle| {
             let rotation = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), angle);
             hand.lowest_point(&Isometry3::from_parts(Translation3::new(0.1, 0.1, 0.5), rotation))

@@ -1,0 +1,101 @@
+use nalgebra::{Isometry3, Point3};
+
+use crate::{Hand, Volume};
+
+/// How a hand must keep clear of what was observed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Clearance {
+    /// Open, on its way.
+    pub hand: Hand,
+    /// From so far back along the approach, metres: the pre-grasp.
+    pub from: f64,
+    /// How far behind a surface something is in the way, as a share of the distance at which the field is truncated: a
+    /// noisy surface is not everywhere where it was seen.
+    pub behind: f32,
+}
+
+impl Default for Clearance {
+    /// The Panda hand from the benchmark's pre-grasp on.
+    fn default() -> Self {
+        Self { hand: Hand::PANDA, from: 0.05, behind: 0.25 }
+    }
+}
+
+/// What was observed and a hand must not touch: points at or behind the surfaces of a volume. Space that nothing observed
+/// is taken to be free.
+pub(crate) struct Obstacles {
+    clearance: Clearance,
+    points: Vec<Point3<f64>>,
+}
+
+impl Obstacles {
+    /// The voxels of `volume` that are in the way.
+    pub fn observed(volume: &Volume, clearance: Clearance) -> Self {
+        let (n, size) = (volume.resolution(), volume.voxel_size());
+        let behind = 0.5 - clearance.behind / 2.0;
+        let solid = volume.values().iter().enumerate().filter(|&(_, &value)| value > 0.0 && value <= behind);
+        let point = |index: usize| {
+            let cell = [index / (n * n), index / n % n, index % n];
+            volume.pose() * Point3::from(cell.map(|c| (c as f64 + 0.5) * size))
+        };
+        Self { clearance, points: solid.map(|(index, _)| point(index)).collect() }
+    }
+
+    /// Whether the hand meets one of them on its way to `pose`.
+    pub fn meet(&self, pose: &Isometry3<f64>) -> bool {
+        let Clearance { hand, from, .. } = self.clearance;
+        self.points.iter().any(|point| hand.meets(&pose.inverse_transform_point(point), from))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::{FRAC_PI_2, PI};
+
+    use nalgebra::{Translation3, UnitQuaternion, Vector3};
+
+    use super::*;
+
+    const N: usize = 40;
+    const SIZE: f64 = 0.0075;
+
+    /// A wall whose face is the plane x = 0.15, seen from in front of it to 0.03 m behind, with the volume's corner at
+    /// (1, 2, 3).
+    fn wall() -> Volume {
+        let value = |index: usize| {
+            let behind = (index / (N * N)) as f64 + 0.5 - 20.0;
+            if behind < 4.0 { (0.5 - behind / 8.0).clamp(0.0, 1.0) as f32 } else { 0.0 }
+        };
+        Volume::new(N, SIZE, Isometry3::translation(1.0, 2.0, 3.0), (0..N.pow(3)).map(value).collect()).unwrap()
+    }
+
+    /// A hand straight down whose fingers close along x, its base at (x, 0.15, z) from the volume's corner.
+    fn down(x: f64, z: f64) -> Isometry3<f64> {
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI)
+            * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), FRAC_PI_2);
+        Isometry3::from_parts(Translation3::new(1.0 + x, 2.15, 3.0 + z), turn)
+    }
+
+    #[test]
+    fn a_hand_meets_what_was_seen_and_nothing_else() {
+        let meet = |clearance: Clearance, x, z| Obstacles::observed(&wall(), clearance).meet(&down(x, z));
+        let clearance = Clearance { behind: 0.0, ..Clearance::default() };
+        // From the middle of the palm to its end are 0.1 m.
+        assert!(!meet(clearance, 0.04, 0.15) && meet(clearance, 0.06, 0.15) && meet(clearance, 0.15, 0.15));
+        // Past the wall's top by the hand's height, but for the way.
+        assert!(!meet(clearance, 0.06, 0.36) && !meet(Clearance { from: 0.0, ..clearance }, 0.06, 0.31));
+        assert!(meet(Clearance { from: 0.1, ..clearance }, 0.06, 0.15));
+    }
+
+    #[test]
+    fn what_lies_just_behind_the_surface_may_be_spared() {
+        let count = |behind| {
+            let clearance = Clearance { behind, ..Clearance::default() };
+            Obstacles::observed(&wall(), clearance).points.len() / (N * N)
+        };
+        // Voxels 0.5, 1.5, 2.5 and 3.5 behind, of a truncation of four.
+        assert_eq!([0.0, 0.25, 0.5, 0.875, 0.9].map(count), [4, 3, 2, 1, 0]);
+        let points = Obstacles::observed(&wall(), Clearance { behind: 0.0, ..Clearance::default() }).points;
+        assert!(points.iter().all(|p| (1.15..1.18).contains(&p.x) && p.y > 2.0 && p.z > 3.0), "in the volume's frame");
+    }
+}

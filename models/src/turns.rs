@@ -1,0 +1,154 @@
+//! A network asked four times about a volume, turned about the vertical by 0, 90, 180 and 270°, as one batch; the answers,
+//! turned back, are averaged. It is the same network, of which four times the work makes a better one, and whose answer
+//! turns exactly with the volume.
+//!
+//! What is averaged is what the last convolution regresses, before it becomes probabilities and unit lengths: there a sum
+//! is a vote. Only networks that regress axes can be averaged so, a sum of quaternions means nothing.
+
+use thiserror::Error;
+
+use crate::heads::{HEADS, Orientation};
+use crate::onnx::{AttributeProto, GraphProto, ModelProto, NodeProto, TensorProto};
+
+/// Why a network cannot be averaged over turns.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+pub enum TurnsError {
+    /// It was not made here, or regresses quaternions.
+    #[error(
+        "only networks that regress axes can be averaged over turns: those of `grasp-train train --orientation axes`"
+    )]
+    NotAxes,
+    /// It is averaged already.
+    #[error("the network is averaged over turns already")]
+    Already,
+}
+
+/// The axes of an array `[batch, channel, x, y, z]` that a turn about the vertical changes.
+const X: i64 = 2;
+const Y: i64 = 3;
+
+/// What the four turns of the volume are called, together.
+const TURNED: &str = "turns.all";
+
+/// The model, averaged over the four quarter turns of its volume.
+///
+/// # Errors
+/// [`TurnsError`] when it is not one of those that can be.
+pub fn averaged_over_turns(model: &ModelProto) -> Result<ModelProto, TurnsError> {
+    let graph = model.graph.as_ref().ok_or(TurnsError::NotAxes)?;
+    let input = graph.input.first().ok_or(TurnsError::NotAxes)?.name();
+    let heads = heads(graph).ok_or(TurnsError::NotAxes)?;
+    if graph.node.iter().flat_map(|node| &node.output).any(|output| output == TURNED) {
+        return Err(TurnsError::Already);
+    }
+    let answer = &heads.output[0];
+    let answers = format!("{answer}.turned");
+
+    let mut nodes = Nodes::default();
+    let turns: Vec<String> = (0..4).map(|turns| nodes.turn(input, turns)).collect();
+    nodes.push("Concat", &turns, &[TURNED], vec![AttributeProto::int("axis", 0)]);
+    for node in &graph.node {
+        let mut node = node.clone();
+        node.input.iter_mut().filter(|name| *name == input).for_each(|name| TURNED.clone_into(name));
+        let is_last = node.output.first() == Some(answer);
+        if is_last {
+            node.output[0].clone_from(&answers);
+        }
+        nodes.list.push(node);
+        if is_last {
+            nodes.average(&answers, answer);
+        }
+    }
+    let graph = GraphProto { node: nodes.list, ..graph.clone() };
+    Ok(ModelProto { graph: Some(graph), ..model.clone() })
+}
+
+/// The convolution of the heads, if it regresses axes.
+fn heads(graph: &GraphProto) -> Option<&NodeProto> {
+    let name = format!("{HEADS}.weight");
+    let weight = graph.initializer.iter().find(|tensor| tensor.name() == name)?;
+    let regresses_axes = weight.dims.first() == Some(&(Orientation::Axes.outputs() as i64));
+    graph.node.iter().find(|node| node.input.get(1) == Some(&name)).filter(|_| regresses_axes)
+}
+
+/// Nodes in the order in which they are executed.
+#[derive(Default)]
+struct Nodes {
+    list: Vec<NodeProto>,
+}
+
+impl Nodes {
+    fn push(&mut self, op: &str, inputs: &[String], outputs: &[&str], attribute: Vec<AttributeProto>) {
+        self.list.push(NodeProto {
+            input: inputs.to_vec(),
+            output: outputs.iter().map(|&output| output.to_owned()).collect(),
+            name: Some(format!("turns.{}", self.list.len())),
+            op_type: Some(op.to_owned()),
+            attribute,
+            domain: None,
+        });
+    }
+
+    fn node(&mut self, op: &str, inputs: &[String], attribute: Vec<AttributeProto>) -> String {
+        let name = format!("turns.{}", self.list.len());
+        self.push(op, inputs, &[&name], attribute);
+        name
+    }
+
+    fn constant(&mut self, value: TensorProto) -> String {
+        self.node("Constant", &[], vec![AttributeProto::tensor("value", value)])
+    }
+
+    /// The array after so many quarter turns: what was at (x, y) is then at (−y, x), counted from the middle.
+    fn turn(&mut self, array: &str, turns: usize) -> String {
+        match turns % 4 {
+            0 => array.to_owned(),
+            1 => self.transposed(array, X),
+            2 => self.flipped(array, &[X, Y]),
+            _ => self.transposed(array, Y),
+        }
+    }
+
+    /// x and y exchanged, then the order along one of them reversed.
+    fn transposed(&mut self, array: &str, reversed: i64) -> String {
+        let order = AttributeProto::ints("perm", &[0, 1, Y, X, 4]);
+        let exchanged = self.node("Transpose", &[array.to_owned()], vec![order]);
+        self.flipped(&exchanged, &[reversed])
+    }
+
+    fn flipped(&mut self, array: &str, axes: &[i64]) -> String {
+        let [from, to, step] = [-1, i64::MIN, -1].map(|value| vec![value; axes.len()]);
+        let settings = [&from, &to, axes, &step]
+            .map(|values| self.constant(TensorProto::from_i64("", &[axes.len() as i64], values)));
+        let inputs = [&[array.to_owned()][..], &settings].concat();
+        self.node("Slice", &inputs, vec![])
+    }
+
+    /// The mean of the four answers, each turned back.
+    fn average(&mut self, answers: &str, mean: &str) {
+        let parts: [String; 4] = std::array::from_fn(|turns| format!("turns.answer.{turns}"));
+        let names = parts.each_ref().map(String::as_str);
+        self.push("Split", &[answers.to_owned()], &names, vec![AttributeProto::int("axis", 0)]);
+        let back: Vec<String> = parts.iter().enumerate().map(|(turns, part)| self.turn_back(part, turns)).collect();
+        self.push("Sum", &back, &[mean], vec![]);
+    }
+
+    /// A quarter of what was answered after so many turns, as seen without them.
+    ///
+    /// The channels are the quality; the approach (−z, x, y), whose x and y turn with the volume; cosine and sine of 2ψ,
+    /// twice the angle of the volume; what is level, which does not turn; and the width.
+    fn turn_back(&mut self, answer: &str, turns: usize) -> String {
+        let in_place = self.turn(answer, 4 - turns);
+        let (order, [x, y], double) = match turns {
+            0 => ([0, 1, 2, 3, 4, 5, 6, 7], [1.0, 1.0], 1.0),
+            1 => ([0, 1, 3, 2, 4, 5, 6, 7], [1.0, -1.0], -1.0),
+            2 => ([0, 1, 2, 3, 4, 5, 6, 7], [-1.0, -1.0], 1.0),
+            _ => ([0, 1, 3, 2, 4, 5, 6, 7], [-1.0, 1.0], -1.0),
+        };
+        let order = self.constant(TensorProto::from_i64("", &[8], &order));
+        let signs = [1.0, 1.0, x, y, double, double, 1.0, 1.0].map(|sign: f32| sign / 4.0);
+        let signs = self.constant(TensorProto::from_f32("", &[1, 8, 1, 1, 1], &signs));
+        let ordered = self.node("Gather", &[in_place, order], vec![AttributeProto::int("axis", 1)]);
+        self.node("Mul", &[ordered, signs], vec![])
+    }
+}
