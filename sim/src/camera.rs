@@ -6,6 +6,7 @@ use std::ops::RangeInclusive;
 use grasp::{DepthImage, Fusion, Intrinsics};
 pub use grasp_data::raw::View;
 use nalgebra::{Isometry3, Point3, Vector3};
+use rand::seq::IndexedRandom;
 use rand::{Rng, RngExt};
 use rand_distr::{Distribution, Gamma, Normal};
 
@@ -31,12 +32,15 @@ pub enum Views {
     Circle,
     /// So many views from anywhere: azimuth any, polar angle 20–75°, distance 0.48–0.72 m.
     Anywhere(RangeInclusive<usize>),
+    /// As one of these has it, drawn anew for every observation.
+    OneOf(Vec<Views>),
 }
 
 impl Views {
     /// The cameras' poses (`T_camera_task`).
     pub fn sample(&self, rng: &mut impl Rng) -> Vec<Isometry3<f64>> {
         match self {
+            Self::OneOf(choices) => choices.choose(rng).map_or_else(Vec::new, |views| views.sample(rng)),
             Self::Side { azimuth } => {
                 vec![look_at(&Point3::new(0.15, 0.15, 0.1), 0.6, FRAC_PI_3, azimuth - FRAC_PI_2)]
             }

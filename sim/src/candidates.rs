@@ -36,7 +36,7 @@ impl Recipe {
     /// Makes scene number `index`, looks at it, and tries up to [`points`](Self::points) random ones of the candidates.
     #[must_use]
     pub fn candidates(&self, index: u64) -> Candidates {
-        let mut rng = self.rng(index, 0);
+        let mut rng = self.rng(index);
         let world = self.scene(&mut rng);
         let cloud = Cloud::new(sights(&observe(&world, &self.views, self.noise, &mut rng)));
         let found = candidates(&cloud, &params(), &mut rng);

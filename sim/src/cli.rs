@@ -5,6 +5,7 @@ mod candidates;
 mod convert;
 mod demo;
 mod label;
+mod look;
 mod merge;
 mod objects;
 mod stats;
@@ -24,6 +25,8 @@ use grasp_sim::scene::SceneKind;
 pub enum Command {
     /// Make scenes, try grasps in them, and write what came of it as training data.
     Label(label::Label),
+    /// Look at labelled scenes anew: the same scenes and trials, other views and other noise.
+    Look(look::Look),
     /// Turn a data set into another form.
     Convert(convert::Convert),
     /// Join what several machines have labelled.
@@ -47,6 +50,7 @@ impl Command {
     pub fn run(self) -> anyhow::Result<()> {
         match self {
             Self::Label(command) => command.run(),
+            Self::Look(command) => command.run(),
             Self::Convert(command) => command.run(),
             Self::Merge(command) => command.run(),
             Self::Stats(command) => command.run(),
@@ -72,7 +76,8 @@ struct SceneArgs {
     objects: Option<String>,
 
     /// The cameras: `side[:DEGREES]` (the paper's one view, turned about the vertical), `circle` (six from above), or
-    /// `anywhere:MIN-MAX` (so many from any azimuth, 20–75° off the vertical).
+    /// `anywhere:MIN-MAX` (so many from any azimuth, 20–75° off the vertical). Of several, separated by commas, one is
+    /// drawn for each observation.
     #[arg(long, default_value = "side")]
     views: String,
 
@@ -127,8 +132,7 @@ impl SceneArgs {
     }
 
     fn views(&self) -> anyhow::Result<Views> {
-        parse_views(&self.views)
-            .with_context(|| format!("--views is `{}`: use side, side:90, circle, or anywhere:1-6", self.views))
+        parse_views(&self.views).with_context(|| format!("--views is `{}`: use {VIEWS}", self.views))
     }
 }
 
@@ -137,7 +141,13 @@ fn parse_share(text: &str) -> Result<f64, String> {
     share.ok_or_else(|| "must be from 0 to 1".to_owned())
 }
 
+/// How cameras are written.
+const VIEWS: &str = "side, side:90, circle, anywhere:1-6, or several with commas between";
+
 fn parse_views(text: &str) -> Option<Views> {
+    if text.contains(',') {
+        return text.split(',').map(parse_views).collect::<Option<_>>().map(Views::OneOf);
+    }
     let (name, rest) = text.split_once(':').unwrap_or((text, ""));
     match name {
         "side" if rest.is_empty() => Some(Views::Side { azimuth: 0.0 }),
@@ -163,7 +173,10 @@ mod tests {
         assert_eq!(parse_views("circle"), Some(Views::Circle));
         assert_eq!(parse_views("anywhere:1-6"), Some(Views::Anywhere(1..=6)));
         assert_eq!(parse_views("anywhere:2"), Some(Views::Anywhere(2..=2)));
-        for wrong in ["", "top", "side:x", "anywhere", "anywhere:0-2", "anywhere:3-2", "circle:1"] {
+        let one_of = Views::OneOf(vec![Views::Anywhere(1..=1), Views::Circle]);
+        assert_eq!(parse_views("anywhere:1,circle"), Some(one_of));
+        for wrong in ["", "top", "side:x", "anywhere", "anywhere:0-2", "anywhere:3-2", "circle:1", "side,", "side,top"]
+        {
             assert_eq!(parse_views(wrong), None, "{wrong}");
         }
     }

@@ -104,11 +104,9 @@ impl Point {
 }
 
 impl Recipe {
-    /// Generators of a scene's own: the result does not depend on which thread makes it, or when.
-    pub(crate) fn rng(&self, index: u64, purpose: u64) -> ChaCha8Rng {
-        let mut rng = ChaCha8Rng::seed_from_u64(self.seed.wrapping_add(purpose << 32));
-        rng.set_stream(index);
-        rng
+    /// The generator that makes a scene and tries it.
+    pub(crate) fn rng(&self, index: u64) -> ChaCha8Rng {
+        generator(self.seed, index)
     }
 
     /// A scene of Poisson(4) + 1 objects.
@@ -120,7 +118,7 @@ impl Recipe {
     /// Makes, looks at and labels scene number `index`; `None` if nothing of it can be seen.
     #[must_use]
     pub fn label(&self, index: u64) -> Option<LabelledScene> {
-        let mut rng = self.rng(index, 0);
+        let mut rng = self.rng(index);
         let world = self.scene(&mut rng);
         // Labels cover what six clean views from above see, whatever the network will see.
         let cloud = graspable(&look(&world, &Views::Circle.sample(&mut rng)));
@@ -128,9 +126,7 @@ impl Recipe {
             return None;
         }
         let points = (0..self.points).map(|_| try_point(&world, &cloud, &mut rng)).collect();
-        // From a generator of their own, so that how often a scene is looked at does not change its labels.
-        let mut rng = self.rng(index, 1);
-        let looks: Vec<Look> = (0..self.looks).filter_map(|_| self.look(&world, &mut rng)).collect();
+        let looks = self.look_at(&world, index, self.seed);
         let objects = world.objects().iter().map(|body| Placed {
             name: body.object.name.clone(),
             scale: body.scale,
@@ -139,11 +135,32 @@ impl Recipe {
         (!looks.is_empty()).then(|| LabelledScene { objects: objects.collect(), looks, points })
     }
 
+    /// Looks at scene number `index` without trying it: other views of the very scene that [`label`](Self::label) makes, or
+    /// the same if `seed` is the recipe's own.
+    #[must_use]
+    pub fn look_anew(&self, index: u64, seed: u64) -> Vec<Look> {
+        let world = self.scene(&mut self.rng(index));
+        self.look_at(&world, index, seed)
+    }
+
+    /// From a generator of its own, so that how often a scene is looked at does not change its labels.
+    fn look_at(&self, world: &World, index: u64, seed: u64) -> Vec<Look> {
+        let mut rng = generator(seed.wrapping_add(1 << 32), index);
+        (0..self.looks).filter_map(|_| self.look(world, &mut rng)).collect()
+    }
+
     fn look(&self, world: &World, rng: &mut ChaCha8Rng) -> Option<Look> {
         let views = observe(world, &self.views, self.noise, rng);
         let volume = fuse(&views, RESOLUTION).volume(Isometry3::identity()).ok()?.values().to_vec();
         Some(Look { views, volume })
     }
+}
+
+/// A generator of a scene's own: the result does not depend on which thread makes it, or when.
+fn generator(seed: u64, index: u64) -> ChaCha8Rng {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    rng.set_stream(index);
+    rng
 }
 
 /// The surface that these views see, without the table, the borders of the workspace, and what faces down.

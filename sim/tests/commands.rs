@@ -240,6 +240,35 @@ fn every_planner_meets_the_same_scenes() {
 }
 
 #[test]
+fn scenes_are_looked_at_anew() {
+    let desk = Desk::new();
+    desk.run(&format!("{LABEL} --scenes 5 --out data"));
+    let before = desk.scenes("data");
+    desk.run("look data --views anywhere:1-2 --looks 2 --seed 4 --out same");
+    assert_eq!(desk.scenes("same"), before, "with the seed and the views of the labels nothing changes");
+    desk.run("look data --views anywhere:1,circle --looks 3 --noise 0 --seed 9 --out other");
+    let other = desk.scenes("other");
+    assert_eq!(other.len(), before.len());
+    for ((id, volumes, trials), (id_before, volumes_before, trials_before)) in other.iter().zip(&before) {
+        assert_eq!((id, trials), (id_before, trials_before));
+        assert!(volumes.len() == 3 && volumes.iter().all(|volume| !volumes_before.contains(volume)));
+    }
+
+    // Looks may be looked at anew, too, and a run goes on where it stopped.
+    desk.run("look other --views anywhere:1-2 --looks 2 --seed 4 --out again");
+    assert_eq!(desk.scenes("again"), before);
+    let bytes = bytes_of(&desk.path("again"));
+    desk.run("look other --views anywhere:1-2 --looks 2 --seed 4 --out again");
+    assert_eq!(bytes_of(&desk.path("again")), bytes);
+
+    // A data set of another simulator: its first scene looks otherwise.
+    let setup = fs::read_to_string(desk.path("data/setup.json")).unwrap();
+    fs::write(desk.path("data/setup.json"), setup.replace("\"seed\": 4", "\"seed\": 5")).unwrap();
+    let said = desk.refused("look data --views side --out refused");
+    assert!(said.contains("another simulator"), "{said}");
+}
+
+#[test]
 fn tables_are_played_once() {
     let desk = Desk::new();
     fs::create_dir(desk.path("zoo")).unwrap();

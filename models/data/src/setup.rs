@@ -52,6 +52,9 @@ pub struct Provenance {
     pub noise: f64,
     /// Seed of the data set; scene numbers select its streams.
     pub seed: u64,
+    /// Seed of the looks, if they were not made with the labels.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub look_seed: Option<u64>,
     /// Version of the simulator: another may give other labels.
     pub version: String,
 }

@@ -17,6 +17,7 @@ fn setup() -> Setup {
         looks: 2,
         noise: 0.0,
         seed: 1,
+        look_seed: None,
         version: "0".into(),
     })
 }

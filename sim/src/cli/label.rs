@@ -80,6 +80,7 @@ impl Label {
             looks: recipe.looks,
             noise: recipe.noise,
             seed: recipe.seed,
+            look_seed: None,
             version: env!("CARGO_PKG_VERSION").to_owned(),
         });
         let mut writer = Writer::open(self.format, &self.out, &setup)?;

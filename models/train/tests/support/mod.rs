@@ -47,6 +47,7 @@ pub fn provenance() -> Provenance {
         looks: 1,
         noise: 0.0,
         seed: 0,
+        look_seed: None,
         version: String::new(),
     }
 }

@@ -1,0 +1,102 @@
+use std::path::PathBuf;
+
+use anyhow::{Context, ensure};
+use clap::{Args, ValueEnum};
+use grasp_data::packed::{Reader, Writer};
+use grasp_data::{Provenance, Setup, quantise};
+use grasp_sim::label::Recipe;
+use grasp_sim::ordered;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::{Scene, VIEWS, parse_share, parse_views};
+
+/// A fraction of the work of labelling: nothing is tried. A run that was cut off goes on where it stopped.
+#[derive(Args)]
+pub struct Look {
+    /// Folder that `label` wrote, packed.
+    data: PathBuf,
+
+    /// The cameras, as for `label`.
+    #[arg(long)]
+    views: String,
+
+    /// How often each scene is looked at.
+    #[arg(long, default_value_t = 1)]
+    looks: usize,
+
+    /// Share of the looks that carry the benchmark's depth noise.
+    #[arg(long, default_value_t = 1.0, value_parser = parse_share)]
+    noise: f64,
+
+    /// Seed of the views and the noise; the scenes stay.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+
+    /// Folder to write into.
+    #[arg(long)]
+    out: PathBuf,
+}
+
+impl Look {
+    pub fn run(self) -> anyhow::Result<()> {
+        ensure!(self.looks > 0, "--looks is 0");
+        let parse = |views: &str| parse_views(views).with_context(|| format!("--views is `{views}`: use {VIEWS}"));
+        let views = parse(&self.views)?;
+        let data = Reader::open(&self.data)?;
+        let mut scenes: Vec<usize> = (0..data.len()).collect();
+        scenes.sort_by_key(|&index| data.number(index));
+
+        let missing = || format!("{} does not say how its scenes were made", self.data.display());
+        let made = Setup::read(&self.data)?.provenance.with_context(missing)?;
+        let scene = Scene::from_str(&made.scene, false).map_err(anyhow::Error::msg)?;
+        let before = Recipe {
+            kind: scene.kind(),
+            objects: scene.objects(&made.objects)?,
+            points: made.points,
+            views: parse(&made.views)?,
+            looks: made.looks,
+            noise: made.noise,
+            seed: made.seed,
+        };
+        if let Some(&first) = scenes.first() {
+            let looks = before.look_anew(data.number(first), made.look_seed.unwrap_or(made.seed));
+            let same = looks.first().is_some_and(|look| quantise(&look.volume) == data.volume(first, 0));
+            ensure!(
+                same,
+                "{} was labelled with another simulator, in which other scenes came out",
+                self.data.display()
+            );
+        }
+
+        let setup = Setup::benchmark(Provenance {
+            views: self.views.clone(),
+            looks: self.looks,
+            noise: self.noise,
+            look_seed: Some(self.seed),
+            ..made
+        });
+        let mut writer = Writer::open(&self.out, &setup)?;
+        let next = writer.next().unwrap_or(0);
+        let done = scenes.partition_point(|&index| data.number(index) < next);
+        let style = "{wide_bar} {pos}/{len} scenes, {per_sec}, {eta} left";
+        let progress = ProgressBar::new(scenes.len() as u64).with_style(ProgressStyle::with_template(style)?);
+        progress.set_position(done as u64);
+        progress.reset_eta();
+        let recipe = Recipe { views, looks: self.looks, noise: self.noise, ..before };
+        ordered::for_each(
+            done as u64..scenes.len() as u64,
+            |place| recipe.look_anew(data.number(scenes[place as usize]), self.seed),
+            |place, looks| {
+                let index = scenes[place as usize];
+                if !looks.is_empty() {
+                    let volumes: Vec<Vec<f32>> = looks.into_iter().map(|look| look.volume).collect();
+                    writer.append(data.number(index), &volumes, &data.trials(index))?;
+                }
+                progress.inc(1);
+                anyhow::Ok(())
+            },
+        )?;
+        progress.finish();
+        Ok(())
+    }
+}
