@@ -2,6 +2,7 @@
 
 mod calibrate;
 mod classify;
+mod device;
 mod evaluate;
 mod export;
 mod run;
@@ -131,6 +132,9 @@ struct Training {
     /// Compute convolutions and matrix products in bf16.
     #[arg(long)]
     bf16: bool,
+    /// Where to compute: cpu, cuda, cuda:N, or auto, the first card if there is one.
+    #[arg(long, default_value = "auto")]
+    device: device::Choice,
     /// The model's name in its metadata [default: the file's].
     #[arg(long)]
     name: Option<String>,

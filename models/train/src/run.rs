@@ -13,9 +13,9 @@ use grasp_models::onnx::ModelProto;
 use grasp_models::{Architecture, Metadata};
 use grasp_train::{Augmentation, Checkpoint, Epoch, Execution, Record, Settings, Success, Trainer, curves};
 use indicatif::{ProgressBar, ProgressStyle};
-use tch::Device;
 use time::OffsetDateTime;
 
+use crate::device;
 use crate::evaluate::{PLACE, evaluate};
 use crate::{Change, Keep, Origin, Training};
 
@@ -42,7 +42,7 @@ pub(crate) fn train(training: &Training) -> Result<()> {
         dataset.resolution(),
         metadata.resolution
     );
-    let device = Device::cuda_if_available();
+    let device = training.device.device()?;
     let execution = Execution { device, bf16: training.bf16, channels_last: true };
     let mut trainer = Trainer::new(model, dataset, settings.clone(), execution)?;
 
@@ -55,6 +55,7 @@ pub(crate) fn train(training: &Training) -> Result<()> {
         records = files.read_log(trainer.epochs())?;
     }
     report(&trainer);
+    eprintln!("computing on {}", device::name(device));
 
     let stop = Arc::new(AtomicBool::new(false));
     let signal = Arc::clone(&stop);

@@ -236,6 +236,8 @@ fn what_cannot_be_done_is_said() {
         ("train --network vgn --data data --out x.onnx --val 1", "--val is 1"),
         ("train --from start.onnx --data data --out x.onnx --resume", "x.state: No such file"),
         ("train --data data --out x.onnx", "--network"),
+        ("train --from start.onnx --data data --out x.onnx --device cuda:99", "--device is cuda:99"),
+        ("train --from start.onnx --data data --out x.onnx --device gpu", "cuda:N"),
         ("export --from start.onnx --precision int8 --out x.onnx", "name folders of them with --data"),
     ] {
         let output = command(folder.path(), arguments).output().unwrap();
