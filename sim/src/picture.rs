@@ -215,17 +215,45 @@ impl Picture {
     /// # Errors
     /// A file that cannot be created or written.
     pub fn save(&self, path: &Path) -> Result<(), PictureError> {
-        let write = || -> Result<(), png::EncodingError> {
-            let file = BufWriter::new(File::create(path)?);
-            let mut encoder = png::Encoder::new(file, self.camera.width as u32, self.camera.height as u32);
-            encoder.set_color(png::ColorType::Rgb);
-            encoder.set_depth(png::BitDepth::Eight);
-            let mut writer = encoder.write_header()?;
-            writer.write_image_data(&self.pixels())?;
-            writer.finish()
-        };
-        write().map_err(|source| PictureError { path: path.into(), source })
+        write(path, self.camera.width, self.camera.height, &self.pixels())
     }
+}
+
+/// Renders pictures of one size and writes them side by side as a PNG, so many in a row.
+///
+/// # Errors
+/// A file that cannot be created or written.
+pub fn save_sheet(path: &Path, pictures: &[&Picture], columns: usize) -> Result<(), PictureError> {
+    let Some(Intrinsics { width, height, .. }) = pictures.first().map(|picture| picture.camera) else {
+        return Ok(());
+    };
+    let columns = columns.clamp(1, pictures.len());
+    let mut sheet = Vec::new();
+    for row in pictures.chunks(columns) {
+        let row: Vec<Vec<u8>> = row.iter().map(|picture| picture.pixels()).collect();
+        for line in 0..height {
+            for column in 0..columns {
+                match row.get(column) {
+                    Some(pixels) => sheet.extend_from_slice(&pixels[3 * line * width..3 * (line + 1) * width]),
+                    None => sheet.extend(std::iter::repeat_n(255, 3 * width)),
+                }
+            }
+        }
+    }
+    write(path, columns * width, pictures.len().div_ceil(columns) * height, &sheet)
+}
+
+fn write(path: &Path, width: usize, height: usize, pixels: &[u8]) -> Result<(), PictureError> {
+    let write = || -> Result<(), png::EncodingError> {
+        let file = BufWriter::new(File::create(path)?);
+        let mut encoder = png::Encoder::new(file, width as u32, height as u32);
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_depth(png::BitDepth::Eight);
+        let mut writer = encoder.write_header()?;
+        writer.write_image_data(pixels)?;
+        writer.finish()
+    };
+    write().map_err(|source| PictureError { path: path.into(), source })
 }
 
 impl Item {

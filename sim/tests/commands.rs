@@ -230,6 +230,23 @@ fn a_benchmark_tells_of_every_attempt() {
 }
 
 #[test]
+fn the_first_failures_are_drawn_on_a_sheet() {
+    let desk = Desk::new();
+    let bench = |name: &str| {
+        let arguments = format!("bench --planner random --rounds 3 --seed 5 --failures {name}");
+        let output = desk.command(&arguments).output().unwrap();
+        assert!(output.status.success(), "{}", stderr(&output));
+        (fs::read(desk.path(name)).unwrap(), stderr(&output))
+    };
+    let (sheet, said) = bench("first.png");
+    // Each round ends with two failures of the random planner: six in all at least, three in a row.
+    assert!(sheet.starts_with(b"\x89PNG"));
+    assert_eq!((&sheet[16..20], &sheet[20..24]), (&1440u32.to_be_bytes()[..], &720u32.to_be_bytes()[..]));
+    assert_eq!(said.matches("first.png: seed 5, round").count(), 6, "{said}");
+    assert!(bench("second.png").0 == sheet, "however the rounds are dealt out");
+}
+
+#[test]
 fn every_planner_meets_the_same_scenes() {
     let desk = Desk::new();
     let objects = |planner: &str| -> Vec<u64> {

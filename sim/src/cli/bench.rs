@@ -1,3 +1,4 @@
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
@@ -8,7 +9,7 @@ use clap::{Args, ValueEnum};
 use grasp::{Clearance, DecodeParams, Grasp};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::{Benchmark, Event};
-use grasp_sim::picture::{Picture, quality_color};
+use grasp_sim::picture::{Picture, quality_color, save_sheet};
 use grasp_sim::planner::PlannerSpec;
 use grasp_sim::score::{Spread, Summary};
 use indicatif::ProgressBar;
@@ -54,6 +55,10 @@ pub struct Bench {
     /// and red where it failed.
     #[arg(long)]
     pictures: Option<PathBuf>,
+
+    /// Also draw the first six failures of the last planner on one sheet, and say what they are.
+    #[arg(long)]
+    failures: Option<PathBuf>,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -132,7 +137,7 @@ impl Bench {
             benchmark.rounds,
             benchmark.seed
         );
-        let watcher = Watcher::new(self.attempts.as_deref(), self.pictures.as_deref())?;
+        let watcher = Watcher::new(&self)?;
         let params = self.decoding.params();
         if self.format == Format::Markdown {
             println!("{setup}, {} seeds, {params:?}\n\n{MARKDOWN_HEAD}", self.seeds);
@@ -148,6 +153,9 @@ impl Bench {
                 });
                 games.push(played.with_context(|| format!("planner `{name}`"))?);
                 watcher.finish()?;
+            }
+            if let Some(path) = &self.failures {
+                watcher.draw_failures(path)?;
             }
             progress.finish_and_clear();
             let whole = Summary::of(&games.concat());
@@ -199,20 +207,35 @@ fn markdown(planner: &str, whole: &Summary, gsr: Option<Spread>, dr: Option<Spre
 struct Watcher<'a> {
     lines: Option<(&'a Path, Mutex<BufWriter<File>>)>,
     pictures: Option<&'a Path>,
+    /// The first failures: of which seed, round and attempt, what became of it, and how it looked.
+    failures: Option<Mutex<BTreeMap<Number, (&'static str, Picture)>>>,
     /// The first that could not be kept.
     error: Mutex<Option<anyhow::Error>>,
 }
 
+/// Seed, round and number of an attempt.
+type Number = (u64, u64, usize);
+
+/// Failures on a sheet, and in a row of it.
+const FAILURES: usize = 6;
+const FAILURES_IN_A_ROW: usize = 3;
+
 impl<'a> Watcher<'a> {
-    fn new(lines: Option<&'a Path>, pictures: Option<&'a Path>) -> anyhow::Result<Self> {
+    fn new(bench: &'a Bench) -> anyhow::Result<Self> {
         let open = |path: &'a Path| {
             let file = File::create(path).with_context(|| path.display().to_string())?;
             anyhow::Ok((path, Mutex::new(BufWriter::new(file))))
         };
+        let Bench { attempts, pictures, failures, .. } = bench;
         if let Some(folder) = pictures {
             fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
         }
-        Ok(Self { lines: lines.map(open).transpose()?, pictures, error: Mutex::new(None) })
+        Ok(Self {
+            lines: attempts.as_deref().map(open).transpose()?,
+            pictures: pictures.as_deref(),
+            failures: failures.as_ref().map(|_| Mutex::default()),
+            error: Mutex::new(None),
+        })
     }
 
     fn attempt(&self, planner: &str, seed: u64, event: &Event) {
@@ -235,16 +258,39 @@ impl<'a> Watcher<'a> {
             let mut file = file.lock().unwrap_or_else(PoisonError::into_inner);
             writeln!(file, "{line}").with_context(|| path.display().to_string())?;
         }
-        if let Some(folder) = self.pictures {
-            let planner: String = planner.chars().map(|c| if c.is_alphanumeric() { c } else { '-' }).collect();
-            let name = format!("{planner}-{seed}-{round:04}-{number:02}-{outcome}.png");
+        let picture = || {
             let color = if attempt.outcome.is_success() { quality_color(1.0) } else { quality_color(0.0) };
             let mut picture = Picture::of_workspace(480, 360, TABLE_HEIGHT);
             picture.scene(before).hand(&attempt.grasp.pose, attempt.grasp.width, color);
             for grasp in proposals.iter().skip(1) {
                 picture.gripper(&grasp.pose, grasp.width, quality_color(f64::from(grasp.quality)));
             }
-            picture.save(&folder.join(name))?;
+            picture
+        };
+        if let Some(folder) = self.pictures {
+            let planner: String = planner.chars().map(|c| if c.is_alphanumeric() { c } else { '-' }).collect();
+            let name = format!("{planner}-{seed}-{round:04}-{number:02}-{outcome}.png");
+            picture().save(&folder.join(name))?;
+        }
+        if let Some(failures) = self.failures.as_ref().filter(|_| !attempt.outcome.is_success()) {
+            // Rounds are played in no order; the first are the first in every run.
+            let mut failures = failures.lock().unwrap_or_else(PoisonError::into_inner);
+            failures.insert((seed, *round, *number), (outcome, picture()));
+            if failures.len() > FAILURES {
+                failures.pop_last();
+            }
+        }
+        Ok(())
+    }
+
+    /// Draws the failures of a planner on a sheet.
+    fn draw_failures(&self, path: &Path) -> anyhow::Result<()> {
+        let Some(failures) = &self.failures else { return Ok(()) };
+        let failures = std::mem::take(&mut *failures.lock().unwrap_or_else(PoisonError::into_inner));
+        let pictures: Vec<&Picture> = failures.values().map(|(_, picture)| picture).collect();
+        save_sheet(path, &pictures, FAILURES_IN_A_ROW)?;
+        for ((seed, round, number), (outcome, _)) in &failures {
+            eprintln!("{}: seed {seed}, round {round}, attempt {number}: {outcome}", path.display());
         }
         Ok(())
     }
