@@ -1,5 +1,7 @@
 //! ONNX Runtime: the only module that touches it.
 
+mod agreement;
+mod backend;
 mod classifier;
 
 use std::collections::BTreeMap;
@@ -16,10 +18,15 @@ use ort::memory::Allocator;
 use ort::session::{IoBinding, Session};
 use ort::value::{Outlet, Tensor, TensorElementType};
 use thiserror::Error;
+use tracing::warn;
 
+use crate::onnx::ModelProto;
 use crate::{Metadata, MetadataError};
 
+pub use backend::{Backend, BackendError, Precision, Provider};
 pub use classifier::Classifier;
+
+use backend::Machine;
 
 /// The input every network has: `[batch, 1, N, N, N]`.
 const INPUT: &str = "tsdf";
@@ -94,6 +101,17 @@ pub enum LoadReason {
     /// ONNX Runtime refuses it.
     #[error("ONNX Runtime refuses it: {0}; if the file was cut short, fetch or export it again")]
     Model(String),
+    /// It cannot be run as was asked.
+    #[error(transparent)]
+    Backend(#[from] BackendError),
+    /// The way it was asked to be run gives other answers.
+    #[error("with {backend} it gives other answers: {what}")]
+    Disagrees {
+        /// Which way.
+        backend: Backend,
+        /// What differs.
+        what: String,
+    },
     /// Its metadata cannot be.
     #[error(transparent)]
     Metadata(#[from] MetadataError),
@@ -168,12 +186,24 @@ fn version(build: &str, library: &Path) -> String {
 pub struct Options {
     /// Threads one inference is spread over.
     pub threads: usize,
+    /// By what; `None` takes the fastest that this machine and this library have, and that gives the network's answers.
+    pub provider: Option<Provider>,
+    /// In which numbers; `None` takes the fastest.
+    pub precision: Option<Precision>,
 }
 
 impl Default for Options {
-    /// One thread.
+    /// One thread of ONNX Runtime's own kernels: the same numbers everywhere.
     fn default() -> Self {
-        Self { threads: 1 }
+        Self { threads: 1, provider: Some(Provider::Cpu), precision: None }
+    }
+}
+
+impl Options {
+    /// The fastest there is.
+    #[must_use]
+    pub fn auto(threads: usize) -> Self {
+        Self { threads, provider: None, precision: None }
     }
 }
 
@@ -181,6 +211,7 @@ impl Default for Options {
 /// session can be run from several threads at a time.
 pub struct Network {
     metadata: Metadata,
+    backend: Backend,
     session: Session,
     /// By batch size; a batch of a size that was seen before allocates nothing.
     buffers: BTreeMap<usize, Buffers>,
@@ -193,14 +224,19 @@ struct Buffers {
     outputs: [Tensor<f32>; 3],
 }
 
-fn open(path: &Path, options: &Options) -> Result<Session, LoadReason> {
+fn open(bytes: &[u8], backend: Backend, threads: usize) -> Result<Session, LoadReason> {
     let runtime = runtime()?;
-    // Read here, so that a file that cannot be read is told from one that is no model.
-    let bytes = fs::read(path)?;
     let builder = Session::builder(&runtime.environment)?;
-    let builder = builder.with_intra_threads(options.threads).map_err(ort::Error::from)?;
+    let builder = builder.with_intra_threads(threads).map_err(ort::Error::from)?;
     let mut builder = builder.with_inter_threads(1).map_err(ort::Error::from)?;
-    Ok(builder.commit_from_memory(&bytes)?)
+    if let Some(provider) = backend.dispatch(threads) {
+        builder = builder.with_execution_providers([provider]).map_err(ort::Error::from)?;
+    }
+    if backend.provider == Provider::OpenVino {
+        // What OpenVINO does not take would be computed elsewhere, and nobody would know.
+        builder = builder.with_config_entry("session.disable_cpu_ep_fallback", "1").map_err(ort::Error::from)?;
+    }
+    Ok(builder.commit_from_memory(bytes)?)
 }
 
 /// The maps of a batch, in the network's buffers until it runs again.
@@ -211,7 +247,8 @@ pub struct Output<'a> {
 }
 
 impl Network {
-    /// Loads a file, and checks that its inputs and outputs are those of a grasp network.
+    /// Loads a file, and checks that its inputs and outputs are those of a grasp network, and that the way it is run
+    /// gives the answers that ONNX Runtime's own kernels give in f32.
     ///
     /// # Errors
     /// [`LoadError`] names the file and what is wrong with it.
@@ -219,15 +256,58 @@ impl Network {
         Self::try_load(path, options).map_err(|reason| LoadError { path: path.to_owned(), reason })
     }
 
+    /// Loads the same file once more, to be run in the same way on as many threads.
+    ///
+    /// # Errors
+    /// [`LoadError`] names the file and what is wrong with it.
+    pub fn load_with(path: &Path, backend: Backend, threads: usize) -> Result<Self, LoadError> {
+        let load = || Self::with(path, &fs::read(path)?, backend, threads);
+        load().map_err(|reason| LoadError { path: path.to_owned(), reason })
+    }
+
     fn try_load(path: &Path, options: &Options) -> Result<Self, LoadReason> {
-        let session = open(path, options)?;
+        let Options { threads, provider, precision } = *options;
+        // Before anything is asked of it.
+        runtime()?;
+        let bytes = fs::read(path)?;
+        let backends = Machine::here().backends(provider, precision, is_int8(&bytes))?;
+        let (&last, others) = backends.split_last().ok_or(RuntimeError::EmptyBatch)?;
+        for &backend in others {
+            match Self::checked(path, &bytes, backend, threads) {
+                Ok(network) => return Ok(network),
+                Err(error) => warn!(model = %path.display(), %backend, %error, "passed over"),
+            }
+        }
+        Self::checked(path, &bytes, last, threads)
+    }
+
+    /// Compared with the reference, unless it is the reference.
+    fn checked(path: &Path, bytes: &[u8], backend: Backend, threads: usize) -> Result<Self, LoadReason> {
+        let mut network = Self::with(path, bytes, backend, threads)?;
+        if backend.provider != Provider::Cpu {
+            let mut reference = Self::with(path, bytes, Backend::REFERENCE, threads)?;
+            if let Some(what) = agreement::difference(&mut network, &mut reference)? {
+                return Err(LoadReason::Disagrees { backend, what });
+            }
+        }
+        Ok(network)
+    }
+
+    fn with(path: &Path, bytes: &[u8], backend: Backend, threads: usize) -> Result<Self, LoadReason> {
+        let session = open(bytes, backend, threads)?;
         let resolution = check_signature(session.inputs(), session.outputs())?;
         let metadata = read_metadata(&session, Metadata::defaults(path, resolution))?;
         if let Some(resolution) = resolution.filter(|&resolution| resolution != metadata.resolution) {
             let what = format!("its metadata says N = {}, its input has N = {resolution}", metadata.resolution);
             return Err(LoadReason::Signature { what });
         }
-        Ok(Self { metadata, session, buffers: BTreeMap::new() })
+        Ok(Self { metadata, backend, session, buffers: BTreeMap::new() })
+    }
+
+    /// What runs it.
+    #[must_use]
+    pub fn backend(&self) -> Backend {
+        self.backend
     }
 
     /// What the file says of itself.
@@ -275,7 +355,7 @@ impl Network {
     /// [`RuntimeError::Run`] when ONNX Runtime fails.
     pub fn run(&mut self, batch: usize) -> Result<Output<'_>, RuntimeError> {
         self.buffers(batch)?;
-        let Self { metadata, session, buffers } = self;
+        let Self { metadata, session, buffers, .. } = self;
         let buffers = buffers.get_mut(&batch).ok_or(RuntimeError::EmptyBatch)?;
         let mut run = |buffers: &mut Buffers| -> ort::Result<()> {
             // Bound anew each time, for on some devices binding is what copies the input there.
@@ -337,6 +417,12 @@ impl Output<'_> {
         });
         Maps { quality, rotation, width }
     }
+}
+
+/// Whether a file computes in 8 bits. One that is no model is none, which ONNX Runtime says better.
+fn is_int8(bytes: &[u8]) -> bool {
+    let graph = ModelProto::from_bytes(bytes).ok().and_then(|model| model.graph);
+    graph.is_some_and(|graph| graph.node.iter().any(|node| node.op_type() == "QuantizeLinear"))
 }
 
 fn refusal(model: &str, error: &ort::Error) -> RuntimeError {

@@ -7,8 +7,8 @@ use grasp::gpd::{Candidate, Cloud, Image};
 use grasp::{SurfacePoint, Volume};
 use grasp_models::onnx::{Dimension, ModelProto, ValueInfoProto};
 use grasp_models::{
-    Architecture, Classifier, Network, Options, Orientation, RuntimeError, TurnsError, averaged_over_turns, build, gpd,
-    init,
+    Architecture, Backend, Classifier, Network, Options, Orientation, Precision, Provider, RuntimeError, TurnsError,
+    averaged_over_turns, build, gpd, init,
 };
 use nalgebra::{Isometry3, Point3, Quaternion, UnitQuaternion, Vector3};
 use tempfile::TempDir;
@@ -23,7 +23,7 @@ fn save(model: &ModelProto) -> (TempDir, PathBuf) {
 
 fn load(model: &ModelProto) -> Network {
     let (_folder, path) = save(model);
-    Network::load(&path, &Options { threads: 2 }).unwrap()
+    Network::load(&path, &Options { threads: 2, ..Options::default() }).unwrap()
 }
 
 fn volume(resolution: usize, seed: usize) -> Volume {
@@ -291,4 +291,54 @@ fn a_network_is_no_classifier_and_a_classifier_no_network() {
     assert!(error.contains("it has an input `images`"), "{error}");
     // Small enough to be shipped.
     assert!(fs::metadata(&path).unwrap().len() < 3_000_000);
+}
+
+#[test]
+fn what_runs_a_network_is_what_was_asked_for() {
+    let (_folder, path) = save(&build("vgn", 0).unwrap());
+    let reference = Network::load(&path, &Options::default()).unwrap();
+    assert_eq!(reference.backend(), Backend::REFERENCE);
+    let auto = Network::load(&path, &Options::auto(2)).unwrap().backend();
+    let explicit = Options { threads: 2, provider: Some(auto.provider), precision: Some(auto.precision) };
+    assert_eq!(Network::load(&path, &explicit).unwrap().backend(), auto, "what auto takes can be asked for");
+
+    let refused = |options: Options| Network::load(&path, &options).err().unwrap().to_string();
+    let card = refused(Options { provider: Some(Provider::TensorRt), ..Options::default() });
+    assert!(card.contains("network.onnx") && card.contains("no provider `tensorrt`"), "{card}");
+    let int8 = refused(Options { precision: Some(Precision::Int8), ..Options::default() });
+    assert!(int8.contains("no int8 model"), "{int8}");
+    let half = refused(Options { precision: Some(Precision::Fp16), ..Options::default() });
+    assert!(half.contains("`cpu` does not compute in fp16"), "{half}");
+}
+
+/// The library that `make` fetches on x86-64 Linux has OpenVINO, and this is where it is seen to run.
+#[test]
+#[cfg(all(target_os = "linux", target_arch = "x86_64"))]
+fn openvino_gives_the_networks_answers() {
+    let (_folder, path) = save(&Architecture::Vgn.build_with(40, Orientation::Axes, 0).unwrap());
+    let volumes = [volume(40, 1), volume(40, 2), volume(40, 3)];
+    let mut reference = Network::load(&path, &Options::default()).unwrap();
+    let precisions = [(Precision::Fp32, 1e-4), (Precision::Bf16, 0.02)];
+    for (precision, tolerance) in precisions {
+        let options = Options { threads: 2, provider: Some(Provider::OpenVino), precision: Some(precision) };
+        let mut network = match Network::load(&path, &options) {
+            Ok(network) => network,
+            // Older processors do not multiply bf16, and say so.
+            Err(error) if precision == Precision::Bf16 && error.to_string().contains("does not compute in bf16") => {
+                break;
+            }
+            Err(error) => panic!("{error}"),
+        };
+        assert_eq!(network.backend(), Backend { provider: Provider::OpenVino, precision });
+        for batch in [1, 3, 2, 1] {
+            let batch: Vec<&Volume> = volumes.iter().take(batch).collect();
+            let (got, expected) = (network.infer(&batch).unwrap(), reference.infer(&batch).unwrap());
+            for index in 0..batch.len() {
+                let (got, expected) = (got.maps(index).quality, expected.maps(index).quality);
+                let largest = got.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+                assert!(largest < tolerance, "{precision}: {largest}");
+                assert!(precision == Precision::Fp32 || largest > 0.0, "bf16 rounds");
+            }
+        }
+    }
 }

@@ -1,0 +1,78 @@
+//! Whether a fast way to run a network still gives its answers.
+
+use grasp::{Maps, Volume};
+use nalgebra::Isometry3;
+
+use super::Network;
+use crate::RuntimeError;
+
+/// What outputs may differ by, from those of ONNX Runtime's own kernels in f32, on [`sample`].
+///
+/// bf16 moves the quality of the networks of the zoo by 0.01 at most; a provider that computed something else, or that
+/// lost an operator, is off by far more than this.
+const QUALITY: Limit = Limit { mean: 0.01, largest: 0.2 };
+/// Voxels.
+const WIDTH: Limit = Limit { mean: 0.1, largest: 4.0 };
+/// 1 − |r·r*|. Where a network does not care how a hand is turned, the last bit may turn it.
+const ROTATION: Limit = Limit { mean: 0.02, largest: 1.0 };
+
+struct Limit {
+    mean: f32,
+    largest: f32,
+}
+
+/// Says what differs by more than it may, if anything does.
+pub(super) fn difference(network: &mut Network, reference: &mut Network) -> Result<Option<String>, RuntimeError> {
+    let metadata = network.metadata();
+    let volume = sample(metadata.resolution, metadata.voxel_size);
+    let (got, expected) = (network.infer(&[&volume])?, reference.infer(&[&volume])?);
+    let (got, expected) = (got.maps(0), expected.maps(0));
+    let apart = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).collect::<Vec<_>>();
+    let differences = [
+        ("quality", apart(got.quality, expected.quality), QUALITY),
+        ("width", apart(got.width, expected.width), WIDTH),
+        ("rotation", turned(&got, &expected), ROTATION),
+    ];
+    Ok(differences.into_iter().find_map(|(name, differences, limit)| {
+        let mean = differences.iter().sum::<f32>() / differences.len().max(1) as f32;
+        let largest = differences.iter().copied().fold(0.0, f32::max);
+        // So that what is not a number is no agreement.
+        let agrees = mean <= limit.mean && largest <= limit.largest;
+        (!agrees).then(|| {
+            format!(
+                "`{name}` differs by {mean:.4} on average and {largest:.4} at most, where {} and {} are allowed",
+                limit.mean, limit.largest
+            )
+        })
+    }))
+}
+
+fn turned(got: &Maps, expected: &Maps) -> Vec<f32> {
+    let voxels = got.quality.len();
+    let cosine = |voxel: usize| -> f32 {
+        (0..4).map(|channel| got.rotation[channel * voxels + voxel] * expected.rotation[channel * voxels + voxel]).sum()
+    };
+    (0..voxels).map(|voxel| 1.0 - cosine(voxel).abs()).collect()
+}
+
+/// A ball and a post on a table, as a camera from above would see them.
+pub(super) fn sample(resolution: usize, voxel_size: f64) -> Volume {
+    let size = resolution as f64;
+    // In shares of the edge.
+    let distance = |x: f64, y: f64, z: f64| {
+        let table = z - 0.17;
+        let ball = ((x - 0.35).powi(2) + (y - 0.4).powi(2) + (z - 0.3).powi(2)).sqrt() - 0.13;
+        let post = ((x - 0.68).powi(2) + (y - 0.62).powi(2)).sqrt() - 0.08;
+        table.min(ball).min(post.max(z - 0.6))
+    };
+    let truncation = grasp::TRUNCATION_VOXELS / size;
+    let value = |index: usize| {
+        let at = |c: usize| (c as f64 + 0.5) / size;
+        let (x, y, z) = (index / (resolution * resolution), index / resolution % resolution, index % resolution);
+        let distance = distance(at(x), at(y), at(z)) / truncation;
+        if distance < -1.0 { 0.0 } else { (distance.min(1.0) as f32 + 1.0) / 2.0 }
+    };
+    let values = (0..resolution.pow(3)).map(value).collect();
+    let volume = Volume::new(resolution, voxel_size, Isometry3::identity(), values);
+    volume.expect("metadata has a positive resolution and voxel size, and the values are in [0, 1], not all 0")
+}
