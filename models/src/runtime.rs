@@ -23,7 +23,7 @@ use tracing::warn;
 use crate::onnx::ModelProto;
 use crate::{Metadata, MetadataError};
 
-pub use backend::{Backend, BackendError, Precision, Provider};
+pub use backend::{Backend, BackendError, Choice, NameError, Precision, Provider};
 pub use classifier::Classifier;
 
 use backend::Machine;

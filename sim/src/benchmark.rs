@@ -4,6 +4,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use grasp::{DecodeParams, Grasp};
+use grasp_models::Options;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -104,6 +105,7 @@ impl Benchmark {
         &self,
         planner: &PlannerSpec,
         params: &DecodeParams,
+        options: &Options,
         watch: impl Fn(Event<'_>) + Sync,
     ) -> anyhow::Result<Vec<Round>> {
         // Planners that wait for the next round: there are as many as threads, however the rounds are dealt out.
@@ -113,7 +115,7 @@ impl Benchmark {
             .into_par_iter()
             .map(|number| {
                 let waiting = idle().pop();
-                let mut player = waiting.map_or_else(|| planner.build(params), Ok)?;
+                let mut player = waiting.map_or_else(|| planner.build(params, options), Ok)?;
                 let round = self.play(number, player.as_mut(), &watch);
                 idle().push(player);
                 watch(Event::Round);

@@ -10,6 +10,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use grasp::{DecodeParams, Grasp, RESOLUTION, Volume};
+use grasp_models::Options;
 use nalgebra::Isometry3;
 use rand_chacha::ChaCha8Rng;
 
@@ -81,17 +82,17 @@ impl From<&str> for PlannerSpec {
 }
 
 impl PlannerSpec {
-    /// Makes the planner. A server decodes with its model's own parameters but for the threshold and `force`.
+    /// Makes the planner, whose network, if it has one, is run with `options`. A server decodes with its model's own parameters but for the threshold and `force`.
     ///
     /// # Errors
     /// When the file is not the network or classifier it should be, or the server cannot be reached.
-    pub fn build(&self, params: &DecodeParams) -> anyhow::Result<Box<dyn Planner + Send>> {
+    pub fn build(&self, params: &DecodeParams, options: &Options) -> anyhow::Result<Box<dyn Planner + Send>> {
         Ok(match self {
             Self::Random => Box::new(random::Random),
-            Self::Network(path) => Box::new(network::Onnx::load(path, params)?),
+            Self::Network(path) => Box::new(network::Onnx::load(path, params, options)?),
             Self::Server(address) => Box::new(server::Server::connect(address, params)?),
             Self::Highest => Box::new(shaf::Geometric),
-            Self::HighestProposed(path) => Box::new(shaf::Proposed::load(path, params)?),
+            Self::HighestProposed(path) => Box::new(shaf::Proposed::load(path, params, options)?),
             Self::Gpd(path) => Box::new(gpd::Gpd::load(path)?),
         })
     }

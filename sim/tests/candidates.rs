@@ -4,6 +4,7 @@ use std::fs;
 
 use grasp::DecodeParams;
 use grasp_data::Candidates;
+use grasp_models::Options;
 use grasp_sim::benchmark::Benchmark;
 use grasp_sim::camera::Views;
 use grasp_sim::candidates::{params, sights};
@@ -30,7 +31,7 @@ fn benchmark() -> Benchmark {
 }
 
 fn plan(spec: &str, observation: &Observation) -> Vec<grasp::Grasp> {
-    let mut planner = PlannerSpec::from(spec).build(&DecodeParams::benchmark()).unwrap();
+    let mut planner = PlannerSpec::from(spec).build(&DecodeParams::benchmark(), &Options::default()).unwrap();
     planner.plan(observation, &mut ChaCha8Rng::seed_from_u64(1)).unwrap()
 }
 
@@ -116,7 +117,11 @@ fn a_file_of_another_kind_is_refused_by_name() {
         (classifier.to_string(), "gpd.onnx", "a grasp network reads `tsdf`"),
         ("gpd:nowhere.onnx".to_owned(), "nowhere.onnx", "No such file"),
     ] {
-        let error = PlannerSpec::from(spec.as_str()).build(&DecodeParams::benchmark()).err().unwrap().to_string();
+        let error = PlannerSpec::from(spec.as_str())
+            .build(&DecodeParams::benchmark(), &Options::default())
+            .err()
+            .unwrap()
+            .to_string();
         assert!(error.contains(file) && error.contains(expected), "{spec}: {error}");
     }
 }

@@ -208,6 +208,27 @@ impl Backend {
     }
 }
 
+/// A name, or `auto`, which leaves the choice to the machine.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Choice<T>(pub Option<T>);
+
+impl<T: FromStr> FromStr for Choice<T> {
+    type Err = T::Err;
+
+    fn from_str(text: &str) -> Result<Self, T::Err> {
+        if text == "auto" { Ok(Self(None)) } else { text.parse().map(|choice| Self(Some(choice))) }
+    }
+}
+
+impl<T: fmt::Display> fmt::Display for Choice<T> {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match &self.0 {
+            Some(choice) => choice.fmt(f),
+            None => f.write_str("auto"),
+        }
+    }
+}
+
 impl fmt::Display for Backend {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         write!(f, "{} {}", self.provider, self.precision)
@@ -226,19 +247,26 @@ impl fmt::Display for Precision {
     }
 }
 
-impl FromStr for Provider {
-    type Err = ();
+/// No such name.
+#[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
+#[error("it must be {0}")]
+pub struct NameError(&'static str);
 
-    fn from_str(name: &str) -> Result<Self, ()> {
-        Self::FASTEST_FIRST.into_iter().find(|provider| provider.name() == name).ok_or(())
+impl FromStr for Provider {
+    type Err = NameError;
+
+    fn from_str(name: &str) -> Result<Self, NameError> {
+        let found = Self::FASTEST_FIRST.into_iter().find(|provider| provider.name() == name);
+        found.ok_or(NameError("auto, cpu, openvino, cuda or tensorrt"))
     }
 }
 
 impl FromStr for Precision {
-    type Err = ();
+    type Err = NameError;
 
-    fn from_str(name: &str) -> Result<Self, ()> {
-        Self::ALL.into_iter().find(|precision| precision.name() == name).ok_or(())
+    fn from_str(name: &str) -> Result<Self, NameError> {
+        let found = Self::ALL.into_iter().find(|precision| precision.name() == name);
+        found.ok_or(NameError("auto, fp32, bf16, fp16 or int8"))
     }
 }
 
@@ -308,6 +336,8 @@ mod tests {
         for precision in Precision::ALL {
             assert_eq!(precision.name().parse(), Ok(precision));
         }
-        assert_eq!("gpu".parse::<Provider>(), Err(()));
+        assert!("gpu".parse::<Provider>().is_err());
+        assert_eq!("auto".parse(), Ok(Choice::<Provider>(None)));
+        assert_eq!("cuda".parse(), Ok(Choice(Some(Provider::Cuda))));
     }
 }

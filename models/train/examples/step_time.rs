@@ -7,7 +7,7 @@ use std::time::Instant;
 use grasp::VoxelOrigin;
 use grasp_data::Trial;
 use grasp_models::build;
-use grasp_train::{Adam, Execution, Executor, Targets};
+use grasp_train::{Adam, Execution, Executor, Targets, Weights};
 use nalgebra::{Point3, UnitQuaternion};
 use tch::{Device, Kind, Tensor};
 
@@ -39,7 +39,7 @@ fn main() -> anyhow::Result<()> {
             let mut times: Vec<f64> = Vec::new();
             for _ in 0..STEPS {
                 let start = Instant::now();
-                let loss = targets.loss(&executor.forward_at(&volumes, targets.cells())?, [1.0, 1.0])?;
+                let loss = targets.loss(&executor.forward_at(&volumes, targets.cells())?, &Weights::default())?;
                 loss.mean.backward();
                 adam.step(executor.parameters(), 1e-4);
                 times.push(start.elapsed().as_secs_f64());

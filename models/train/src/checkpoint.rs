@@ -173,15 +173,15 @@ fn copy(stored: &TensorProto, tensor: &Tensor) -> Result<(), CheckpointError> {
 impl Sums {
     /// As a list, for a checkpoint.
     pub(crate) fn to_list(self) -> Vec<f64> {
-        let Self { voxels, quality, rotation, width, true_positives, false_positives, false_negatives } = self;
-        vec![voxels, quality, rotation, width, true_positives, false_positives, false_negatives]
+        let Self { voxels, quality, rotation, width, angle, true_positives, false_positives, false_negatives } = self;
+        vec![voxels, quality, rotation, width, angle, true_positives, false_positives, false_negatives]
     }
 
     /// From such a list; none if it is of another length.
     pub(crate) fn from_list(list: &[f64]) -> Option<Self> {
-        let &[voxels, quality, rotation, width, true_positives, false_positives, false_negatives] = list else {
+        let &[voxels, quality, rotation, width, angle, true_positives, false_positives, false_negatives] = list else {
             return None;
         };
-        Some(Self { voxels, quality, rotation, width, true_positives, false_positives, false_negatives })
+        Some(Self { voxels, quality, rotation, width, angle, true_positives, false_positives, false_negatives })
     }
 }

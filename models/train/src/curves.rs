@@ -11,7 +11,7 @@ use plotters::style::{FontStyle, register_font};
 
 use crate::record::{Record, Validation};
 
-const SIZE: (u32, u32) = (1000, 420);
+const SIZE: (u32, u32) = (1500, 420);
 
 /// What a curve shows: its name and the value of an epoch.
 type Curve<'a> = (&'a str, Box<dyn Fn(&Record) -> Option<f64>>);
@@ -27,7 +27,8 @@ pub fn draw(path: &Path, records: &[Record]) -> anyhow::Result<()> {
     }
     let root = BitMapBackend::new(path, SIZE).into_drawing_area();
     root.fill(&WHITE)?;
-    let (left, right) = root.split_horizontally(SIZE.0 / 2);
+    let (left, others) = root.split_horizontally(SIZE.0 / 3);
+    let (middle, right) = others.split_horizontally(SIZE.0 / 3);
     let held_out =
         |value: fn(&Validation) -> Option<f64>| move |record: &Record| record.validation.as_ref().and_then(value);
     let losses: [Curve; 2] =
@@ -40,7 +41,10 @@ pub fn draw(path: &Path, records: &[Record]) -> anyhow::Result<()> {
         ("precision", Box::new(held_out(|v| v.precision))),
         ("recall", Box::new(held_out(|v| v.recall))),
     ];
-    panel(&right, "validation, quality above 0.5", 0.0..1.0, &scores, records)?;
+    panel(&middle, "validation, quality above 0.5", 0.0..1.0, &scores, records)?;
+    let angles: [Curve; 1] = [("mean angle", Box::new(held_out(|v| v.angle)))];
+    let highest = records.iter().filter_map(|record| record.validation?.angle).fold(0.0, f64::max).max(1.0);
+    panel(&right, "validation, rotation of successes, degrees", 0.0..highest * 1.05, &angles, records)?;
     root.present()?;
     Ok(())
 }

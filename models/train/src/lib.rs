@@ -27,7 +27,7 @@ pub use checkpoint::{Checkpoint, CheckpointError};
 pub use classifier::{ClassifierSettings, Learner, Tally};
 pub use examples::Examples;
 pub use execute::{ExecuteError, Execution, Executor, Outputs};
-pub use loss::{Loss, LossError, Sums, Targets};
+pub use loss::{Loss, LossError, Sums, Targets, Weights};
 pub use record::{Record, Success, Validation};
 pub use settings::Settings;
 pub use trainer::{Epoch, TrainError, Trainer};

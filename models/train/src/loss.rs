@@ -25,6 +25,22 @@ pub struct Targets {
     widths: Vec<f32>,
 }
 
+/// What each part of the loss counts for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Weights {
+    /// Voxels that failed, and voxels that succeeded.
+    pub classes: [f64; 2],
+    /// The rotation's part of a success.
+    pub rotation: f64,
+}
+
+impl Default for Weights {
+    /// As in the paper: everything counts the same.
+    fn default() -> Self {
+        Self { classes: [1.0; 2], rotation: 1.0 }
+    }
+}
+
 /// The loss over a batch.
 pub struct Loss {
     /// The mean over the labelled voxels, to be minimised.
@@ -40,10 +56,12 @@ pub struct Sums {
     pub voxels: f64,
     /// Binary cross-entropy of the quality.
     pub quality: f64,
-    /// 1 − |r·r*| to the nearest rotation that holds, successes only.
+    /// Weighted 1 − |r·r*| to the nearest rotation that holds, successes only.
     pub rotation: f64,
     /// Weighted squared error of the width, successes only.
     pub width: f64,
+    /// The angle to the nearest rotation that holds, degrees, successes only.
+    pub angle: f64,
     /// Successes with a quality above 0.5.
     pub true_positives: f64,
     /// Failures with a quality above 0.5.
@@ -98,12 +116,12 @@ impl Targets {
         self.cells.is_empty()
     }
 
-    /// The loss of a network's outputs at [these voxels](Self::cells): L = w·BCE(q, q*) + q*·(1 − max |r·r*| +
-    /// 0.01·(w − w*)²), averaged over them. `class_weights` weigh the cross-entropy of failures and successes.
+    /// The loss of a network's outputs at [these voxels](Self::cells): L = c·(BCE(q, q*) + q*·(ρ·(1 − max |r·r*|) +
+    /// 0.01·(w − w*)²)), averaged over them, with c the weight of the voxel's class and ρ that of the rotation.
     ///
     /// # Errors
     /// [`LossError`] when the outputs are not numbers, or of other voxels.
-    pub fn loss(&self, outputs: &Outputs, class_weights: [f64; 2]) -> Result<Loss, LossError> {
+    pub fn loss(&self, outputs: &Outputs, weights: &Weights) -> Result<Loss, LossError> {
         let device = outputs.quality.device();
         let labels = Tensor::f_from_slice(&self.labels)?.to_device(device);
 
@@ -111,21 +129,22 @@ impl Targets {
         if quality.isnan().any().int64_value(&[]) != 0 {
             return Err(LossError::NotANumber);
         }
-        let [failure, success] = class_weights;
-        let weights = &labels * (success - failure) + failure;
-        let quality_loss = quality.f_binary_cross_entropy(&labels, Some(&weights), Reduction::Sum)?;
+        let [failure, success] = weights.classes;
+        let of_voxels = &labels * (success - failure) + failure;
+        let quality_loss = quality.f_binary_cross_entropy(&labels, Some(&of_voxels), Reduction::Sum)?;
 
         let hold = self.rotations.as_flattened().as_flattened().as_flattened();
         let hold = Tensor::f_from_slice(hold)?.to_device(device).f_reshape([-1, 2 * TURNS as i64, 4])?;
         let rotation = outputs.rotation.f_reshape([-1, 1, 4])?;
         let cosines = rotation.f_mul(&hold)?.sum_dim_intlist(-1, false, None).abs();
-        let rotation_loss: Tensor = &labels * (1.0 - cosines.amax([1], false));
-        let rotation_loss = rotation_loss.sum(None);
+        let nearest = cosines.amax([1], false);
+        let rotation_loss: Tensor = &labels * (1.0 - &nearest);
+        let rotation_loss = rotation_loss.sum(None) * (success * weights.rotation);
 
         let width = outputs.width.f_reshape_as(&labels)?;
         let expected = Tensor::f_from_slice(&self.widths)?.to_device(device);
         let width_loss: Tensor = &labels * (width - expected).square();
-        let width_loss = width_loss.sum(None) * WIDTH_WEIGHT;
+        let width_loss = width_loss.sum(None) * (success * WIDTH_WEIGHT);
 
         let positive = quality.gt(0.5).to_kind(Kind::Float);
         let count = |tensor: Tensor| tensor.sum(None).double_value(&[]);
@@ -135,6 +154,7 @@ impl Targets {
             quality: quality_loss.double_value(&[]),
             rotation: rotation_loss.double_value(&[]),
             width: width_loss.double_value(&[]),
+            angle: count(&labels * nearest.detach().clamp_max(1.0).acos() * 2.0).to_degrees(),
             true_positives,
             false_positives: count(positive) - true_positives,
             false_negatives: f64::from(self.labels.iter().sum::<f32>()) - true_positives,
@@ -160,6 +180,7 @@ impl Sums {
         self.quality += other.quality;
         self.rotation += other.rotation;
         self.width += other.width;
+        self.angle += other.angle;
         self.true_positives += other.true_positives;
         self.false_positives += other.false_positives;
         self.false_negatives += other.false_negatives;
@@ -169,6 +190,12 @@ impl Sums {
     #[must_use]
     pub fn loss(&self) -> f64 {
         (self.quality + self.rotation + self.width) / self.voxels
+    }
+
+    /// Mean angle of a success to the nearest rotation that holds, degrees.
+    #[must_use]
+    pub fn angle(&self) -> f64 {
+        self.angle / (self.true_positives + self.false_negatives)
     }
 
     /// Share of the voxels on the right side of 0.5.

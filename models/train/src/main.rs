@@ -129,6 +129,9 @@ struct Training {
     /// Weigh failures and successes the same, however many there are of each, instead of leaving it to the data.
     #[arg(long)]
     balance: bool,
+    /// What the rotation counts for in the loss, against quality and width.
+    #[arg(long, default_value_t = 1.0)]
+    rotation_weight: f64,
     /// Compute convolutions and matrix products in bf16.
     #[arg(long)]
     bf16: bool,

@@ -41,6 +41,9 @@ pub struct Validation {
     pub loss_rotation: f64,
     /// and width.
     pub loss_width: f64,
+    /// Mean angle of a success to the nearest rotation that holds, degrees.
+    #[serde(default)]
+    pub angle: Option<f64>,
     /// Share of voxels on the right side of a quality of 0.5.
     pub accuracy: f64,
     /// Share of successes among the voxels above it.
@@ -66,6 +69,7 @@ impl Validation {
             loss_quality: sums.quality / sums.voxels,
             loss_rotation: sums.rotation / sums.voxels,
             loss_width: sums.width / sums.voxels,
+            angle: Some(sums.angle()).filter(|angle| angle.is_finite()),
             accuracy: sums.accuracy(),
             precision: Some(sums.precision()).filter(|share| share.is_finite()),
             recall: Some(sums.recall()).filter(|share| share.is_finite()),

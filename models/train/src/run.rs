@@ -26,6 +26,7 @@ pub(crate) fn train(training: &Training) -> Result<()> {
     }
     ensure!((0.0..1.0).contains(&training.val), "--val is {}, must be at least 0 and below 1", training.val);
     ensure!(training.weight_decay >= 0.0, "--weight-decay is {}, must be at least 0", training.weight_decay);
+    ensure!(training.rotation_weight >= 0.0, "--rotation-weight is {}, must be at least 0", training.rotation_weight);
     if let Some(decay) = training.ema {
         ensure!((0.0..1.0).contains(&decay), "--ema is {decay}, must be at least 0 and below 1");
     }
@@ -182,6 +183,7 @@ fn settings(training: &Training, metadata: &Metadata) -> Settings {
             shift: if allows(Change::Shift) { training.max_shift } else { 0 },
         },
         balance: training.balance,
+        rotation_weight: training.rotation_weight,
         voxel_origin: metadata.voxel_origin,
         bf16: training.bf16,
     }
@@ -216,6 +218,9 @@ fn write_model(trainer: &mut Trainer, metadata: &Metadata, last: Option<&Record>
             note("evaluation", format!("GSR {gsr:.3}, DR {dr:.3}"));
         }
         if let Some(validation) = record.validation {
+            if let Some(angle) = validation.angle {
+                note("validation_angle_degrees", angle.to_string());
+            }
             note("validation_loss", validation.loss.to_string());
             note("validation_accuracy", validation.accuracy.to_string());
         }

@@ -30,9 +30,11 @@ pub struct Settings {
     pub validation: f64,
     /// How scenes are changed.
     pub augmentation: Augmentation,
-    /// Whether failures and successes weigh the same in the quality's loss, however many there are of each. Otherwise
-    /// the data decide, which VGN balances beforehand.
+    /// Whether failures and successes weigh the same, however many there are of each: in the mean as if there were as
+    /// many of both. Otherwise the data decide, which VGN balances beforehand.
     pub balance: bool,
+    /// What the rotation's part of the loss counts for.
+    pub rotation_weight: f64,
     /// Where in its voxel a grasp stands, `corner` or `center`.
     #[serde(serialize_with = "origin_name")]
     pub voxel_origin: VoxelOrigin,

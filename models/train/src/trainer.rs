@@ -14,7 +14,7 @@ use crate::average::Average;
 use crate::batch::{Batch, Example, read_ahead};
 use crate::checkpoint::{Checkpoint, CheckpointError};
 use crate::execute::{ExecuteError, Execution, Executor};
-use crate::loss::{Loss, LossError, Sums};
+use crate::loss::{Loss, LossError, Sums, Weights};
 use crate::record::{Record, Validation};
 use crate::settings::Settings;
 
@@ -62,7 +62,7 @@ pub struct Trainer {
     dataset: Dataset,
     training: Vec<usize>,
     validation: Vec<usize>,
-    class_weights: [f64; 2],
+    weights: Weights,
     /// What must be the same for a run to go on.
     fingerprint: String,
     executor: Executor,
@@ -93,7 +93,7 @@ impl Trainer {
             dataset,
             training: Vec::new(),
             validation: Vec::new(),
-            class_weights: [1.0; 2],
+            weights: Weights::default(),
             fingerprint: String::new(),
             executor,
             adam,
@@ -132,7 +132,8 @@ impl Trainer {
             );
             return Err(TrainError::Settings(reason));
         }
-        self.class_weights = if self.settings.balance { class_weights(&self.dataset, &training)? } else { [1.0; 2] };
+        let classes = if self.settings.balance { class_weights(&self.dataset, &training)? } else { [1.0; 2] };
+        self.weights = Weights { classes, rotation: self.settings.rotation_weight };
         self.fingerprint = self.settings.fingerprint(&self.dataset, training.len(), validation.len());
         (self.training, self.validation) = (training, validation);
         Ok(())
@@ -341,7 +342,7 @@ impl Trainer {
         let volumes = Tensor::f_from_slice(&batch.volumes)?.f_reshape([batch.len as i64, 1, edge, edge, edge])?;
         let volumes = volumes.to_device(self.executor.device());
         let outputs = self.executor.forward_at(&volumes, batch.targets.cells())?;
-        match batch.targets.loss(&outputs, self.class_weights) {
+        match batch.targets.loss(&outputs, &self.weights) {
             Err(LossError::NotANumber) => Err(self.diverged()),
             loss => Ok(Some(loss?)),
         }

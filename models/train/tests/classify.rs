@@ -8,6 +8,7 @@ use grasp::DecodeParams;
 use grasp::SurfacePoint;
 use grasp::gpd::{Candidate, Cloud, Image};
 use grasp_data::Candidates;
+use grasp_models::Options;
 use grasp_models::gpd::gpd;
 use grasp_models::onnx::ModelProto;
 use grasp_sim::benchmark::Benchmark;
@@ -104,7 +105,7 @@ fn candidates_become_a_classifier_that_plans() {
         seed: 1,
     };
     let planner = PlannerSpec::from(format!("gpd:{}", path.display()).as_str());
-    let rounds = benchmark.run(&planner, &DecodeParams::benchmark(), |_| ()).unwrap();
+    let rounds = benchmark.run(&planner, &DecodeParams::benchmark(), &Options::default(), |_| ()).unwrap();
     let summary = Summary::of(&rounds);
     assert!(summary.rounds == 2 && summary.objects >= 2, "{summary:?}");
     assert!(summary.attempts > 0 || summary.nothing_proposed == 2, "{summary:?}");

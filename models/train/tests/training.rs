@@ -10,7 +10,7 @@ use grasp_models::onnx::ModelProto;
 use grasp_models::{Architecture, Orientation};
 use grasp_train::{
     Augmentation, Checkpoint, CheckpointError, Epoch, Execution, Outputs, Record, Settings, Targets, TrainError,
-    Trainer,
+    Trainer, Weights,
 };
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use tch::{Device, Tensor};
@@ -32,6 +32,7 @@ fn settings() -> Settings {
         validation: 0.0,
         augmentation: Augmentation::default(),
         balance: false,
+        rotation_weight: 1.0,
         voxel_origin: VoxelOrigin::Center,
         bf16: false,
     }
@@ -271,7 +272,7 @@ fn the_loss_is_the_papers() {
     for rotation in [label.rotation, label.rotation * half_turn] {
         for sign in [1.0, -1.0] {
             let rotation: [f32; 4] = (rotation.coords * sign).map(|c| c as f32).into();
-            let loss = targets.loss(&outputs(0.8, rotation, 6.0), [1.0, 1.0]).unwrap();
+            let loss = targets.loss(&outputs(0.8, rotation, 6.0), &Weights::default()).unwrap();
             // −ln 0.8 for the success, −ln 0.2 for the failure; 0.01 · 2² for the width.
             let expected = (-(0.8_f64.ln()) - 0.2_f64.ln() + 0.01 * 4.0) / 2.0;
             assert!((loss.mean.double_value(&[]) - expected).abs() < 1e-5);
@@ -291,15 +292,17 @@ fn the_loss_is_the_papers() {
         let Outputs { quality, rotation, width } = outputs(0.8, rotation, 4.0);
         let first = |map: Tensor| map.narrow(0, 0, 1);
         let outputs = Outputs { quality: first(quality), rotation: first(rotation), width: first(width) };
-        targets.loss(&outputs, [1.0, 1.0]).unwrap().sums.rotation
+        targets.loss(&outputs, &Weights::default()).unwrap().sums.rotation
     };
     assert!(rotation_loss(&turns(2)).abs() < 1e-5);
     let off_by_a_step = 1.0 - (std::f64::consts::PI / 10.0).cos();
     assert!((rotation_loss(&turns(1)) - off_by_a_step).abs() < 1e-5);
     let quarter = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
     let rotation: [f32; 4] = (label.rotation * quarter).coords.map(|c| c as f32).into();
-    let loss = targets.loss(&outputs(0.8, rotation, 4.0), [1.0, 3.0]).unwrap();
-    assert!((loss.sums.rotation - (1.0 - 0.5_f64.sqrt())).abs() < 1e-5, "a quarter turn is the worst about z");
+    let loss = targets.loss(&outputs(0.8, rotation, 4.0), &Weights { classes: [1.0, 3.0], rotation: 2.0 }).unwrap();
+    let worst = 1.0 - 0.5_f64.sqrt();
+    assert!((loss.sums.rotation - 3.0 * 2.0 * worst).abs() < 1e-5, "a quarter turn is the worst about z");
+    assert!((loss.sums.angle() - 90.0).abs() < 1e-3, "{}", loss.sums.angle());
     assert!((loss.sums.quality - (-3.0 * 0.8_f64.ln() - 0.2_f64.ln())).abs() < 1e-5, "classes are weighted");
 }
 

@@ -7,6 +7,7 @@ use std::sync::{Mutex, PoisonError};
 use anyhow::Context;
 use clap::{Args, ValueEnum};
 use grasp::{Clearance, DecodeParams, Grasp};
+use grasp_models::{Choice, Options, Precision, Provider};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::{Benchmark, Event};
 use grasp_sim::picture::{Picture, quality_color, save_sheet};
@@ -42,6 +43,14 @@ pub struct Bench {
     /// Objects a scene.
     #[arg(long, default_value_t = 5)]
     count: usize,
+
+    /// What runs the networks: cpu, openvino, cuda, tensorrt, or auto, the fastest there is.
+    #[arg(long, default_value = "cpu")]
+    provider: Choice<Provider>,
+
+    /// The numbers in which it runs them: fp32, bf16, fp16, int8, or auto.
+    #[arg(long, default_value = "auto")]
+    precision: Choice<Precision>,
 
     /// Print a JSON object or a Markdown row a planner.
     #[arg(long, value_enum, default_value = "json")]
@@ -139,6 +148,7 @@ impl Bench {
         );
         let watcher = Watcher::new(&self)?;
         let params = self.decoding.params();
+        let options = Options { provider: self.provider.0, precision: self.precision.0, ..Options::default() };
         if self.format == Format::Markdown {
             println!("{setup}, {} seeds, {params:?}\n\n{MARKDOWN_HEAD}", self.seeds);
         }
@@ -147,7 +157,7 @@ impl Bench {
             let mut games = Vec::new();
             for seed in benchmark.seed..benchmark.seed + self.seeds {
                 let benchmark = Benchmark { seed, ..benchmark.clone() };
-                let played = benchmark.run(&PlannerSpec::from(name.as_str()), &params, |event| match event {
+                let played = benchmark.run(&PlannerSpec::from(name.as_str()), &params, &options, |event| match event {
                     Event::Round => progress.inc(1),
                     Event::Attempt { .. } => watcher.attempt(name, seed, &event),
                 });
@@ -168,6 +178,7 @@ impl Bench {
                     line["seeds"] = serde_json::json!({ "gsr": gsr, "dr": dr });
                     line["planner"] = name.as_str().into();
                     line["decoding"] = format!("{params:?}").into();
+                    line["provider"] = format!("{} {}", self.provider, self.precision).into();
                     line["setup"] = setup.as_str().into();
                     println!("{line}");
                 }

@@ -7,8 +7,8 @@ use std::time::Instant;
 use anyhow::Context;
 use clap::Args;
 use grasp::DecodeParams;
-use grasp_models::Metadata;
 use grasp_models::onnx::ModelProto;
+use grasp_models::{Metadata, Options};
 use grasp_sim::benchmark::{Benchmark, Event};
 use grasp_sim::label::Recipe;
 use grasp_sim::objects::{ObjectSet, Split};
@@ -221,7 +221,7 @@ impl Tables {
         let (params, planner) = (params(&task.game), PlannerSpec::from(task.planner.as_str()));
         let (mut summary, mut milliseconds) = (None, None);
         if task.timed {
-            let mut planner = planner.build(&params)?;
+            let mut planner = planner.build(&params, &Options::default())?;
             let mut times = Vec::new();
             // The first is for warming up.
             for number in 0..=self.timed {
@@ -234,7 +234,7 @@ impl Tables {
             }
             milliseconds = Spread::of(times.get(1..).unwrap_or_default());
         } else {
-            let rounds = benchmark.run(&planner, &params, |event| {
+            let rounds = benchmark.run(&planner, &params, &Options::default(), |event| {
                 if let Event::Round = event {
                     progress.inc(1);
                 }

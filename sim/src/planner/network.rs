@@ -12,8 +12,8 @@ pub(super) struct Onnx {
 }
 
 impl Onnx {
-    pub fn load(path: &Path, params: &DecodeParams) -> anyhow::Result<Self> {
-        let network = Network::load(path, &Options::default())?;
+    pub fn load(path: &Path, params: &DecodeParams, options: &Options) -> anyhow::Result<Self> {
+        let network = Network::load(path, options)?;
         let params = DecodeParams { origin: network.metadata().voxel_origin, ..*params };
         Ok(Self { network, params })
     }

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use grasp::gpd::{Cloud, candidates, highest_first};
 use grasp::{DecodeParams, Grasp};
+use grasp_models::Options;
 use rand_chacha::ChaCha8Rng;
 
 use super::network::Onnx;
@@ -28,9 +29,9 @@ impl Planner for Geometric {
 pub(super) struct Proposed(Onnx);
 
 impl Proposed {
-    pub fn load(path: &Path, params: &DecodeParams) -> anyhow::Result<Self> {
+    pub fn load(path: &Path, params: &DecodeParams, options: &Options) -> anyhow::Result<Self> {
         let params = DecodeParams { threshold: 0.5, force: None, ..*params };
-        Ok(Self(Onnx::load(path, &params)?))
+        Ok(Self(Onnx::load(path, &params, options)?))
     }
 }
 
