@@ -7,7 +7,7 @@ use std::thread::available_parallelism;
 use std::time::Duration;
 
 use clap::Parser;
-use grasp_models::Store;
+use grasp_models::{Choice, Precision, Provider, Store};
 use tracing_subscriber::EnvFilter;
 
 /// Everything that can be set, checked.
@@ -20,6 +20,10 @@ pub(crate) struct Config {
     pub workers: usize,
     /// Threads of each session.
     pub threads: usize,
+    /// What runs the models; the machine's choice where there is none.
+    pub provider: Option<Provider>,
+    /// In which numbers.
+    pub precision: Option<Precision>,
     /// Threads that move messages.
     pub io_threads: usize,
     /// Requests of each model that may wait.
@@ -68,6 +72,15 @@ struct Flags {
     /// Threads of each session. By default the CPUs that this process may use, divided by --workers.
     #[arg(long, env = "GRASPD_THREADS", value_name = "N")]
     threads: Option<String>,
+
+    /// What runs the models: cpu, openvino, cuda or tensorrt, or it is an error. auto takes the fastest that this machine
+    /// and this ONNX Runtime have, and that gives the answers that cpu gives.
+    #[arg(long, env = "GRASPD_PROVIDER", value_name = "NAME", default_value = "auto")]
+    provider: String,
+
+    /// The numbers they are computed in: fp32, bf16, fp16 or int8, or it is an error. auto takes the fastest.
+    #[arg(long, env = "GRASPD_PRECISION", value_name = "NAME", default_value = "auto")]
+    precision: String,
 
     /// Requests of each model that may wait for a session. Further ones are refused at once.
     #[arg(long, env = "GRASPD_QUEUE", value_name = "N", default_value = "32")]
@@ -120,6 +133,8 @@ impl Config {
             Some(threads) => errors.parse("threads", threads, COUNT).map(|Count(threads)| threads),
             None => workers.map(|workers| (cpus / workers).max(1)),
         };
+        let provider = errors.parse("provider", &flags.provider, "auto, cpu, openvino, cuda or tensorrt");
+        let precision = errors.parse("precision", &flags.precision, "auto, fp32, bf16, fp16 or int8");
         let queue = errors.parse("queue", &flags.queue, COUNT).map(|Count(queue)| queue);
         let max_message_bytes = errors.parse("max-message-bytes", &flags.max_message_bytes, BYTES);
         let drain_timeout = errors
@@ -150,6 +165,8 @@ impl Config {
                 http: http?,
                 workers: workers?,
                 threads: threads?,
+                provider: provider.map(|Choice(provider)| provider)?,
+                precision: precision.map(|Choice(precision)| precision)?,
                 // A request costs them a tenth of a millisecond: more than four would only take CPUs from the networks.
                 io_threads: cpus.min(4),
                 queue: queue?,

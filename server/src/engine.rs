@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use grasp::{DecodeError, DecodeParams, Decoded, Volume, decode};
-use grasp_models::{Entry, Network, Options, RuntimeError};
+use grasp_models::{Backend, Entry, Network, Options, RuntimeError};
 use nalgebra::Isometry3;
 use prometheus::IntGauge;
 use thiserror::Error;
@@ -20,6 +20,8 @@ pub(crate) struct Engine {
     pub entry: Entry,
     /// `name version`, as the log and the metrics have it.
     pub label: String,
+    /// What runs it.
+    pub backend: Backend,
     queue: SyncSender<Job>,
     /// One for each request that may run or wait. Counting the queue alone would refuse a request for which a session
     /// is free but has not woken up yet.
@@ -83,11 +85,11 @@ struct Job {
 struct Pace(AtomicU64);
 
 impl Engine {
-    /// Loads `workers` sessions of `threads` threads each and starts them behind a queue of `capacity`.
+    /// Loads `workers` sessions and starts them behind a queue of `capacity`.
     pub fn start(
         entry: Entry,
         workers: usize,
-        threads: usize,
+        options: &Options,
         capacity: usize,
         waiting: impl FnOnce(&str) -> IntGauge,
         sessions: &mut Sessions,
@@ -99,9 +101,13 @@ impl Engine {
         let (queue, jobs) = sync_channel(places);
         let places = Arc::new(Semaphore::new(places));
         let jobs = Arc::new(Mutex::new(jobs));
+        // The first finds out what can run the model; the others are run by the same.
+        let first = Network::load(&entry.path, options)?;
+        let (backend, threads) = (first.backend(), options.threads);
+        let mut loaded = Some(first);
         for worker in 0..workers {
             let session = Session {
-                network: Network::load(&entry.path, &Options { threads })?,
+                network: loaded.take().map_or_else(|| Network::load_with(&entry.path, backend, threads), Ok)?,
                 jobs: Arc::clone(&jobs),
                 waiting: waiting.clone(),
                 pace: Arc::clone(&pace),
@@ -110,8 +116,9 @@ impl Engine {
                 format!("cannot start thread {worker} of {workers} for the model {label}; lower --workers")
             })?;
         }
-        info!(model = label, sha256 = entry.sha256, workers, threads, "loaded");
-        Ok(Self { entry, label, queue, places, capacity, waiting, pace })
+        let Backend { provider, precision } = backend;
+        info!(model = label, sha256 = entry.sha256, %provider, %precision, workers, threads, "loaded");
+        Ok(Self { entry, label, backend, queue, places, capacity, waiting, pace })
     }
 
     /// Queues a volume, or refuses at once. A caller that drops the reply has gone: its job is skipped.

@@ -1,3 +1,4 @@
+use grasp_models::Backend;
 use prometheus::{
     HistogramOpts, HistogramVec, IntCounterVec, IntGauge, IntGaugeVec, Opts, Registry, TEXT_FORMAT, TextEncoder,
 };
@@ -18,6 +19,7 @@ pub(crate) struct Metrics {
     requests: IntCounterVec,
     grasps: IntCounterVec,
     waiting: IntGaugeVec,
+    models: IntGaugeVec,
 }
 
 impl Metrics {
@@ -41,12 +43,18 @@ impl Metrics {
                 &["model"],
             )
             .expect(VALID),
+            models: IntGaugeVec::new(
+                Opts::new("graspd_model_info", "1 for each model that is served: what runs it, in which numbers."),
+                &["model", "provider", "precision", "sha256"],
+            )
+            .expect(VALID),
         };
-        let Self { registry, stages, requests, grasps, waiting } = &metrics;
+        let Self { registry, stages, requests, grasps, waiting, models } = &metrics;
         registry.register(Box::new(stages.clone())).expect(VALID);
         registry.register(Box::new(requests.clone())).expect(VALID);
         registry.register(Box::new(grasps.clone())).expect(VALID);
         registry.register(Box::new(waiting.clone())).expect(VALID);
+        registry.register(Box::new(models.clone())).expect(VALID);
         metrics
     }
 
@@ -62,6 +70,12 @@ impl Metrics {
     /// A request came to an end.
     pub fn ended(&self, model: &str, code: Code) {
         self.requests.with_label_values(&[model, code_name(code)]).inc();
+    }
+
+    /// A model is served.
+    pub fn loaded(&self, model: &str, backend: Backend, sha256: &str) {
+        let Backend { provider, precision } = backend;
+        self.models.with_label_values(&[model, provider.name(), precision.name(), sha256]).set(1);
     }
 
     /// The gauge of a model's queue.

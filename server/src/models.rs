@@ -1,4 +1,5 @@
 use grasp::Volume;
+use grasp_models::Options;
 use grasp_proto::{FieldError, pb};
 
 use crate::config::Config;
@@ -19,11 +20,15 @@ impl Models {
             let name = entry.metadata.name.clone();
             (config.default_model.as_ref() != Some(&name), name)
         });
+        let Config { threads, provider, precision, .. } = *config;
+        let options = Options { threads, provider, precision };
         let engines = entries.into_iter().map(|entry| {
             let gauge = |label: &str| metrics.waiting(label);
-            Engine::start(entry, config.workers, config.threads, config.queue, gauge, sessions)
+            Engine::start(entry, config.workers, &options, config.queue, gauge, sessions)
         });
-        Ok(Self(engines.collect::<Result<_, _>>()?))
+        let models = Self(engines.collect::<Result<_, _>>()?);
+        models.0.iter().for_each(|engine| metrics.loaded(&engine.label, engine.backend, &engine.entry.sha256));
+        Ok(models)
     }
 
     /// The model that a request asks for, if it takes volumes of that resolution.
@@ -85,6 +90,8 @@ impl From<&Engine> for pb::Model {
             voxel_size: metadata.voxel_size,
             threshold: metadata.decode_params().threshold,
             sha256: engine.entry.sha256.clone(),
+            provider: engine.backend.provider.to_string(),
+            precision: engine.backend.precision.to_string(),
             provenance: metadata.provenance.clone().into_iter().collect(),
         }
     }

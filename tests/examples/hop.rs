@@ -31,7 +31,8 @@ async fn main() -> anyhow::Result<()> {
 
     let folder = tempfile::tempdir()?;
     model.write(folder.path());
-    let mut network = Network::load(&folder.path().join("mirror-1.onnx"), &Threads { threads: 1 })?;
+    let mut network =
+        Network::load(&folder.path().join("mirror-1.onnx"), &Threads { threads: 1, ..Threads::default() })?;
     let params = network.metadata().decode_params();
     network.fill(&[&volume])?;
     let mut run = Vec::new();

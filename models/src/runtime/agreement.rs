@@ -13,7 +13,8 @@ use crate::RuntimeError;
 const QUALITY: Limit = Limit { mean: 0.01, largest: 0.2 };
 /// Voxels.
 const WIDTH: Limit = Limit { mean: 0.1, largest: 4.0 };
-/// 1 − |r·r*|. Where a network does not care how a hand is turned, the last bit may turn it.
+/// Half the square of the distance between two quaternions, or one and the other's negative: 1 − |r·r*| for unit ones.
+/// Where a network does not care how a hand is turned, the last bit may turn it.
 const ROTATION: Limit = Limit { mean: 0.02, largest: 1.0 };
 
 struct Limit {
@@ -49,10 +50,14 @@ pub(super) fn difference(network: &mut Network, reference: &mut Network) -> Resu
 
 fn turned(got: &Maps, expected: &Maps) -> Vec<f32> {
     let voxels = got.quality.len();
-    let cosine = |voxel: usize| -> f32 {
-        (0..4).map(|channel| got.rotation[channel * voxels + voxel] * expected.rotation[channel * voxels + voxel]).sum()
+    let at = |maps: &Maps, voxel: usize| [0, 1, 2, 3].map(|channel| maps.rotation[channel * voxels + voxel]);
+    let apart = |voxel: usize| -> f32 {
+        let pairs = || at(got, voxel).into_iter().zip(at(expected, voxel));
+        let [minus, plus]: [f32; 2] =
+            [pairs().map(|(a, b)| (a - b).powi(2)).sum(), pairs().map(|(a, b)| (a + b).powi(2)).sum()];
+        minus.min(plus) / 2.0
     };
-    (0..voxels).map(|voxel| 1.0 - cosine(voxel).abs()).collect()
+    (0..voxels).map(apart).collect()
 }
 
 /// A ball and a post on a table, as a camera from above would see them.

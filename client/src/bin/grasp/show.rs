@@ -50,13 +50,23 @@ pub(crate) fn detection_json(detection: &Detection) -> String {
 }
 
 pub(crate) fn models(models: &[Model]) -> String {
-    let mut table = numbers(&["model", "version", "resolution", "voxel m", "threshold", "sha256"]);
+    let mut table =
+        numbers(&["model", "version", "resolution", "voxel m", "threshold", "provider", "precision", "sha256"]);
     for model in models {
-        let Model { name, version, resolution, voxel_size, threshold, sha256, .. } = model;
+        let Model { name, version, resolution, voxel_size, threshold, sha256, provider, precision, .. } = model;
         let sha256 = sha256.get(..12).unwrap_or(sha256).to_owned();
         let [resolution, voxel_size, threshold] =
             [resolution.to_string(), voxel_size.to_string(), threshold.to_string()];
-        table.add_row(right([name.clone(), version.clone(), resolution, voxel_size, threshold, sha256]));
+        table.add_row(right([
+            name.clone(),
+            version.clone(),
+            resolution,
+            voxel_size,
+            threshold,
+            provider.clone(),
+            precision.clone(),
+            sha256,
+        ]));
     }
     table.to_string()
 }
@@ -69,6 +79,8 @@ pub(crate) fn models_json(models: &[Model]) -> String {
             "resolution": model.resolution,
             "voxel_size": model.voxel_size,
             "threshold": model.threshold,
+            "provider": model.provider,
+            "precision": model.precision,
             "sha256": model.sha256,
             "provenance": model.provenance,
         })

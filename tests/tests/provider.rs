@@ -1,0 +1,64 @@
+//! What runs the models is what was asked for, and everybody is told.
+
+use std::process::Command;
+
+use grasp::Volume;
+use grasp_client::Options;
+use grasp_tests::{RESOLUTION, Server, TestModel, blobs, graspd};
+use nalgebra::Isometry3;
+
+fn volume() -> Volume {
+    blobs(RESOLUTION, Isometry3::identity(), &[[4, 5, 6], [11, 10, 9]])
+}
+
+/// A graspd that does not get as far as listening: its exit code, and what it says.
+fn refused(args: &[&str]) -> (Option<i32>, String) {
+    let models = tempfile::tempdir().unwrap();
+    TestModel::new("blobs").write(models.path());
+    let mut command = Command::new(graspd());
+    command.arg("--models").arg(models.path()).args(["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"]).args(args);
+    let output = command.output().unwrap();
+    (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+}
+
+#[tokio::test]
+async fn the_list_and_the_metric_say_what_runs() {
+    for asked in ["auto", "cpu"] {
+        let server = Server::run(&[TestModel::new("blobs")], &["--provider", asked, "--workers", "2"]);
+        let client = server.client().await;
+        let model = client.list_models().await.unwrap().remove(0);
+        assert!(asked == "auto" || (&*model.provider, &*model.precision) == ("cpu", "fp32"), "{model:?}");
+        let (provider, precision, sha256) = (&model.provider, &model.precision, &model.sha256);
+        let labels = format!(r#"model="blobs 1",precision="{precision}",provider="{provider}",sha256="{sha256}""#);
+        assert_eq!(server.metric(&format!("graspd_model_info{{{labels}}}")), 1.0);
+        let detection = client.detect(&volume(), Options::default()).await.unwrap();
+        assert_eq!(detection.grasps.len(), 2, "{asked} ({provider} {precision}) gives the model's answer");
+    }
+}
+
+/// The library that `make` fetches on x86-64 Linux has OpenVINO.
+#[tokio::test]
+#[cfg(all(target_os = "linux", target_arch = "x86_64"))]
+async fn openvino_runs_where_it_was_asked_for() {
+    let server = Server::run(&[TestModel::new("blobs")], &["--provider", "openvino", "--precision", "fp32"]);
+    let client = server.client().await;
+    let model = client.list_models().await.unwrap().remove(0);
+    assert_eq!((&*model.provider, &*model.precision), ("openvino", "fp32"));
+    assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 2);
+}
+
+#[test]
+fn what_cannot_be_had_is_an_error_and_nothing_else_is_taken() {
+    for (args, expected) in [
+        (&["--provider", "tensorrt"][..], "no provider `tensorrt`"),
+        (&["--provider", "cpu", "--precision", "fp16"], "`cpu` does not compute in fp16"),
+        (&["--precision", "int8"], "grasp-train export --precision int8"),
+    ] {
+        let (code, said) = refused(args);
+        assert_eq!(code, Some(1), "{said}");
+        assert!(said.contains("blobs-1.onnx") && said.contains(expected), "{args:?}: {said}");
+    }
+    let (code, said) = refused(&["--provider", "gpu", "--precision", "half"]);
+    assert_eq!(code, Some(2), "{said}");
+    assert!(said.contains("--provider (GRASPD_PROVIDER) is `gpu`") && said.contains("--precision"), "{said}");
+}
