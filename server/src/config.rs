@@ -10,6 +10,8 @@ use clap::Parser;
 use grasp_models::{Choice, Precision, Provider, Store};
 use tracing_subscriber::EnvFilter;
 
+use crate::queue::Batching;
+
 /// Everything that can be set, checked.
 pub(crate) struct Config {
     pub store: Store,
@@ -28,6 +30,8 @@ pub(crate) struct Config {
     pub io_threads: usize,
     /// Requests of each model that may wait.
     pub queue: usize,
+    /// How many volumes a session takes at once.
+    pub batching: Batching,
     pub max_message_bytes: usize,
     pub drain_timeout: Duration,
     pub log: String,
@@ -86,6 +90,16 @@ struct Flags {
     #[arg(long, env = "GRASPD_QUEUE", value_name = "N", default_value = "32")]
     queue: String,
 
+    /// Volumes that a session takes at once, if so many wait. More than 1 serves more volumes on a card; on a CPU it only
+    /// makes each wait for the others.
+    #[arg(long, env = "GRASPD_MAX_BATCH", value_name = "N", default_value = "1")]
+    max_batch: String,
+
+    /// How long a session that could take more volumes waits for them, counted from the first, milliseconds. 0 takes what
+    /// is there.
+    #[arg(long, env = "GRASPD_BATCH_DELAY", value_name = "MS", default_value = "0", allow_negative_numbers = true)]
+    batch_delay: String,
+
     /// Largest message that is taken, bytes.
     #[arg(long, env = "GRASPD_MAX_MESSAGE_BYTES", value_name = "N", default_value = "16777216")]
     max_message_bytes: String,
@@ -136,6 +150,10 @@ impl Config {
         let provider = errors.parse("provider", &flags.provider, "auto, cpu, openvino, cuda or tensorrt");
         let precision = errors.parse("precision", &flags.precision, "auto, fp32, bf16, fp16 or int8");
         let queue = errors.parse("queue", &flags.queue, COUNT).map(|Count(queue)| queue);
+        let max_batch = errors.parse("max-batch", &flags.max_batch, COUNT).map(|Count(volumes)| volumes);
+        let batch_delay = errors
+            .parse("batch-delay", &flags.batch_delay, "a number of milliseconds, 0 or more")
+            .map(|Seconds(milliseconds)| milliseconds / 1000);
         let max_message_bytes = errors.parse("max-message-bytes", &flags.max_message_bytes, BYTES);
         let drain_timeout = errors
             .parse("drain-timeout", &flags.drain_timeout, "a number of seconds, 0 or more")
@@ -170,6 +188,7 @@ impl Config {
                 // A request costs them a tenth of a millisecond: more than four would only take CPUs from the networks.
                 io_threads: cpus.min(4),
                 queue: queue?,
+                batching: Batching { max: max_batch?, delay: batch_delay? },
                 max_message_bytes: max_message_bytes.map(NonZeroUsize::get)?,
                 drain_timeout: drain_timeout?,
                 log: flags.log,

@@ -1,8 +1,7 @@
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -10,10 +9,13 @@ use anyhow::Context;
 use grasp::{DecodeError, DecodeParams, Decoded, Volume, decode};
 use grasp_models::{Backend, Entry, Network, Options, RuntimeError};
 use nalgebra::Isometry3;
-use prometheus::IntGauge;
+use prometheus::{Histogram, IntGauge};
 use thiserror::Error;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot};
 use tracing::{Span, error, info};
+
+use crate::deadline::Deadline;
+use crate::queue::{Batching, Full, Place, Queue};
 
 /// One model: its queue, and what is said of it. The sessions that take from the queue end when the engine is dropped.
 pub(crate) struct Engine {
@@ -22,13 +24,29 @@ pub(crate) struct Engine {
     pub label: String,
     /// What runs it.
     pub backend: Backend,
-    queue: SyncSender<Job>,
-    /// One for each request that may run or wait. Counting the queue alone would refuse a request for which a session
-    /// is free but has not woken up yet.
-    places: Arc<Semaphore>,
-    capacity: usize,
-    waiting: IntGauge,
+    queue: Arc<Queue<Job>>,
     pace: Arc<Pace>,
+}
+
+/// How a model's requests are served.
+#[derive(Clone, Copy)]
+pub(crate) struct Serving {
+    /// Sessions.
+    pub workers: usize,
+    /// How each runs the model.
+    pub options: Options,
+    /// Requests that may wait.
+    pub capacity: usize,
+    /// How many a session takes at once.
+    pub batching: Batching,
+}
+
+/// What is measured of a model's queue.
+pub(crate) struct Gauges {
+    /// Requests that wait.
+    pub waiting: IntGauge,
+    /// Volumes in a batch.
+    pub batch: Histogram,
 }
 
 /// The threads of every engine's sessions.
@@ -58,7 +76,7 @@ pub(crate) struct Answer {
 }
 
 /// Why a session could not answer.
-#[derive(Debug, Error)]
+#[derive(Clone, Debug, Error)]
 pub(crate) enum EngineError {
     #[error(transparent)]
     Run(#[from] RuntimeError),
@@ -68,16 +86,39 @@ pub(crate) enum EngineError {
     Panic(String),
     #[error("the session is gone")]
     Gone,
+    #[error("the deadline has passed before a session was free")]
+    Expired,
 }
 
-pub(crate) type Reply = oneshot::Receiver<Result<Answer, EngineError>>;
+/// What a session's answer comes by. Who drops it has gone, and the volume is not looked at any more.
+pub(crate) struct Reply {
+    answer: oneshot::Receiver<Result<Answer, EngineError>>,
+    /// None if there is no session to wait for.
+    _place: Option<Place<Job>>,
+}
+
+impl Reply {
+    /// Waits for it, but no longer than anybody waits for the reply.
+    pub async fn wait(self, deadline: Option<Deadline>) -> Result<Answer, EngineError> {
+        let Self { answer, _place } = self;
+        let answer = match deadline {
+            None => answer.await,
+            Some(Deadline(deadline)) => {
+                let waited = tokio::time::timeout_at(deadline.into(), answer).await;
+                waited.map_err(|_| EngineError::Expired)?
+            }
+        };
+        // A session that is gone drops what it had: that is told, too.
+        answer.unwrap_or(Err(EngineError::Gone))
+    }
+}
 
 struct Job {
     volume: Volume,
     params: DecodeParams,
+    deadline: Option<Deadline>,
     span: Span,
     submitted: Instant,
-    place: OwnedSemaphorePermit,
     reply: oneshot::Sender<Result<Answer, EngineError>>,
 }
 
@@ -85,31 +126,28 @@ struct Job {
 struct Pace(AtomicU64);
 
 impl Engine {
-    /// Loads `workers` sessions and starts them behind a queue of `capacity`.
+    /// Loads the model's sessions and starts them behind its queue.
     pub fn start(
         entry: Entry,
-        workers: usize,
-        options: &Options,
-        capacity: usize,
-        waiting: impl FnOnce(&str) -> IntGauge,
+        serving: &Serving,
+        gauges: impl FnOnce(&str) -> Gauges,
         sessions: &mut Sessions,
     ) -> anyhow::Result<Self> {
+        let Serving { workers, options, capacity, batching } = *serving;
         let label = format!("{} {}", entry.metadata.name, entry.metadata.version);
-        let waiting = waiting(&label);
+        let Gauges { waiting, batch } = gauges(&label);
         let pace = Arc::new(Pace(AtomicU64::new(0)));
-        let places = capacity + workers;
-        let (queue, jobs) = sync_channel(places);
-        let places = Arc::new(Semaphore::new(places));
-        let jobs = Arc::new(Mutex::new(jobs));
+        let queue = Arc::new(Queue::new(workers, capacity, waiting));
         // The first finds out what can run the model; the others are run by the same.
-        let first = Network::load(&entry.path, options)?;
+        let first = Network::load(&entry.path, &options)?;
         let (backend, threads) = (first.backend(), options.threads);
         let mut loaded = Some(first);
         for worker in 0..workers {
             let session = Session {
                 network: loaded.take().map_or_else(|| Network::load_with(&entry.path, backend, threads), Ok)?,
-                jobs: Arc::clone(&jobs),
-                waiting: waiting.clone(),
+                queue: Arc::clone(&queue),
+                batching,
+                batch: batch.clone(),
                 pace: Arc::clone(&pace),
             };
             sessions.spawn(format!("{} {worker}", entry.metadata.name), session).with_context(|| {
@@ -118,25 +156,32 @@ impl Engine {
         }
         let Backend { provider, precision } = backend;
         info!(model = label, sha256 = entry.sha256, %provider, %precision, workers, threads, "loaded");
-        Ok(Self { entry, label, backend, queue, places, capacity, waiting, pace })
+        Ok(Self { entry, label, backend, queue, pace })
     }
 
-    /// Queues a volume, or refuses at once. A caller that drops the reply has gone: its job is skipped.
-    pub fn submit(&self, volume: Volume, params: DecodeParams, span: Span) -> Result<Reply, Overloaded> {
-        let place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| Overloaded {
-            model: self.entry.metadata.name.clone(),
-            waiting: self.capacity,
-            retry_after: self.pace.get(),
-        })?;
+    /// Queues a volume, or refuses at once.
+    pub fn submit(
+        &self,
+        volume: Volume,
+        params: DecodeParams,
+        deadline: Option<Deadline>,
+        span: Span,
+    ) -> Result<Reply, Overloaded> {
         let (reply, answer) = oneshot::channel();
-        // Before the session can take it, or the gauge could fall below 0.
-        self.waiting.inc();
-        let job = Job { volume, params, span, submitted: Instant::now(), place, reply };
-        if self.queue.try_send(job).is_err() {
-            // Who has a place has room in the queue, so the sessions are gone: the reply says so, for the job is dropped.
-            self.waiting.dec();
+        match self.queue.push(Job { volume, params, deadline, span, submitted: Instant::now(), reply }) {
+            Ok(place) => Ok(Reply { answer, _place: Some(place) }),
+            // The job has been dropped, which the reply says.
+            Err(Full::Closed) => Ok(Reply { answer, _place: None }),
+            Err(Full::Waiting(waiting)) => {
+                Err(Overloaded { model: self.entry.metadata.name.clone(), waiting, retry_after: self.pace.get() })
+            }
         }
-        Ok(answer)
+    }
+}
+
+impl Drop for Engine {
+    fn drop(&mut self) {
+        self.queue.close();
     }
 }
 
@@ -178,8 +223,9 @@ impl Sessions {
 /// A thread's own network and its end of the queue.
 struct Session {
     network: Network,
-    jobs: Arc<Mutex<Receiver<Job>>>,
-    waiting: IntGauge,
+    queue: Arc<Queue<Job>>,
+    batching: Batching,
+    batch: Histogram,
     pace: Arc<Pace>,
 }
 
@@ -187,41 +233,47 @@ impl Session {
     fn run(mut self, report: &mpsc::Sender<Result<(), EngineError>>) {
         // Nobody to report to: the server is stopping already, and the queue says so next.
         let _ = report.blocking_send(self.warm_up());
-        while let Some(job) = self.next() {
-            let Job { volume, params, span, submitted, place, reply } = job;
-            if reply.is_closed() {
-                continue;
+        while let Some(mut jobs) = self.queue.take(self.batching) {
+            let now = Instant::now();
+            let expired = |job: &mut Job| job.deadline.is_some_and(|Deadline(deadline)| deadline <= now);
+            for job in jobs.extract_if(.., expired) {
+                // The caller's own timer may have been faster.
+                let _ = job.reply.send(Err(EngineError::Expired));
             }
-            let queue = submitted.elapsed();
-            let answer = span.in_scope(|| self.answer(&volume, &params, queue));
-            // First the place, so that whoever got this answer finds room for the next request.
-            drop(place);
-            // The caller may have gone meanwhile, which is counted on their side.
-            let _ = reply.send(answer);
+            // Whoever has gone has left the queue, but for those who went this very moment.
+            jobs.retain(|job| !job.reply.is_closed());
+            if jobs.is_empty() {
+                self.queue.free();
+            } else {
+                self.answer(jobs, now);
+            }
         }
     }
 
-    fn next(&self) -> Option<Job> {
-        // Whoever holds the lock is the one that waits. A panic cannot have left the receiver half changed.
-        let job = self.jobs.lock().unwrap_or_else(PoisonError::into_inner).recv().ok()?;
-        self.waiting.dec();
-        Some(job)
-    }
-
-    fn answer(&mut self, volume: &Volume, params: &DecodeParams, queue: Duration) -> Result<Answer, EngineError> {
-        let started = Instant::now();
+    /// Runs the network over the batch, then decodes and answers one after the other.
+    fn answer(&mut self, jobs: Vec<Job>, taken: Instant) {
+        self.batch.observe(jobs.len() as f64);
+        let volumes: Vec<&Volume> = jobs.iter().map(|job| &job.volume).collect();
         let network = &mut self.network;
-        let answer = caught(|| {
-            let output = network.infer(&[volume])?;
-            let inference = started.elapsed();
-            let decoded = decode(volume, &output.maps(0), params)?;
-            Ok(Answer { decoded, queue, inference, postprocessing: started.elapsed() - inference })
-        });
-        self.pace.set(started.elapsed());
-        if let Err(error) = &answer {
-            error!(%error, "the session failed");
+        let output = caught(|| Ok(network.infer(&volumes)?));
+        let inference = taken.elapsed();
+        // A place in the queue is free as often as a volume is done.
+        self.pace.set(inference / u32::try_from(jobs.len()).unwrap_or(u32::MAX));
+        self.queue.free();
+        for (index, Job { volume, params, span, submitted, reply, .. }) in jobs.into_iter().enumerate() {
+            let started = Instant::now();
+            let decoded = match &output {
+                Ok(output) => caught(|| Ok(decode(&volume, &output.maps(index), &params)?)),
+                Err(error) => Err(error.clone()),
+            };
+            if let Err(error) = &decoded {
+                span.in_scope(|| error!(%error, "the session failed"));
+            }
+            let queue = taken.duration_since(submitted);
+            let postprocessing = started.elapsed();
+            // The caller may have gone meanwhile, which is counted on their side.
+            let _ = reply.send(decoded.map(|decoded| Answer { decoded, queue, inference, postprocessing }));
         }
-        answer
     }
 
     /// The first inference allocates and tunes; no caller should wait for that.
@@ -231,7 +283,15 @@ impl Session {
         let volume = Volume::new(metadata.resolution, metadata.voxel_size, Isometry3::identity(), values);
         let params = metadata.decode_params();
         let volume = volume.expect("metadata has a positive resolution and voxel size, and 0.5 is a surface");
-        self.answer(&volume, &params, Duration::ZERO).map(drop)
+        let started = Instant::now();
+        let network = &mut self.network;
+        let warmed = caught(|| {
+            let output = network.infer(&[&volume])?;
+            decode(&volume, &output.maps(0), &params)?;
+            Ok(())
+        });
+        self.pace.set(started.elapsed());
+        warmed
     }
 }
 

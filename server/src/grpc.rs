@@ -4,10 +4,12 @@ use grasp_proto::FILE_DESCRIPTOR_SET;
 use grasp_proto::pb::grasp_service_server::GraspServiceServer;
 use tokio::net::TcpListener;
 use tokio::sync::watch;
+use tonic::service::interceptor::InterceptedService;
 use tonic::transport::Server;
 use tonic::transport::server::TcpIncoming;
 use tonic_health::pb::health_server::HealthServer;
 
+use crate::deadline;
 use crate::health::{Health, State, draining};
 use crate::service::Grasps;
 
@@ -32,12 +34,13 @@ pub(crate) async fn serve(
             .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
+    let grasps = GraspServiceServer::new(service).max_decoding_message_size(max_message_bytes);
     Server::builder()
         .initial_stream_window_size(STREAM_WINDOW)
         .initial_connection_window_size(CONNECTION_WINDOW)
         .max_frame_size(MAX_FRAME)
         .http2_keepalive_interval(Some(KEEPALIVE))
-        .add_service(GraspServiceServer::new(service).max_decoding_message_size(max_message_bytes))
+        .add_service(InterceptedService::new(grasps, deadline::note))
         .add_service(HealthServer::new(Health(state.clone())))
         .add_service(reflection().build_v1()?)
         .add_service(reflection().build_v1alpha()?)

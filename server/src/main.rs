@@ -1,12 +1,14 @@
 //! graspd: volumes in, grasps out, over gRPC.
 
 mod config;
+mod deadline;
 mod engine;
 mod grpc;
 mod health;
 mod http;
 mod metrics;
 mod models;
+mod queue;
 mod refusal;
 mod service;
 mod shutdown;

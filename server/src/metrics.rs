@@ -1,9 +1,8 @@
 use grasp_models::Backend;
-use prometheus::{
-    HistogramOpts, HistogramVec, IntCounterVec, IntGauge, IntGaugeVec, Opts, Registry, TEXT_FORMAT, TextEncoder,
-};
+use prometheus::{HistogramOpts, HistogramVec, IntCounterVec, IntGaugeVec, Opts, Registry, TEXT_FORMAT, TextEncoder};
 use tonic::Code;
 
+use crate::engine::Gauges;
 use crate::timings::Timings;
 
 /// Seconds. Dense from a cached wake-up to a large network on a slow CPU.
@@ -12,6 +11,9 @@ const BUCKETS: [f64; 27] = [
     20e-3, 30e-3, 50e-3, 75e-3, 100e-3, 150e-3, 200e-3, 300e-3, 500e-3, 750e-3, 1.0,
 ];
 
+/// Volumes.
+const BATCHES: [f64; 9] = [1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 16.0, 32.0, 64.0];
+
 /// What Prometheus sees. A model is labelled `name version`; requests that reached no model have an empty label.
 pub(crate) struct Metrics {
     registry: Registry,
@@ -19,6 +21,7 @@ pub(crate) struct Metrics {
     requests: IntCounterVec,
     grasps: IntCounterVec,
     waiting: IntGaugeVec,
+    batches: HistogramVec,
     models: IntGaugeVec,
 }
 
@@ -43,17 +46,24 @@ impl Metrics {
                 &["model"],
             )
             .expect(VALID),
+            batches: HistogramVec::new(
+                HistogramOpts::new("graspd_batch_size", "Volumes that a session took at once.")
+                    .buckets(BATCHES.to_vec()),
+                &["model"],
+            )
+            .expect(VALID),
             models: IntGaugeVec::new(
                 Opts::new("graspd_model_info", "1 for each model that is served: what runs it, in which numbers."),
                 &["model", "provider", "precision", "sha256"],
             )
             .expect(VALID),
         };
-        let Self { registry, stages, requests, grasps, waiting, models } = &metrics;
+        let Self { registry, stages, requests, grasps, waiting, batches, models } = &metrics;
         registry.register(Box::new(stages.clone())).expect(VALID);
         registry.register(Box::new(requests.clone())).expect(VALID);
         registry.register(Box::new(grasps.clone())).expect(VALID);
         registry.register(Box::new(waiting.clone())).expect(VALID);
+        registry.register(Box::new(batches.clone())).expect(VALID);
         registry.register(Box::new(models.clone())).expect(VALID);
         metrics
     }
@@ -78,9 +88,9 @@ impl Metrics {
         self.models.with_label_values(&[model, provider.name(), precision.name(), sha256]).set(1);
     }
 
-    /// The gauge of a model's queue.
-    pub fn waiting(&self, model: &str) -> IntGauge {
-        self.waiting.with_label_values(&[model])
+    /// What is measured of a model's queue.
+    pub fn gauges(&self, model: &str) -> Gauges {
+        Gauges { waiting: self.waiting.with_label_values(&[model]), batch: self.batches.with_label_values(&[model]) }
     }
 
     /// In Prometheus' text format.
@@ -98,6 +108,7 @@ fn code_name(code: Code) -> &'static str {
         Code::NotFound => "NOT_FOUND",
         Code::ResourceExhausted => "RESOURCE_EXHAUSTED",
         Code::Unavailable => "UNAVAILABLE",
+        Code::DeadlineExceeded => "DEADLINE_EXCEEDED",
         Code::Internal => "INTERNAL",
         _ => "UNKNOWN",
     }

@@ -3,7 +3,7 @@ use grasp_models::Options;
 use grasp_proto::{FieldError, pb};
 
 use crate::config::Config;
-use crate::engine::{Engine, Sessions};
+use crate::engine::{Engine, Serving, Sessions};
 use crate::metrics::Metrics;
 use crate::refusal::Refusal;
 
@@ -20,12 +20,11 @@ impl Models {
             let name = entry.metadata.name.clone();
             (config.default_model.as_ref() != Some(&name), name)
         });
-        let Config { threads, provider, precision, .. } = *config;
+        let Config { workers, threads, provider, precision, queue, batching, .. } = *config;
         let options = Options { threads, provider, precision };
-        let engines = entries.into_iter().map(|entry| {
-            let gauge = |label: &str| metrics.waiting(label);
-            Engine::start(entry, config.workers, &options, config.queue, gauge, sessions)
-        });
+        let serving = Serving { workers, options, capacity: queue, batching };
+        let engines =
+            entries.into_iter().map(|entry| Engine::start(entry, &serving, |label| metrics.gauges(label), sessions));
         let models = Self(engines.collect::<Result<_, _>>()?);
         models.0.iter().for_each(|engine| metrics.loaded(&engine.label, engine.backend, &engine.entry.sha256));
         Ok(models)

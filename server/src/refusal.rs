@@ -32,6 +32,7 @@ impl Refusal {
             Self::UnknownModel { .. } => Code::NotFound,
             Self::Overloaded(_) => Code::ResourceExhausted,
             Self::Starting(_) => Code::Unavailable,
+            Self::Failed(EngineError::Expired) => Code::DeadlineExceeded,
             Self::Failed(_) => Code::Internal,
         }
     }

@@ -16,7 +16,8 @@ use tonic::{Code, Request, Response, Status, Streaming};
 use tracing::field::Empty;
 use tracing::{Span, debug, info, info_span};
 
-use crate::engine::{Answer, EngineError, Reply};
+use crate::deadline::Deadline;
+use crate::engine::{Answer, Reply};
 use crate::health::{State, draining};
 use crate::metrics::Metrics;
 use crate::models::{Models, check_voxel_size};
@@ -48,7 +49,7 @@ impl Grasps {
     }
 
     /// Checks a request and queues its volume. What is wrong with it comes out of [`Begun::finish`], like the answer.
-    fn begin(&self, mut request: pb::DetectGraspsRequest) -> Begun {
+    fn begin(&self, mut request: pb::DetectGraspsRequest, deadline: Option<Deadline>) -> Begun {
         let started = Instant::now();
         let mut id = std::mem::take(&mut request.request_id);
         let checked = check_id("request_id", &id);
@@ -68,6 +69,7 @@ impl Grasps {
         let mut call = Call {
             id,
             started,
+            deadline,
             span,
             metrics: Arc::clone(&self.metrics),
             model: String::new(),
@@ -98,7 +100,7 @@ impl Grasps {
         let checked = Volume::try_from(volume)?;
         check_voxel_size(&checked, engine)?;
         let preprocessing = call.started.elapsed();
-        let reply = engine.submit(checked, params, call.span.clone())?;
+        let reply = engine.submit(checked, params, call.deadline, call.span.clone())?;
 
         let pb::Volume { frame_id, stamp, .. } = request.volume.unwrap_or_default();
         let max_grasps = if request.max_grasps == 0 { usize::MAX } else { request.max_grasps as usize };
@@ -133,10 +135,11 @@ struct Begun {
     work: Result<Work, Refusal>,
 }
 
-/// A request on its way. Dropped before its end, it counts as cancelled by its caller.
+/// A request on its way. Dropped before its end, it counts as cancelled by its caller, unless that one's time was up.
 struct Call {
     id: String,
     started: Instant,
+    deadline: Option<Deadline>,
     span: Span,
     metrics: Arc<Metrics>,
     model: String,
@@ -175,8 +178,7 @@ impl Begun {
 
 impl Call {
     async fn reply(&mut self, work: Work) -> Result<pb::DetectGraspsResponse, Refusal> {
-        // A session that is gone drops what it had: that is told, too.
-        let answer = work.reply.await.unwrap_or(Err(EngineError::Gone))?;
+        let answer = work.reply.wait(self.deadline).await?;
         let Answer { decoded, queue, inference, postprocessing } = answer;
 
         let sent = decoded.grasps.len().min(work.max_grasps);
@@ -209,8 +211,10 @@ impl Call {
 impl Drop for Call {
     fn drop(&mut self) {
         if !self.ended {
-            self.metrics.ended(&self.label, Code::Cancelled);
-            self.span.in_scope(|| info!("the caller has gone"));
+            let expired = self.deadline.is_some_and(|Deadline(deadline)| deadline <= Instant::now());
+            let code = if expired { Code::DeadlineExceeded } else { Code::Cancelled };
+            self.metrics.ended(&self.label, code);
+            self.span.in_scope(|| info!(?code, "the caller has gone"));
         }
     }
 }
@@ -221,7 +225,8 @@ impl GraspService for Grasps {
         &self,
         request: Request<pb::DetectGraspsRequest>,
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
-        Ok(Response::new(self.begin(request.into_inner()).finish().await?))
+        let deadline = request.extensions().get().copied();
+        Ok(Response::new(self.begin(request.into_inner(), deadline).finish().await?))
     }
 
     type DetectGraspsStreamStream = BoxStream<pb::DetectGraspsStreamResponse>;
@@ -230,6 +235,8 @@ impl GraspService for Grasps {
         &self,
         request: Request<Streaming<pb::DetectGraspsRequest>>,
     ) -> Result<Response<Self::DetectGraspsStreamStream>, Status> {
+        // The stream's, hence that of every request in it.
+        let deadline = request.extensions().get().copied();
         let mut requests = request.into_inner();
         let service = self.clone();
         let (begun, calls) = mpsc::channel(READ_AHEAD);
@@ -241,7 +248,7 @@ impl GraspService for Grasps {
                     () = draining(service.state.clone()) => return,
                 };
                 match message {
-                    Ok(Some(request)) => place.send(Ok(service.begin(request))),
+                    Ok(Some(request)) => place.send(Ok(service.begin(request, deadline))),
                     Ok(None) => return,
                     // Too large, or no message at all: HTTP/2's framing is lost, so the stream ends with this status.
                     Err(status) => return place.send(Err(status)),

@@ -108,6 +108,32 @@ async fn a_request_whose_deadline_passes_is_dropped_from_the_queue() {
     request.set_timeout(Duration::from_millis(1));
     let status = server.raw().await.detect_grasps(request).await.unwrap_err();
     assert!(matches!(status.code(), Code::Cancelled | Code::DeadlineExceeded), "{status}");
+    server.wait_for("graspd_requests_total{code=\"DEADLINE_EXCEEDED\",model=\"slow 1\"}", 1.0).await;
+    server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 0.0).await;
     ahead.await.unwrap().unwrap();
     assert_eq!(server.metric("graspd_stage_duration_seconds_count{model=\"slow 1\",stage=\"total\"}"), 1.0);
+    assert_eq!(server.metric("graspd_requests_total{code=\"CANCELLED\",model=\"slow 1\"}"), 0.0);
+}
+
+#[tokio::test]
+async fn what_waits_is_taken_as_a_batch_and_each_gets_its_own_answer() {
+    let server = Server::run(&[slow()], &["--queue", "8", "--max-batch", "3"]);
+    let client = server.client().await;
+    let mut calls = JoinSet::new();
+    for number in 0..7 {
+        let (client, centre) = (client.clone(), [4 + number, 8, 8]);
+        calls.spawn(async move {
+            let volume = blobs(RESOLUTION, Isometry3::identity(), &[centre]);
+            let detection = client.detect(&volume, Options::default()).await.unwrap();
+            assert_eq!(detection.grasps.len(), 1);
+            let x = detection.grasps[0].pose.translation.x / volume.voxel_size();
+            assert!((x - centre[0] as f64).abs() < 1.5, "{x} of {centre:?}");
+        });
+    }
+    calls.join_all().await;
+    let sum = server.metric("graspd_batch_size_sum{model=\"slow 1\"}");
+    let batches = server.metric("graspd_batch_size_count{model=\"slow 1\"}");
+    assert_eq!(sum, 7.0);
+    // The first is taken alone, unless others came as fast; then three at a time.
+    assert!((3.0..7.0).contains(&batches), "{batches} batches");
 }
