@@ -2,8 +2,9 @@ use std::time::Duration;
 
 use grasp_proto::{FieldError, pb};
 use thiserror::Error;
-use tonic::metadata::MetadataValue;
+use tonic::metadata::{MetadataMap, MetadataValue};
 use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, StatusExt};
 
 use crate::engine::{EngineError, Overloaded};
 
@@ -48,13 +49,20 @@ impl Refusal {
 }
 
 impl From<Refusal> for Status {
+    /// With what clients need to react to it by themselves: `google.rpc.BadRequest` names the field, `google.rpc.RetryInfo`
+    /// says when to come back, and so does the trailer that gRPC's own retries look at.
     fn from(refusal: Refusal) -> Self {
-        let mut status = Self::new(refusal.code(), refusal.to_string());
-        if let Some(after) = refusal.retry_after() {
-            let milliseconds = u64::try_from(after.as_millis()).unwrap_or(u64::MAX);
-            status.metadata_mut().insert(RETRY_PUSHBACK, MetadataValue::from(milliseconds));
+        let mut details = ErrorDetails::new();
+        if let Refusal::Field(error) = &refusal {
+            details.add_bad_request_violation(error.field, &error.message);
         }
-        status
+        let mut metadata = MetadataMap::new();
+        if let Some(after) = refusal.retry_after() {
+            details.set_retry_info(Some(after));
+            let milliseconds = u64::try_from(after.as_millis()).unwrap_or(u64::MAX);
+            metadata.insert(RETRY_PUSHBACK, MetadataValue::from(milliseconds));
+        }
+        Self::with_error_details_and_metadata(refusal.code(), refusal.to_string(), details, metadata)
     }
 }
 
@@ -65,5 +73,21 @@ impl From<Refusal> for pb::Error {
             retry_after: refusal.retry_after().map(|after| after.as_secs_f64()),
             message: refusal.to_string(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn clients_are_told_when_to_come_back_in_every_way_they_look_at() {
+        let after = Duration::from_millis(1500);
+        let status = Status::from(Refusal::Starting(after));
+        assert_eq!(status.get_details_retry_info().and_then(|info| info.retry_delay), Some(after));
+        assert_eq!(status.metadata().get(RETRY_PUSHBACK).unwrap(), "1500");
+        let gone = Status::from(Refusal::Failed(EngineError::Gone));
+        assert!(gone.get_details_retry_info().is_none() && gone.metadata().get(RETRY_PUSHBACK).is_none());
+        assert_eq!(Status::from(Refusal::Failed(EngineError::Expired)).code(), Code::DeadlineExceeded);
     }
 }

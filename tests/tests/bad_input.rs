@@ -6,6 +6,7 @@ use grasp_proto::pb::{self, DataType};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
 use nalgebra::Isometry3;
 use tonic::Code;
+use tonic_types::StatusExt;
 
 fn volume() -> Volume {
     blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]])
@@ -51,6 +52,12 @@ impl Case {
     async fn refused(&mut self, request: pb::DetectGraspsRequest, code: Code, message: &str) {
         let status = self.client.detect_grasps(request).await.expect_err(message);
         assert_eq!((status.code(), status.message()), (code, message));
+        if code == Code::InvalidArgument {
+            let details = status.get_details_bad_request().expect("a google.rpc.BadRequest");
+            let violation = &details.field_violations[0];
+            assert!(message.starts_with(&violation.field), "{violation:?}");
+            assert_eq!(violation.description, message);
+        }
         self.still_answers().await;
     }
 
