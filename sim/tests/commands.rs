@@ -348,7 +348,7 @@ fn mistakes_name_what_is_wrong() {
         (format!("{label} urdf"), "urdf/a.urdf"),
         (format!("{label} flat"), "flat/a.obj"),
         (format!("{label} wide"), "wide/a.urdf"),
-        ("label --scenes 1 --out never --views top".to_owned(), "use side, side:90, circle, or anywhere:1-6"),
+        ("label --scenes 1 --out never --views top".to_owned(), "use side, side:90, circle, anywhere:1-6"),
         ("label --scenes 1 --out never --noise 2".to_owned(), "must be from 0 to 1"),
         ("label --scenes 1 --out never --looks 2 --format raw".to_owned(), "only --format packed"),
         ("label --scenes 3 --scene pile --points 6 --format processed --out half".to_owned(), "half/setup.json"),
