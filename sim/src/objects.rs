@@ -11,9 +11,6 @@ use rand::{Rng, RngExt};
 use crate::mesh::Mesh;
 pub use urdf::ObjectError;
 
-/// The smallest factor that scenes scale objects by.
-pub const SMALLEST_SCALE: f64 = 0.7;
-
 /// A rigid object. Its frame has z up in the pose in which it best stands on a table.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Object {

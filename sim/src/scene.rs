@@ -9,7 +9,7 @@ use rand::{Rng, RngExt};
 use rand_distr::{Distribution, StandardNormal};
 
 use crate::TABLE_HEIGHT;
-use crate::objects::{Object, ObjectSet, SMALLEST_SCALE};
+use crate::objects::{Object, ObjectSet};
 use crate::physics::{STEPS_PER_SECOND, World};
 
 /// The two ways in which a scene is made.
@@ -25,7 +25,7 @@ pub enum SceneKind {
 const PILE_SCALE: Range<f64> = 0.8..1.0;
 
 /// Those of packed ones.
-const PACKED_SCALE: Range<f64> = SMALLEST_SCALE..0.9;
+const PACKED_SCALE: Range<f64> = 0.7..0.9;
 
 /// Velocity norm (m/s and rad/s together) at which a body counts as resting.
 const REST_SPEED: f64 = 0.01;

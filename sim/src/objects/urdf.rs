@@ -6,13 +6,13 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use grasp::MAX_OPENING;
+use grasp::WORKSPACE_SIZE;
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 use roxmltree::{Document, Node};
 use thiserror::Error;
 
-use super::{Object, SMALLEST_SCALE};
+use super::Object;
 use crate::mesh::Mesh;
 
 /// PyBullet's friction for a link that states none.
@@ -61,15 +61,15 @@ pub enum ObjectError {
         /// Why.
         source: tobj::LoadError,
     },
-    /// An object that nothing can take.
+    /// An object larger than the workspace, as one in millimetres is.
     #[error(
-        "{}: its thinnest part is {:.0} mm thick, the hand opens {:.0} mm; scale the meshes down (are they in metres?)",
-        path.display(), thickness * 1e3, MAX_OPENING * 1e3
+        "{}: its thinnest part is {:.0} mm thick, the workspace is {:.0} mm wide; scale the meshes down (are they in metres?)",
+        path.display(), thickness * 1e3, WORKSPACE_SIZE * 1e3
     )]
-    TooWide {
+    TooLarge {
         /// The URDF.
         path: PathBuf,
-        /// Of the thinnest part at the smallest scale of a scene, metres.
+        /// Of the thinnest part, metres.
         thickness: f64,
     },
     /// A file that could not be written.
@@ -132,9 +132,9 @@ pub(super) fn load(path: &Path) -> Result<Object, ObjectError> {
     if parts.is_empty() {
         return Err(urdf.wrong("has no <collision> shape that encloses a volume"));
     }
-    let thickness = parts.iter().map(|part| part.extents().min()).fold(f64::INFINITY, f64::min) * SMALLEST_SCALE;
-    if thickness > MAX_OPENING {
-        return Err(ObjectError::TooWide { path: path.into(), thickness });
+    let thickness = parts.iter().map(|part| part.extents().min()).fold(f64::INFINITY, f64::min);
+    if thickness > WORKSPACE_SIZE {
+        return Err(ObjectError::TooLarge { path: path.into(), thickness });
     }
     let mut visual = Mesh::default();
     for node in children(link, "visual") {
@@ -394,7 +394,7 @@ f 5 7 6\nf 5 6 8\nf 6 7 8\nf 7 5 8
             (urdf("1", "<capsule/>"), "has a <capsule>"),
             (urdf("1", "<mesh filename='none.obj'/>"), "none.obj has no faces"),
             (urdf("1", "<mesh filename='lost.obj'/>"), "cannot read the mesh"),
-            (urdf("1", "<box size='0.2 0.3 0.2'/>"), "is 140 mm thick, the hand opens 80 mm"),
+            (urdf("1", "<box size='0.5 0.4 0.6'/>"), "is 400 mm thick, the workspace is 300 mm wide"),
         ];
         for (urdf, fault) in cases {
             let message = error(&urdf);
