@@ -107,6 +107,14 @@ impl LocalServer {
         Ok(kill_process(Pid::from_child(&self.process), Signal::TERM)?)
     }
 
+    /// Tells it to read its models anew: SIGHUP.
+    ///
+    /// # Errors
+    /// What the system says, which is nothing as long as the process has not been waited for.
+    pub fn reload(&self) -> io::Result<()> {
+        Ok(kill_process(Pid::from_child(&self.process), Signal::HUP)?)
+    }
+
     /// Waits for it to end.
     ///
     /// # Errors

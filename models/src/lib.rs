@@ -27,5 +27,5 @@ pub use runtime::{
     Backend, BackendError, Choice, Classifier, LoadError, LoadReason, NameError, Network, Options, Output, Precision,
     Provider, RuntimeError, RuntimeInfo, init,
 };
-pub use store::{Entry, EntryError, Store, StoreError};
+pub use store::{Entry, EntryError, Scan, Store, StoreError};
 pub use turns::{TurnsError, averaged_over_turns};

@@ -4,10 +4,10 @@ mod agreement;
 mod backend;
 mod classifier;
 
-use std::collections::BTreeMap;
-use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, btree_map};
 use std::env::consts::{DLL_PREFIX, DLL_SUFFIX};
 use std::fs;
+use std::iter;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
@@ -21,7 +21,7 @@ use thiserror::Error;
 use tracing::warn;
 
 use crate::onnx::ModelProto;
-use crate::{Metadata, MetadataError};
+use crate::{Entry, Metadata, MetadataError};
 
 pub use backend::{Backend, BackendError, Choice, NameError, Precision, Provider};
 pub use classifier::Classifier;
@@ -98,6 +98,14 @@ pub enum LoadReason {
     /// The file system refused.
     #[error(transparent)]
     Io(#[from] std::io::Error),
+    /// Another file took its place since the folder was read.
+    #[error("has the SHA-256 {found} now, it had {expected} when the folder was read; load it anew")]
+    Changed {
+        /// When the folder was read.
+        expected: String,
+        /// Now.
+        found: String,
+    },
     /// ONNX Runtime refuses it.
     #[error("ONNX Runtime refuses it: {0}; if the file was cut short, fetch or export it again")]
     Model(String),
@@ -256,29 +264,41 @@ impl Network {
         Self::try_load(path, options).map_err(|reason| LoadError { path: path.to_owned(), reason })
     }
 
-    /// Loads the same file once more, to be run in the same way on as many threads.
+    /// Loads an entry of a store several times, for as many threads that run it at the same time. What runs the first
+    /// runs the others.
     ///
     /// # Errors
-    /// [`LoadError`] names the file and what is wrong with it.
-    pub fn load_with(path: &Path, backend: Backend, threads: usize) -> Result<Self, LoadError> {
-        let load = || Self::with(path, &fs::read(path)?, backend, threads);
-        load().map_err(|reason| LoadError { path: path.to_owned(), reason })
+    /// [`LoadError`] names the file and what is wrong with it, if it is not the one that the store read, too.
+    pub fn load_several(entry: &Entry, options: &Options, count: usize) -> Result<Vec<Self>, LoadError> {
+        let load = || {
+            runtime()?;
+            let bytes = entry.bytes()?;
+            let first = Self::choose(&entry.path, &bytes, options)?;
+            let backend = first.backend();
+            let others = (1..count).map(|_| Self::with(&entry.path, &bytes, backend, options.threads));
+            iter::once(Ok(first)).chain(others).take(count).collect::<Result<_, LoadReason>>()
+        };
+        load().map_err(|reason| LoadError { path: entry.path.clone(), reason })
     }
 
     fn try_load(path: &Path, options: &Options) -> Result<Self, LoadReason> {
-        let Options { threads, provider, precision } = *options;
         // Before anything is asked of it.
         runtime()?;
-        let bytes = fs::read(path)?;
-        let backends = Machine::here().backends(provider, precision, is_int8(&bytes))?;
+        Self::choose(path, &fs::read(path)?, options)
+    }
+
+    /// The first way to run it, of those that may, that gives its answers.
+    fn choose(path: &Path, bytes: &[u8], options: &Options) -> Result<Self, LoadReason> {
+        let Options { threads, provider, precision } = *options;
+        let backends = Machine::here().backends(provider, precision, is_int8(bytes))?;
         let (&last, others) = backends.split_last().ok_or(RuntimeError::EmptyBatch)?;
         for &backend in others {
-            match Self::checked(path, &bytes, backend, threads) {
+            match Self::checked(path, bytes, backend, threads) {
                 Ok(network) => return Ok(network),
                 Err(error) => warn!(model = %path.display(), %backend, %error, "passed over"),
             }
         }
-        Self::checked(path, &bytes, last, threads)
+        Self::checked(path, bytes, last, threads)
     }
 
     /// Compared with the reference, unless it is the reference.
@@ -368,8 +388,8 @@ impl Network {
 
     fn buffers(&mut self, batch: usize) -> Result<&mut Buffers, RuntimeError> {
         match self.buffers.entry(batch) {
-            Entry::Occupied(entry) => Ok(entry.into_mut()),
-            Entry::Vacant(entry) => {
+            btree_map::Entry::Occupied(entry) => Ok(entry.into_mut()),
+            btree_map::Entry::Vacant(entry) => {
                 let buffers = Buffers::new(&self.session, batch, self.metadata.resolution);
                 Ok(entry.insert(buffers.map_err(|error| refusal(&self.metadata.name, &error))?))
             }

@@ -6,6 +6,7 @@ use sha2::{Digest, Sha256};
 use thiserror::Error;
 
 use crate::onnx::{FileError, ModelProto};
+use crate::runtime::LoadReason;
 use crate::{Metadata, MetadataError};
 
 /// The models in a folder, as their files describe themselves. Nothing is loaded into ONNX Runtime yet.
@@ -88,17 +89,38 @@ pub enum EntryError {
     },
 }
 
+impl EntryError {
+    /// The file.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        match self {
+            Self::File(FileError::Io { path, .. } | FileError::Decode { path, .. })
+            | Self::Metadata { path, .. }
+            | Self::Duplicate { second: path, .. } => path,
+        }
+    }
+}
+
 /// A line each, indented below the heading.
 fn lines(files: &[EntryError]) -> String {
     files.iter().map(|error| format!("\n    {error}")).collect()
 }
 
-impl Store {
+/// What a folder holds: the models that its files describe, and the files that describe none.
+#[derive(Debug)]
+pub struct Scan {
+    /// By name, the versions of a name from the oldest to the newest.
+    pub entries: Vec<Entry>,
+    /// What is wrong with each other file.
+    pub rejected: Vec<EntryError>,
+}
+
+impl Scan {
     /// Reads every `*.onnx` file of a folder.
     ///
     /// # Errors
-    /// [`StoreError`] names every file that cannot be used, or the folder if there is none.
-    pub fn open(directory: &Path) -> Result<Self, StoreError> {
+    /// [`StoreError`] when the folder cannot be read, or holds no such file.
+    pub fn read(directory: &Path) -> Result<Self, StoreError> {
         let files = fs::read_dir(directory).and_then(|files| files.map(|file| Ok(file?.path())).collect());
         let mut paths: Vec<PathBuf> = files.map_err(|source| StoreError::Io { path: directory.to_owned(), source })?;
         paths.retain(|path| path.extension().is_some_and(|extension| extension == "onnx"));
@@ -107,26 +129,49 @@ impl Store {
         }
         // A folder has no order of its own.
         paths.sort();
-        let (mut entries, mut files) = (Vec::new(), Vec::new());
+        let (mut entries, mut rejected) = (Vec::<Entry>::new(), Vec::new());
         for path in paths {
             match Entry::read(path) {
                 Ok(entry) => entries.push(entry),
-                Err(error) => files.push(error),
+                Err(error) => rejected.push(error),
             }
         }
         entries.sort_by(|a, b| a.order(b));
-        for pair in entries.windows(2) {
-            if pair[0].order(&pair[1]).is_eq() {
-                files.push(EntryError::Duplicate {
-                    first: pair[0].path.clone(),
-                    second: pair[1].path.clone(),
-                    name: pair[0].metadata.name.clone(),
-                    version: pair[0].metadata.version.clone(),
+        entries.dedup_by(|second, first| {
+            let same = first.order(second).is_eq();
+            if same {
+                rejected.push(EntryError::Duplicate {
+                    first: first.path.clone(),
+                    second: second.path.clone(),
+                    name: first.metadata.name.clone(),
+                    version: first.metadata.version.clone(),
                 });
             }
-        }
+            same
+        });
+        Ok(Self { entries, rejected })
+    }
+}
+
+impl Store {
+    /// Reads every `*.onnx` file of a folder, each of which must be a model.
+    ///
+    /// # Errors
+    /// [`StoreError`] names every file that cannot be used, or the folder if there is none.
+    pub fn open(directory: &Path) -> Result<Self, StoreError> {
+        let Scan { entries, rejected } = Scan::read(directory)?;
         let directory = directory.to_owned();
-        if files.is_empty() { Ok(Self { directory, entries }) } else { Err(StoreError::Files { directory, files }) }
+        if rejected.is_empty() {
+            Ok(Self { directory, entries })
+        } else {
+            Err(StoreError::Files { directory, files: rejected })
+        }
+    }
+
+    /// The folder.
+    #[must_use]
+    pub fn directory(&self) -> &Path {
+        &self.directory
     }
 
     /// All models, by name, the versions of a name from the oldest to the newest.
@@ -166,14 +211,29 @@ impl Entry {
             Ok(metadata) => metadata,
             Err(source) => return Err(EntryError::Metadata { path, source }),
         };
-        let sha256 = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
-        Ok(Self { path, metadata, sha256 })
+        Ok(Self { path, metadata, sha256: sha256(&bytes) })
+    }
+
+    /// The file's bytes, unless they are others by now.
+    pub(crate) fn bytes(&self) -> Result<Vec<u8>, LoadReason> {
+        let bytes = fs::read(&self.path)?;
+        let found = sha256(&bytes);
+        if found == self.sha256 { Ok(bytes) } else { Err(LoadReason::Changed { expected: self.sha256.clone(), found }) }
     }
 
     fn order(&self, other: &Self) -> Ordering {
-        let (a, b) = (&self.metadata, &other.metadata);
-        a.name.cmp(&b.name).then_with(|| compare_versions(&a.version, &b.version))
+        self.metadata.name.cmp(&other.metadata.name).then_with(|| self.by_version(other))
     }
+
+    /// Which of two versions is the older: 1.9 is older than 1.10, and what is no number older than any.
+    #[must_use]
+    pub fn by_version(&self, other: &Self) -> Ordering {
+        compare_versions(&self.metadata.version, &other.metadata.version)
+    }
+}
+
+fn sha256(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// Part by part: numbers as numbers, so that 1.10 is newer than 1.9; anything else as text, older than any number.

@@ -10,11 +10,14 @@ use clap::Parser;
 use grasp_models::{Choice, Precision, Provider, Store};
 use tracing_subscriber::EnvFilter;
 
+use crate::folder::{Stamps, stamps};
 use crate::queue::Batching;
 
 /// Everything that can be set, checked.
 pub(crate) struct Config {
     pub store: Store,
+    /// Of the store's files, from before they were read.
+    pub stamps: Stamps,
     pub default_model: Option<String>,
     pub listen: SocketAddr,
     pub http: SocketAddr,
@@ -32,6 +35,8 @@ pub(crate) struct Config {
     pub queue: usize,
     /// How many volumes a session takes at once.
     pub batching: Batching,
+    /// How often it is looked whether the models have changed.
+    pub watch: Option<Duration>,
     pub max_message_bytes: usize,
     pub drain_timeout: Duration,
     pub log: String,
@@ -100,6 +105,11 @@ struct Flags {
     #[arg(long, env = "GRASPD_BATCH_DELAY", value_name = "MS", default_value = "0", allow_negative_numbers = true)]
     batch_delay: String,
 
+    /// How often it is looked whether files of the folder have changed, seconds: what is new is loaded and warmed up
+    /// beside what is served, then served instead. With 0 nobody looks; SIGHUP loads anew in any case.
+    #[arg(long, env = "GRASPD_WATCH", value_name = "SECONDS", default_value = "2", allow_negative_numbers = true)]
+    watch: String,
+
     /// Largest message that is taken, bytes.
     #[arg(long, env = "GRASPD_MAX_MESSAGE_BYTES", value_name = "N", default_value = "16777216")]
     max_message_bytes: String,
@@ -154,6 +164,8 @@ impl Config {
         let batch_delay = errors
             .parse("batch-delay", &flags.batch_delay, "a number of milliseconds, 0 or more")
             .map(|Seconds(milliseconds)| milliseconds / 1000);
+        let watch =
+            errors.parse("watch", &flags.watch, "a number of seconds, 0 or more").map(|Seconds(duration)| duration);
         let max_message_bytes = errors.parse("max-message-bytes", &flags.max_message_bytes, BYTES);
         let drain_timeout = errors
             .parse("drain-timeout", &flags.drain_timeout, "a number of seconds, 0 or more")
@@ -162,6 +174,7 @@ impl Config {
         if let Err(error) = EnvFilter::try_new(&flags.log) {
             errors.add("log", format_args!("is `{}`: {error}", flags.log));
         }
+        let stamps = flags.models.as_deref().map(stamps);
         let store = match flags.models {
             Some(models) => Store::open(&models).map_err(|error| errors.add("models", error)).ok(),
             None => {
@@ -178,6 +191,7 @@ impl Config {
         let config = || {
             Some(Self {
                 store: store?,
+                stamps: stamps?,
                 default_model: flags.default_model,
                 listen: listen?,
                 http: http?,
@@ -189,6 +203,7 @@ impl Config {
                 io_threads: cpus.min(4),
                 queue: queue?,
                 batching: Batching { max: max_batch?, delay: batch_delay? },
+                watch: watch.map(|every| Some(every).filter(|every| !every.is_zero()))?,
                 max_message_bytes: max_message_bytes.map(NonZeroUsize::get)?,
                 drain_timeout: drain_timeout?,
                 log: flags.log,

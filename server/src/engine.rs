@@ -1,7 +1,7 @@
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -11,10 +11,11 @@ use grasp_models::{Backend, Entry, Network, Options, RuntimeError};
 use nalgebra::Isometry3;
 use prometheus::{Histogram, IntGauge};
 use thiserror::Error;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::oneshot;
 use tracing::{Span, error, info};
 
 use crate::deadline::Deadline;
+use crate::metrics::Metrics;
 use crate::queue::{Batching, Full, Place, Queue};
 
 /// One model: its queue, and what is said of it. The sessions that take from the queue end when the engine is dropped.
@@ -50,12 +51,8 @@ pub(crate) struct Gauges {
 }
 
 /// The threads of every engine's sessions.
-pub(crate) struct Sessions {
-    threads: Vec<JoinHandle<()>>,
-    warm: mpsc::Receiver<Result<(), EngineError>>,
-    /// Held for the sessions that are still to be started.
-    report: mpsc::Sender<Result<(), EngineError>>,
-}
+#[derive(Default)]
+pub(crate) struct Sessions(Mutex<Vec<JoinHandle<()>>>);
 
 /// Why a volume was not taken.
 #[derive(Debug, Error)]
@@ -126,37 +123,31 @@ struct Job {
 struct Pace(AtomicU64);
 
 impl Engine {
-    /// Loads the model's sessions and starts them behind its queue.
-    pub fn start(
-        entry: Entry,
-        serving: &Serving,
-        gauges: impl FnOnce(&str) -> Gauges,
-        sessions: &mut Sessions,
-    ) -> anyhow::Result<Self> {
+    /// Loads the model's sessions, has each of them answer once, and starts them behind its queue.
+    pub fn start(entry: Entry, serving: &Serving, metrics: &Metrics, sessions: &Sessions) -> anyhow::Result<Self> {
         let Serving { workers, options, capacity, batching } = *serving;
         let label = format!("{} {}", entry.metadata.name, entry.metadata.version);
-        let Gauges { waiting, batch } = gauges(&label);
-        let pace = Arc::new(Pace(AtomicU64::new(0)));
+        let started = Instant::now();
+        let mut networks = Network::load_several(&entry, &options, workers)?;
+        let mut pace = Duration::ZERO;
+        for network in &mut networks {
+            pace = warm_up(network).with_context(|| format!("the model {label} cannot answer"))?;
+        }
+        let backend = networks[0].backend();
+        let Gauges { waiting, batch } = metrics.gauges(&label);
         let queue = Arc::new(Queue::new(workers, capacity, waiting));
-        // The first finds out what can run the model; the others are run by the same.
-        let first = Network::load(&entry.path, &options)?;
-        let (backend, threads) = (first.backend(), options.threads);
-        let mut loaded = Some(first);
-        for worker in 0..workers {
-            let session = Session {
-                network: loaded.take().map_or_else(|| Network::load_with(&entry.path, backend, threads), Ok)?,
-                queue: Arc::clone(&queue),
-                batching,
-                batch: batch.clone(),
-                pace: Arc::clone(&pace),
-            };
-            sessions.spawn(format!("{} {worker}", entry.metadata.name), session).with_context(|| {
-                format!("cannot start thread {worker} of {workers} for the model {label}; lower --workers")
+        // From here on it closes its queue when it goes, which is what ends the sessions that have been started.
+        let engine = Self { entry, label, backend, queue, pace: Arc::new(Pace::new(pace)) };
+        for (worker, network) in networks.into_iter().enumerate() {
+            let (queue, pace) = (Arc::clone(&engine.queue), Arc::clone(&engine.pace));
+            let session = Session { network, queue, batching, batch: batch.clone(), pace };
+            sessions.spawn(format!("{} {worker}", engine.entry.metadata.name), session).with_context(|| {
+                format!("cannot start thread {worker} of {workers} for the model {}; lower --workers", engine.label)
             })?;
         }
-        let Backend { provider, precision } = backend;
-        info!(model = label, sha256 = entry.sha256, %provider, %precision, workers, threads, "loaded");
-        Ok(Self { entry, label, backend, queue, pace })
+        let (Backend { provider, precision }, threads, took) = (backend, options.threads, started.elapsed());
+        info!(model = engine.label, sha256 = engine.entry.sha256, %provider, %precision, workers, threads, ?took, "loaded");
+        Ok(engine)
     }
 
     /// Queues a volume, or refuses at once.
@@ -186,33 +177,17 @@ impl Drop for Engine {
 }
 
 impl Sessions {
-    pub fn none() -> Self {
-        let (report, warm) = mpsc::channel(1);
-        Self { threads: Vec::new(), warm, report }
-    }
-
-    fn spawn(&mut self, name: String, session: Session) -> io::Result<()> {
-        let report = self.report.clone();
-        self.threads.push(thread::Builder::new().name(name).spawn(move || session.run(&report))?);
-        Ok(())
-    }
-
-    /// Waits until every session has answered once.
-    pub async fn warm(&mut self) -> Result<(), EngineError> {
-        for _ in &self.threads {
-            // `self` holds a sender, so there is always one to wait for.
-            if let Some(report) = self.warm.recv().await {
-                report?;
-            }
-        }
+    fn spawn(&self, name: String, session: Session) -> io::Result<()> {
+        let thread = thread::Builder::new().name(name).spawn(move || session.run())?;
+        let mut threads = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        threads.retain(|thread| !thread.is_finished());
+        threads.push(thread);
         Ok(())
     }
 
     /// Waits for the sessions to end, which they do once their engine is dropped.
-    pub fn join(self) {
-        let Self { threads, warm, report: _ } = self;
-        // Nobody listens any more: a session that has still to report that it is warm must not wait for it.
-        drop(warm);
+    pub fn join(&self) {
+        let threads = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
         for thread in threads {
             // A session catches its panics, and one that did not has nothing left to be waited for.
             let _ = thread.join();
@@ -230,9 +205,7 @@ struct Session {
 }
 
 impl Session {
-    fn run(mut self, report: &mpsc::Sender<Result<(), EngineError>>) {
-        // Nobody to report to: the server is stopping already, and the queue says so next.
-        let _ = report.blocking_send(self.warm_up());
+    fn run(mut self) {
         while let Some(mut jobs) = self.queue.take(self.batching) {
             let now = Instant::now();
             let expired = |job: &mut Job| job.deadline.is_some_and(|Deadline(deadline)| deadline <= now);
@@ -275,27 +248,31 @@ impl Session {
             let _ = reply.send(decoded.map(|decoded| Answer { decoded, queue, inference, postprocessing }));
         }
     }
+}
 
-    /// The first inference allocates and tunes; no caller should wait for that.
-    fn warm_up(&mut self) -> Result<(), EngineError> {
-        let metadata = self.network.metadata();
-        let values = vec![0.5; metadata.resolution.pow(3)];
-        let volume = Volume::new(metadata.resolution, metadata.voxel_size, Isometry3::identity(), values);
-        let params = metadata.decode_params();
-        let volume = volume.expect("metadata has a positive resolution and voxel size, and 0.5 is a surface");
-        let started = Instant::now();
-        let network = &mut self.network;
-        let warmed = caught(|| {
-            let output = network.infer(&[&volume])?;
-            decode(&volume, &output.maps(0), &params)?;
-            Ok(())
-        });
-        self.pace.set(started.elapsed());
-        warmed
-    }
+/// Has a network answer once, and says how long that took: the first inference allocates and tunes, no caller should
+/// wait for that.
+fn warm_up(network: &mut Network) -> Result<Duration, EngineError> {
+    let metadata = network.metadata();
+    let values = vec![0.5; metadata.resolution.pow(3)];
+    let volume = Volume::new(metadata.resolution, metadata.voxel_size, Isometry3::identity(), values);
+    let params = metadata.decode_params();
+    let volume = volume.expect("metadata has a positive resolution and voxel size, and 0.5 is a surface");
+    let started = Instant::now();
+    caught(|| {
+        let output = network.infer(&[&volume])?;
+        decode(&volume, &output.maps(0), &params)?;
+        Ok(started.elapsed())
+    })
 }
 
 impl Pace {
+    fn new(duration: Duration) -> Self {
+        let pace = Self(AtomicU64::new(0));
+        pace.set(duration);
+        pace
+    }
+
     fn set(&self, duration: Duration) {
         self.0.store(duration.as_micros().try_into().unwrap_or(u64::MAX), Ordering::Relaxed);
     }

@@ -3,6 +3,7 @@
 mod config;
 mod deadline;
 mod engine;
+mod folder;
 mod grpc;
 mod health;
 mod http;
@@ -26,11 +27,12 @@ use tracing::{error, info, warn};
 
 use crate::config::Config;
 use crate::engine::Sessions;
+use crate::folder::Folder;
 use crate::health::Readiness;
 use crate::metrics::Metrics;
 use crate::models::Models;
 use crate::service::Grasps;
-use crate::shutdown::Signals;
+use crate::shutdown::{Signals, hangup};
 
 fn main() -> ExitCode {
     let config = match Config::from_args() {
@@ -56,28 +58,28 @@ fn run(config: &Config) -> anyhow::Result<()> {
     info!(version = onnxruntime.version, library = %onnxruntime.library.display(), "ONNX Runtime");
 
     let metrics = Arc::new(Metrics::new());
-    let mut sessions = Sessions::none();
-    let served = load_and_serve(config, &metrics, &mut sessions);
+    let sessions = Arc::new(Sessions::default());
+    let served = serve_all(config, &metrics, &sessions);
     // Whatever happened, no session may still be inside ONNX Runtime when the process ends.
     sessions.join();
     served
 }
 
-/// From loading the models to the end of the runtime, and with it of the last way to reach the sessions.
-fn load_and_serve(config: &Config, metrics: &Arc<Metrics>, sessions: &mut Sessions) -> anyhow::Result<()> {
-    let models = Models::load(config, metrics, sessions)?;
+/// From the start of the runtime to its end, and with it of the last way to reach the sessions.
+fn serve_all(config: &Config, metrics: &Arc<Metrics>, sessions: &Arc<Sessions>) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(config.io_threads)
         .thread_name("grpc")
         .enable_all()
         .build()
         .context("cannot start the runtime's threads")?;
-    runtime.block_on(serve(config, models, sessions, metrics))
+    runtime.block_on(serve(config, metrics, sessions))
 }
 
 /// From binding the listeners to the end of the drain.
-async fn serve(config: &Config, models: Models, sessions: &mut Sessions, metrics: &Arc<Metrics>) -> anyhow::Result<()> {
+async fn serve(config: &Config, metrics: &Arc<Metrics>, sessions: &Arc<Sessions>) -> anyhow::Result<()> {
     let mut signals = Signals::new().context("cannot handle signals")?;
+    let hangup = hangup().context("cannot handle signals")?;
     let grpc = bind(config.listen, "--listen").await?;
     let http = bind(config.http, "--http").await?;
     announce(&format!("grpc listening on {}", grpc.local_addr()?));
@@ -85,12 +87,19 @@ async fn serve(config: &Config, models: Models, sessions: &mut Sessions, metrics
 
     let readiness = Readiness::starting();
     let state = readiness.subscribe();
+    let models = Arc::new(Models::default());
     let http = tokio::spawn(http::serve(http, Arc::clone(metrics), state.clone()));
-    let service = Grasps::new(Arc::new(models), Arc::clone(metrics), state.clone());
-    let mut grpc = tokio::spawn(grpc::serve(grpc, config.max_message_bytes, service, state));
+    let service = Grasps::new(Arc::clone(&models), Arc::clone(metrics), state.clone());
+    let mut grpc = tokio::spawn(grpc::serve(grpc, config.max_message_bytes, service, state.clone()));
 
+    let folder = Folder::new(config, models, Arc::clone(sessions), Arc::clone(metrics));
+    let entries = config.store.entries().to_vec();
+    let mut loading = tokio::task::spawn_blocking(move || folder.load(&entries, &state).map(|()| folder));
     let stopped = tokio::select! {
-        warm = sessions.warm() => { warm?; false }
+        loaded = &mut loading => {
+            tokio::spawn(loaded.context("loading the models panicked")??.watch(hangup, config.watch));
+            false
+        }
         () = signals.next() => true,
     };
     if !stopped {

@@ -1,8 +1,12 @@
+use std::sync::Arc;
+
 use grasp_models::Backend;
-use prometheus::{HistogramOpts, HistogramVec, IntCounterVec, IntGaugeVec, Opts, Registry, TEXT_FORMAT, TextEncoder};
+use prometheus::{
+    HistogramOpts, HistogramVec, IntCounterVec, IntGauge, IntGaugeVec, Opts, Registry, TEXT_FORMAT, TextEncoder,
+};
 use tonic::Code;
 
-use crate::engine::Gauges;
+use crate::engine::{Engine, Gauges};
 use crate::timings::Timings;
 
 /// Seconds. Dense from a cached wake-up to a large network on a slow CPU.
@@ -23,6 +27,8 @@ pub(crate) struct Metrics {
     waiting: IntGaugeVec,
     batches: HistogramVec,
     models: IntGaugeVec,
+    reloads: IntCounterVec,
+    rejected: IntGauge,
 }
 
 impl Metrics {
@@ -57,14 +63,29 @@ impl Metrics {
                 &["model", "provider", "precision", "sha256"],
             )
             .expect(VALID),
+            reloads: IntCounterVec::new(
+                Opts::new(
+                    "graspd_reloads_total",
+                    "How often the folder of models was read anew: ok, or failed where not all of it can be served.",
+                ),
+                &["outcome"],
+            )
+            .expect(VALID),
+            rejected: IntGauge::new(
+                "graspd_rejected_files",
+                "Model files that cannot be served, as of the last reload.",
+            )
+            .expect(VALID),
         };
-        let Self { registry, stages, requests, grasps, waiting, batches, models } = &metrics;
+        let Self { registry, stages, requests, grasps, waiting, batches, models, reloads, rejected } = &metrics;
         registry.register(Box::new(stages.clone())).expect(VALID);
         registry.register(Box::new(requests.clone())).expect(VALID);
         registry.register(Box::new(grasps.clone())).expect(VALID);
         registry.register(Box::new(waiting.clone())).expect(VALID);
         registry.register(Box::new(batches.clone())).expect(VALID);
         registry.register(Box::new(models.clone())).expect(VALID);
+        registry.register(Box::new(reloads.clone())).expect(VALID);
+        registry.register(Box::new(rejected.clone())).expect(VALID);
         metrics
     }
 
@@ -82,10 +103,29 @@ impl Metrics {
         self.requests.with_label_values(&[model, code_name(code)]).inc();
     }
 
-    /// A model is served.
-    pub fn loaded(&self, model: &str, backend: Backend, sha256: &str) {
-        let Backend { provider, precision } = backend;
-        self.models.with_label_values(&[model, provider.name(), precision.name(), sha256]).set(1);
+    /// Other models are served than before.
+    pub fn replaced(&self, before: &[Arc<Engine>], now: &[Arc<Engine>]) {
+        let labels = |engine: &Engine| {
+            let Backend { provider, precision } = engine.backend;
+            [engine.label.clone(), provider.to_string(), precision.to_string(), engine.entry.sha256.clone()]
+        };
+        let now: Vec<_> = now.iter().map(|engine| labels(engine)).collect();
+        for labels in &now {
+            self.models.with_label_values(labels).set(1);
+        }
+        for gone in before.iter().map(|engine| labels(engine)).filter(|labels| !now.contains(labels)) {
+            // It was there, as whatever is served is.
+            let _ = self.models.remove_label_values(&gone.each_ref().map(String::as_str));
+        }
+    }
+
+    /// The folder of models was read anew; so many of its files, or the whole of it, cannot be served.
+    pub fn reloaded(&self, outcome: Result<usize, ()>) {
+        let name = if outcome == Ok(0) { "ok" } else { "failed" };
+        self.reloads.with_label_values(&[name]).inc();
+        if let Ok(rejected) = outcome {
+            self.rejected.set(rejected as i64);
+        }
     }
 
     /// What is measured of a model's queue.

@@ -1,61 +1,64 @@
+use std::sync::{Arc, PoisonError, RwLock};
+
 use grasp::Volume;
-use grasp_models::Options;
 use grasp_proto::{FieldError, pb};
 
-use crate::config::Config;
-use crate::engine::{Engine, Serving, Sessions};
-use crate::metrics::Metrics;
+use crate::engine::Engine;
 use crate::refusal::Refusal;
 
-/// Every model that is served: the default first, then by name, the newest version of a name before the older ones.
-pub(crate) struct Models(Vec<Engine>);
+/// The models that are served now.
+#[derive(Default)]
+pub(crate) struct Models(RwLock<Engines>);
+
+/// The default first, then by name, the newest version of a name before the older ones.
+pub(crate) type Engines = Arc<[Arc<Engine>]>;
 
 impl Models {
-    /// Loads what the store holds and starts `sessions`, which run until the models are dropped.
-    pub fn load(config: &Config, metrics: &Metrics, sessions: &mut Sessions) -> anyhow::Result<Self> {
-        let mut entries = config.store.entries().to_vec();
-        // The store has the oldest version of a name first; the sort is stable.
-        entries.reverse();
-        entries.sort_by_key(|entry| {
-            let name = entry.metadata.name.clone();
-            (config.default_model.as_ref() != Some(&name), name)
+    /// What is served at this moment. Whoever holds it can still ask it, even if others are served meanwhile.
+    pub fn now(&self) -> Engines {
+        Arc::clone(&self.0.read().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// From now on serves these.
+    pub fn replace(&self, mut engines: Vec<Arc<Engine>>, default: Option<&str>) {
+        // From the newest version to the oldest, as the sort by name is stable.
+        engines.sort_by(|a, b| b.entry.by_version(&a.entry));
+        engines.sort_by_key(|engine| {
+            let name = engine.entry.metadata.name.clone();
+            (default != Some(&name), name)
         });
-        let Config { workers, threads, provider, precision, queue, batching, .. } = *config;
-        let options = Options { threads, provider, precision };
-        let serving = Serving { workers, options, capacity: queue, batching };
-        let engines =
-            entries.into_iter().map(|entry| Engine::start(entry, &serving, |label| metrics.gauges(label), sessions));
-        let models = Self(engines.collect::<Result<_, _>>()?);
-        models.0.iter().for_each(|engine| metrics.loaded(&engine.label, engine.backend, &engine.entry.sha256));
-        Ok(models)
+        *self.0.write().unwrap_or_else(PoisonError::into_inner) = engines.into();
     }
 
     /// The model that a request asks for, if it takes volumes of that resolution.
-    pub fn select(&self, name: &str, version: &str, resolution: usize) -> Result<&Engine, Refusal> {
-        let fits = |engine: &&Engine| engine.entry.metadata.resolution == resolution;
+    pub fn select(&self, name: &str, version: &str, resolution: usize) -> Result<Arc<Engine>, Refusal> {
+        let served = self.now();
+        let fits = |engine: &&Arc<Engine>| engine.entry.metadata.resolution == resolution;
         if name.is_empty() {
             if !version.is_empty() {
                 let needed = "which needs a `model` that it is a version of";
                 return Err(FieldError::new("version", format_args!("`{version}`"), needed).into());
             }
-            let taken = || self.describe(|engine| format!("{} ({})", engine.entry.metadata.resolution, engine.label));
-            return self.0.iter().find(fits).ok_or_else(|| wrong_resolution(resolution, &taken()));
+            let taken =
+                || describe(&served, |engine| format!("{} ({})", engine.entry.metadata.resolution, engine.label));
+            let engine = served.iter().find(fits).cloned();
+            return engine.ok_or_else(|| wrong_resolution(resolution, &taken()));
         }
-        let is_named = |engine: &&Engine| {
+        let is_named = |engine: &&Arc<Engine>| {
             let metadata = &engine.entry.metadata;
             metadata.name == name && (version.is_empty() || metadata.version == version)
         };
-        let engine = self.0.iter().find(is_named).ok_or_else(|| Refusal::UnknownModel {
+        let engine = served.iter().find(is_named).ok_or_else(|| Refusal::UnknownModel {
             wanted: format!("{name} {version}").trim_end().to_owned(),
-            available: self.describe(|engine| engine.label.clone()),
+            available: describe(&served, |engine| engine.label.clone()),
         })?;
         let taken = format!("{} ({})", engine.entry.metadata.resolution, engine.label);
-        Some(engine).filter(fits).ok_or_else(|| wrong_resolution(resolution, &taken))
+        Some(engine).filter(fits).cloned().ok_or_else(|| wrong_resolution(resolution, &taken))
     }
+}
 
-    fn describe(&self, engine: impl Fn(&Engine) -> String) -> String {
-        self.0.iter().map(engine).collect::<Vec<_>>().join(", ")
-    }
+fn describe(served: &[Arc<Engine>], engine: impl Fn(&Engine) -> String) -> String {
+    served.iter().map(|served| engine(served)).collect::<Vec<_>>().join(", ")
 }
 
 /// A network trained for voxels of one size sees the world scaled when they have another.
@@ -74,7 +77,7 @@ fn wrong_resolution(resolution: usize, taken: &str) -> Refusal {
 
 impl From<&Models> for pb::ListModelsResponse {
     fn from(models: &Models) -> Self {
-        Self { models: models.0.iter().map(pb::Model::from).collect() }
+        Self { models: models.now().iter().map(|engine| (&**engine).into()).collect() }
     }
 }
 

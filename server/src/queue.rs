@@ -53,7 +53,8 @@ pub(crate) enum Full {
 }
 
 impl<T> Queue<T> {
-    /// A queue of so many sessions, in which `capacity` jobs may wait, and of which `gauge` says how many do.
+    /// A queue of so many sessions, in which `capacity` jobs may wait. They are counted in `gauge`, beside those of
+    /// other queues that share it, as a model's old and new sessions do.
     pub fn new(sessions: usize, capacity: usize, gauge: IntGauge) -> Self {
         let state = State { waiting: VecDeque::new(), next: 0, free: sessions, closed: false };
         Self { state: Mutex::new(state), changed: Condvar::new(), capacity, gauge }
@@ -72,7 +73,7 @@ impl<T> Queue<T> {
         let number = state.next;
         state.next += 1;
         state.waiting.push_back(Waiting { number, since: Instant::now(), job });
-        self.show(&state);
+        self.gauge.inc();
         drop(state);
         self.changed.notify_one();
         Ok(Place { queue: Arc::clone(self), number })
@@ -90,7 +91,7 @@ impl<T> Queue<T> {
         state.free -= 1;
         let count = state.waiting.len().min(batching.max);
         let jobs: Vec<T> = state.waiting.drain(..count).map(|waiting| waiting.job).collect();
-        self.show(&state);
+        self.gauge.sub(count as i64);
         let (left, ended) = (!state.waiting.is_empty(), state.closed && jobs.is_empty());
         drop(state);
         if left {
@@ -130,12 +131,8 @@ impl<T> Queue<T> {
         // Sorted by number, as they came.
         if let Ok(index) = state.waiting.binary_search_by_key(&number, |waiting| waiting.number) {
             state.waiting.remove(index);
-            self.show(&state);
+            self.gauge.dec();
         }
-    }
-
-    fn show(&self, state: &State<T>) {
-        self.gauge.set(state.waiting.len() as i64);
     }
 
     /// A panic cannot leave it half changed: nothing that could panic is done with it.

@@ -98,7 +98,7 @@ impl Grasps {
 
         let params = decode_params(&request, engine.entry.metadata.decode_params())?;
         let checked = Volume::try_from(volume)?;
-        check_voxel_size(&checked, engine)?;
+        check_voxel_size(&checked, &engine)?;
         let preprocessing = call.started.elapsed();
         let reply = engine.submit(checked, params, call.deadline, call.span.clone())?;
 

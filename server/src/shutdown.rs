@@ -22,3 +22,8 @@ impl Signals {
         }
     }
 }
+
+/// SIGHUP, which no longer ends the process either: whoever sends it wants the models loaded anew.
+pub(crate) fn hangup() -> io::Result<Signal> {
+    signal(SignalKind::hangup())
+}

@@ -1,0 +1,150 @@
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use grasp_models::{Entry, Options, Scan};
+use tokio::signal::unix::Signal;
+use tokio::sync::watch;
+use tracing::{error, info, warn};
+
+use crate::config::Config;
+use crate::engine::{Engine, Serving, Sessions};
+use crate::health::State;
+use crate::metrics::Metrics;
+use crate::models::Models;
+
+/// Brings the models of a folder into service, and keeps them as the folder has them.
+pub(crate) struct Folder {
+    directory: PathBuf,
+    /// From before it was read first.
+    stamps: Stamps,
+    default_model: Option<String>,
+    serving: Serving,
+    models: Arc<Models>,
+    sessions: Arc<Sessions>,
+    metrics: Arc<Metrics>,
+}
+
+impl Folder {
+    pub fn new(config: &Config, models: Arc<Models>, sessions: Arc<Sessions>, metrics: Arc<Metrics>) -> Self {
+        let Config { workers, threads, provider, precision, queue, batching, .. } = *config;
+        let options = Options { threads, provider, precision };
+        let serving = Serving { workers, options, capacity: queue, batching };
+        let (directory, default_model) = (config.store.directory().to_owned(), config.default_model.clone());
+        let stamps = config.stamps.clone();
+        Self { directory, stamps, default_model, serving, models, sessions, metrics }
+    }
+
+    /// Serves all of these, or says which cannot be served; or gives up where the process is to stop meanwhile.
+    pub fn load(&self, entries: &[Entry], state: &watch::Receiver<State>) -> anyhow::Result<()> {
+        let mut engines = Vec::new();
+        for entry in entries {
+            if *state.borrow() == State::Draining {
+                return Ok(());
+            }
+            engines.push(self.start(entry.clone())?);
+        }
+        self.replace(engines);
+        Ok(())
+    }
+
+    /// Reads the folder anew at SIGHUP, and whenever its files have changed and then stayed the same from one look to
+    /// the next: who is still writing one is not disturbed. Without `every` nobody looks.
+    pub async fn watch(self, mut hangup: Signal, every: Option<Duration>) {
+        let folder = Arc::new(self);
+        let mut loaded = folder.stamps.clone();
+        let mut last = loaded.clone();
+        loop {
+            let told = tokio::select! {
+                _ = hangup.recv() => true,
+                () = tokio::time::sleep(every.unwrap_or_default()), if every.is_some() => false,
+            };
+            let now = stamps(&folder.directory);
+            if told || (now != loaded && now == last) {
+                let reloading = Arc::clone(&folder);
+                if let Err(panic) = tokio::task::spawn_blocking(move || reloading.reload()).await {
+                    error!(%panic, "the models could not be loaded anew");
+                    folder.metrics.reloaded(Err(()));
+                }
+                loaded.clone_from(&now);
+            }
+            last = now;
+        }
+    }
+
+    /// Loads what is new and warms it up beside what is served, then serves it instead. A file that cannot be served
+    /// changes nothing: what it held before goes on being served.
+    fn reload(&self) {
+        let Scan { entries, rejected } = match Scan::read(&self.directory) {
+            Ok(scan) => scan,
+            Err(error) => {
+                error!(%error, "the models stay as they are");
+                return self.metrics.reloaded(Err(()));
+            }
+        };
+        let served = self.models.now();
+        let mut refused: Vec<PathBuf> = Vec::new();
+        for error in rejected {
+            error!(%error, "cannot be served, what it held before is kept");
+            refused.push(error.path().to_owned());
+        }
+        let mut engines = Vec::new();
+        for entry in entries {
+            if let Some(engine) = served.iter().find(|engine| engine.entry == entry) {
+                engines.push(Arc::clone(engine));
+                continue;
+            }
+            let path = entry.path.clone();
+            match self.start(entry) {
+                Ok(engine) => engines.push(engine),
+                Err(error) => {
+                    error!(error = format!("{error:#}"), "cannot be served, what it held before is kept");
+                    refused.push(path);
+                }
+            }
+        }
+        let kept = served.iter().filter(|engine| refused.contains(&engine.entry.path));
+        for kept in kept.cloned().collect::<Vec<_>>() {
+            if !engines.iter().any(|engine| engine.label == kept.label) {
+                engines.push(kept);
+            }
+        }
+        self.metrics.reloaded(Ok(refused.len()));
+        if engines.is_empty() {
+            warn!("nothing in the folder can be served, the models stay as they are");
+        } else {
+            self.replace(engines);
+        }
+    }
+
+    fn start(&self, entry: Entry) -> anyhow::Result<Arc<Engine>> {
+        Engine::start(entry, &self.serving, &self.metrics, &self.sessions).map(Arc::new)
+    }
+
+    fn replace(&self, engines: Vec<Arc<Engine>>) {
+        let before = self.models.now();
+        self.models.replace(engines, self.default_model.as_deref());
+        let now = self.models.now();
+        self.metrics.replaced(&before, &now);
+        for gone in before.iter().filter(|engine| !now.iter().any(|other| Arc::ptr_eq(engine, other))) {
+            info!(model = gone.label, sha256 = gone.entry.sha256, "no longer served");
+        }
+    }
+}
+
+/// What tells a folder's model files from other ones without reading them: name, time of the last change, size.
+pub(crate) type Stamps = Vec<(PathBuf, Option<SystemTime>, u64)>;
+
+pub(crate) fn stamps(directory: &Path) -> Stamps {
+    let stamp = |path: PathBuf| {
+        // Of what a link leads to: Kubernetes swaps links.
+        let metadata = fs::metadata(&path).ok()?;
+        Some((path, metadata.modified().ok(), metadata.len()))
+    };
+    let files = fs::read_dir(directory).into_iter().flatten().flatten().map(|file| file.path());
+    let models = files.filter(|path| path.extension().is_some_and(|extension| extension == "onnx"));
+    let mut stamps: Vec<_> = models.filter_map(stamp).collect();
+    stamps.sort();
+    stamps
+}

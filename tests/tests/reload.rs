@@ -1,0 +1,137 @@
+//! Models that change while they are served.
+
+use std::fs;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+
+use grasp::Volume;
+use grasp_client::{Client, Options};
+use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
+use nalgebra::Isometry3;
+use tokio::task::JoinSet;
+
+const NO_WATCH: &[&str] = &["--watch", "0"];
+const WATCH: &[&str] = &["--watch", "0.05"];
+
+fn volume() -> Volume {
+    blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]])
+}
+
+/// The version that answers who names none.
+async fn newest(client: &Client) -> String {
+    client.detect(&volume(), Options::default()).await.unwrap().version
+}
+
+/// Who is served, as `name version`.
+async fn served(client: &Client) -> Vec<String> {
+    let models = client.list_models().await.unwrap();
+    models.into_iter().map(|model| format!("{} {}", model.name, model.version)).collect()
+}
+
+#[tokio::test]
+async fn a_new_version_is_served_at_sighup_and_the_old_one_stays_for_who_asks_for_it() {
+    let server = Server::run(&[TestModel::new("mirror")], NO_WATCH);
+    let client = server.client().await;
+    TestModel::new("mirror").version("2").write(server.models());
+    assert_eq!(newest(&client).await, "1");
+    server.reload().unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
+    assert_eq!(newest(&client).await, "2");
+    assert_eq!(served(&client).await, ["mirror 2", "mirror 1"]);
+    let old = Options { model: "mirror".into(), version: "1".into(), ..Options::default() };
+    assert_eq!(client.detect(&volume(), old).await.unwrap().version, "1");
+}
+
+#[tokio::test]
+async fn a_folder_that_is_watched_needs_no_signal() {
+    let server = Server::run(&[TestModel::new("mirror")], WATCH);
+    let client = server.client().await;
+    TestModel::new("mirror").version("2").write(server.models());
+    server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
+    assert_eq!(newest(&client).await, "2");
+    fs::remove_file(server.models().join("mirror-1.onnx")).unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 2.0).await;
+    assert_eq!(served(&client).await, ["mirror 2"]);
+    let (_, metrics) = server.get("/metrics");
+    let infos = metrics.lines().filter(|line| line.starts_with("graspd_model_info{"));
+    assert_eq!(infos.count(), 1, "{metrics}");
+}
+
+#[tokio::test]
+async fn what_cannot_be_served_changes_nothing_and_is_told() {
+    let server = Server::run(&[TestModel::new("mirror")], NO_WATCH);
+    let client = server.client().await;
+    let path = server.models().join("mirror-1.onnx");
+    let whole = fs::read(&path).unwrap();
+    let before = client.list_models().await.unwrap();
+
+    let mut other_signature = whole.clone();
+    let outputs = (0..whole.len()).filter(|&at| whole[at..].starts_with(b"quality"));
+    outputs.for_each(|at| other_signature[at + 6] = b'x');
+    let bad = [whole[..whole.len() / 2].to_vec(), other_signature, Vec::new()];
+    for (failed, bytes) in bad.into_iter().enumerate() {
+        fs::write(&path, bytes).unwrap();
+        server.reload().unwrap();
+        server.wait_for("graspd_reloads_total{outcome=\"failed\"}", failed as f64 + 1.0).await;
+        assert_eq!(server.metric("graspd_rejected_files"), 1.0);
+        assert_eq!(newest(&client).await, "1");
+        assert_eq!(client.list_models().await.unwrap(), before);
+    }
+    // What is good beside it is served all the same.
+    TestModel::new("mirror").version("2").write(server.models());
+    server.reload().unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 4.0).await;
+    assert_eq!(served(&client).await, ["mirror 2", "mirror 1"]);
+
+    // And all is well again.
+    fs::write(&path, whole).unwrap();
+    server.reload().unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
+    assert_eq!(server.metric("graspd_rejected_files"), 0.0);
+}
+
+#[tokio::test]
+async fn a_folder_that_is_gone_changes_nothing() {
+    let server = Server::run(&[TestModel::new("mirror")], WATCH);
+    let client = server.client().await;
+    fs::remove_file(server.models().join("mirror-1.onnx")).unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 1.0).await;
+    assert_eq!(newest(&client).await, "1");
+}
+
+#[tokio::test]
+async fn nobody_who_asks_while_models_are_swapped_notices() {
+    let model = TestModel::new("mirror").convolutions(2);
+    let server = Server::run(&[model.clone()], &["--watch", "0", "--queue", "16", "--workers", "2"]);
+    let (stop, answered) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicUsize::new(0)));
+    let mut callers = JoinSet::new();
+    for _ in 0..4 {
+        let (client, stop, answered) = (server.client().await, Arc::clone(&stop), Arc::clone(&answered));
+        callers.spawn(async move {
+            while !stop.load(Ordering::Relaxed) {
+                let detection = client.detect(&volume(), Options::default()).await.unwrap();
+                assert_eq!(detection.grasps.len(), 1);
+                answered.fetch_add(1, Ordering::Relaxed);
+            }
+        });
+    }
+    for version in 2..8 {
+        model.clone().version(&version.to_string()).write(server.models());
+        fs::remove_file(server.models().join(format!("mirror-{}.onnx", version - 1))).unwrap();
+        server.reload().unwrap();
+        server.wait_for("graspd_reloads_total{outcome=\"ok\"}", f64::from(version) - 1.0).await;
+        assert_eq!(newest(&server.client().await).await, version.to_string());
+        let before = answered.load(Ordering::Relaxed);
+        while answered.load(Ordering::Relaxed) < before + 20 {
+            tokio::task::yield_now().await;
+        }
+    }
+    stop.store(true, Ordering::Relaxed);
+    callers.join_all().await;
+    let count = |version: u32, code: &str| {
+        server.metric(&format!("graspd_requests_total{{code=\"{code}\",model=\"mirror {version}\"}}"))
+    };
+    assert!((1..8).all(|version| count(version, "OK") > 0.0), "every version has answered");
+    let waiting = |version: u32| server.metric(&format!("graspd_queue_requests{{model=\"mirror {version}\"}}"));
+    assert!((1..8).all(|version| waiting(version) == 0.0));
+}
