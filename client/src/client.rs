@@ -7,12 +7,14 @@ use grasp_proto::pb::grasp_service_client::GraspServiceClient;
 use tokio::time::{Instant, sleep, timeout_at};
 use tokio_stream::{Stream, StreamExt};
 use tonic::Code;
+use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
-use crate::{Detection, Error, Options};
+use crate::access::{Bearer, may_pass};
+use crate::{Access, Detection, Error, Options, Retry};
 
 /// Several replies in flight on one connection must not wait for HTTP/2's windows of 64 KiB.
 const WINDOW: u32 = 4 << 20;
@@ -24,6 +26,8 @@ const POLL: Duration = Duration::from_millis(50);
 #[derive(Clone, Debug)]
 pub struct Client {
     channel: Channel,
+    bearer: Bearer,
+    retry: Retry,
 }
 
 /// What a server says of itself.
@@ -41,14 +45,27 @@ impl Client {
     /// # Errors
     /// [`Error::Connect`] when nobody listens there.
     pub async fn connect(address: impl Into<String>) -> Result<Self, Error> {
+        Self::connect_with(address, Access::default()).await
+    }
+
+    /// Connects where more than the address is needed.
+    ///
+    /// # Errors
+    /// [`Error::Connect`] when nobody listens there, or the two do not come to terms over TLS.
+    pub async fn connect_with(address: impl Into<String>, access: Access) -> Result<Self, Error> {
         let address = address.into();
-        let uri = if address.contains("://") { address.clone() } else { format!("http://{address}") };
+        let tls = access.tls(&address);
+        let scheme = if tls.is_some() { "https" } else { "http" };
+        let uri = if address.contains("://") { address.clone() } else { format!("{scheme}://{address}") };
         let connect = async || {
-            let endpoint = Endpoint::from_shared(uri)?;
+            let mut endpoint = Endpoint::from_shared(uri)?;
+            if let Some(tls) = tls {
+                endpoint = endpoint.tls_config(tls)?;
+            }
             endpoint.initial_stream_window_size(WINDOW).initial_connection_window_size(WINDOW).connect().await
         };
         let channel = connect().await.map_err(|source| Error::Connect { address, source })?;
-        Ok(Self { channel })
+        Ok(Self { channel, bearer: Bearer(access.token), retry: access.retry })
     }
 
     /// Connects to a server that may still be starting, and returns once it is ready.
@@ -76,13 +93,31 @@ impl Client {
         }
     }
 
-    /// Asks for the grasps in a volume.
+    /// Asks for the grasps in a volume, as often as [`Retry`] has it.
     ///
     /// # Errors
-    /// [`Error::Refused`] with the server's status.
+    /// [`Error::Refused`] with the last status.
     pub async fn detect(&self, volume: &Volume, options: Options) -> Result<Detection, Error> {
-        let response = self.grasps().detect_grasps(options.request(volume)).await?;
-        response.into_inner().try_into()
+        let timeout = options.timeout;
+        let message = options.request(volume);
+        let mut attempts = 0;
+        loop {
+            let mut request = tonic::Request::new(message.clone());
+            if let Some(timeout) = timeout {
+                request.set_timeout(timeout);
+            }
+            let status = match self.grasps().detect_grasps(request).await {
+                Ok(response) => return response.into_inner().try_into(),
+                Err(status) => status,
+            };
+            attempts += 1;
+            let may_pass = may_pass(&status);
+            let error = Error::from(status);
+            match self.retry.pause(attempts, error.retry_after()) {
+                Some(pause) if may_pass => sleep(pause).await,
+                _ => return Err(error),
+            }
+        }
     }
 
     /// Asks for the grasps in each of a stream of volumes; one answer comes for each, in their order. A volume that is
@@ -130,8 +165,9 @@ impl Client {
         })
     }
 
-    fn grasps(&self) -> GraspServiceClient<Channel> {
+    fn grasps(&self) -> GraspServiceClient<InterceptedService<Channel, Bearer>> {
         // A reply holds grasps, never volumes, but with a low threshold there may be thousands of them.
-        GraspServiceClient::new(self.channel.clone()).max_decoding_message_size(WINDOW as usize)
+        let service = GraspServiceClient::with_interceptor(self.channel.clone(), self.bearer.clone());
+        service.max_decoding_message_size(WINDOW as usize)
     }
 }

@@ -1,4 +1,4 @@
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use grasp::{Grasp, Volume};
 use grasp_proto::{encode, pb};
@@ -28,6 +28,8 @@ pub struct Options {
     pub stamp: Option<SystemTime>,
     /// How the values travel: F32 (also when unspecified), or half or a quarter of it.
     pub dtype: pb::DataType,
+    /// How long each attempt may take, as the server is told, too.
+    pub timeout: Option<Duration>,
 }
 
 /// The answer to a volume.

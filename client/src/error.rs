@@ -49,6 +49,15 @@ impl Error {
             Self::Connect { .. } | Self::NotReady { .. } | Self::Reply(_) => None,
         }
     }
+
+    /// When it is worth coming back, where the server says so.
+    #[must_use]
+    pub fn retry_after(&self) -> Option<Duration> {
+        match self {
+            Self::Refused { retry_after, .. } => *retry_after,
+            Self::Connect { .. } | Self::NotReady { .. } | Self::Reply(_) => None,
+        }
+    }
 }
 
 impl From<Status> for Error {

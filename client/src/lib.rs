@@ -3,13 +3,16 @@
 //! [`Client`] speaks `grasp.v1` in the types of the domain: a [`grasp::Volume`] in, a [`Detection`] with
 //! [`grasp::Grasp`]s out. [`LocalServer`] runs a server of one's own for as long as it is needed.
 
+mod access;
 mod client;
 mod detection;
 mod error;
 mod local;
 
+pub use access::{Access, Retry, Token};
 pub use client::{Client, Health};
 pub use detection::{Detection, Options};
 pub use error::Error;
 pub use grasp_proto::pb::{DataType, Dropped, Latency, Model};
 pub use local::{LocalServer, LocalServerError};
+pub use tonic::transport::{Certificate, Identity};

@@ -1,16 +1,21 @@
 use std::fmt::{self, Display};
+use std::fs;
 use std::net::SocketAddr;
 use std::num::NonZeroUsize;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
+use std::sync::Arc;
 use std::thread::available_parallelism;
 use std::time::Duration;
 
 use clap::Parser;
 use grasp_models::{Choice, Precision, Provider, Store};
+use tonic::transport::{Certificate, Identity, ServerTlsConfig};
 use tracing_subscriber::EnvFilter;
 
+use crate::auth::Tokens;
 use crate::folder::{Stamps, stamps};
+use crate::intake::Limits;
 use crate::queue::Batching;
 
 /// Everything that can be set, checked.
@@ -37,7 +42,11 @@ pub(crate) struct Config {
     pub batching: Batching,
     /// How often it is looked whether the models have changed.
     pub watch: Option<Duration>,
-    pub max_message_bytes: usize,
+    /// The server's certificate, and whose clients it takes.
+    pub tls: Option<ServerTlsConfig>,
+    pub tokens: Option<Arc<Tokens>>,
+    pub max_connections: usize,
+    pub limits: Limits,
     pub drain_timeout: Duration,
     pub log: String,
     pub log_format: LogFormat,
@@ -110,6 +119,37 @@ struct Flags {
     #[arg(long, env = "GRASPD_WATCH", value_name = "SECONDS", default_value = "2", allow_negative_numbers = true)]
     watch: String,
 
+    /// Certificate that the gRPC listener shows, with those between it and its CA, PEM. With it TLS is spoken, alone.
+    #[arg(long, env = "GRASPD_TLS_CERT", value_name = "FILE")]
+    tls_cert: Option<PathBuf>,
+
+    /// The certificate's private key, PEM.
+    #[arg(long, env = "GRASPD_TLS_KEY", value_name = "FILE")]
+    tls_key: Option<PathBuf>,
+
+    /// Take only clients that show a certificate of one of these CAs, PEM.
+    #[arg(long, env = "GRASPD_TLS_CLIENT_CA", value_name = "FILE")]
+    tls_client_ca: Option<PathBuf>,
+
+    /// Take only requests that bring one of the tokens in this file, one in a line, as `authorization: Bearer TOKEN`.
+    /// SIGHUP reads it anew. Health is told without.
+    #[arg(long, env = "GRASPD_TOKEN_FILE", value_name = "FILE")]
+    token_file: Option<PathBuf>,
+
+    /// Connections that may be open at a time. Further ones are closed at once.
+    #[arg(long, env = "GRASPD_MAX_CONNECTIONS", value_name = "N", default_value = "16384")]
+    max_connections: String,
+
+    /// How long a message may stand still in the middle, seconds.
+    #[arg(
+        long,
+        env = "GRASPD_STALL_TIMEOUT",
+        value_name = "SECONDS",
+        default_value = "10",
+        allow_negative_numbers = true
+    )]
+    stall_timeout: String,
+
     /// Largest message that is taken, bytes.
     #[arg(long, env = "GRASPD_MAX_MESSAGE_BYTES", value_name = "N", default_value = "16777216")]
     max_message_bytes: String,
@@ -167,6 +207,14 @@ impl Config {
         let watch =
             errors.parse("watch", &flags.watch, "a number of seconds, 0 or more").map(|Seconds(duration)| duration);
         let max_message_bytes = errors.parse("max-message-bytes", &flags.max_message_bytes, BYTES);
+        let max_connections =
+            errors.parse::<NonZeroUsize>("max-connections", &flags.max_connections, "a whole number above 0");
+        let stall = errors
+            .parse("stall-timeout", &flags.stall_timeout, "a number of seconds, 0 or more")
+            .map(|Seconds(duration)| duration);
+        let tls = errors.tls(flags.tls_cert.as_deref(), flags.tls_key.as_deref(), flags.tls_client_ca.as_deref());
+        let tokens = flags.token_file.map(Tokens::read).transpose();
+        let tokens = tokens.map_err(|error| errors.add("token-file", format_args!("{error:#}"))).ok();
         let drain_timeout = errors
             .parse("drain-timeout", &flags.drain_timeout, "a number of seconds, 0 or more")
             .map(|Seconds(duration)| duration);
@@ -204,7 +252,10 @@ impl Config {
                 queue: queue?,
                 batching: Batching { max: max_batch?, delay: batch_delay? },
                 watch: watch.map(|every| Some(every).filter(|every| !every.is_zero()))?,
-                max_message_bytes: max_message_bytes.map(NonZeroUsize::get)?,
+                tls: tls?,
+                tokens: tokens?.map(Arc::new),
+                max_connections: max_connections.map(NonZeroUsize::get)?,
+                limits: Limits { message_bytes: max_message_bytes.map(NonZeroUsize::get)?, stall: stall? },
                 drain_timeout: drain_timeout?,
                 log: flags.log,
                 log_format: log_format?,
@@ -218,6 +269,33 @@ impl ConfigErrors {
     fn add(&mut self, flag: &str, error: impl Display) {
         let variable = flag.to_uppercase().replace('-', "_");
         self.0.push(format!("--{flag} (GRASPD_{variable}) {error}"));
+    }
+
+    fn refuse<T>(&mut self, flag: &str, error: &str) -> Option<T> {
+        self.add(flag, error);
+        None
+    }
+
+    /// No TLS, or all that it needs.
+    fn tls(&mut self, cert: Option<&Path>, key: Option<&Path>, ca: Option<&Path>) -> Option<Option<ServerTlsConfig>> {
+        let (cert, key) = match (cert, key, ca) {
+            (None, None, None) => return Some(None),
+            (Some(cert), Some(key), _) => (cert, key),
+            (None, ..) => return self.refuse("tls-cert", "is missing, --tls-key and --tls-client-ca need it"),
+            (_, None, _) => return self.refuse("tls-key", "is missing, --tls-cert needs it"),
+        };
+        let cert = self.read("tls-cert", cert);
+        let key = self.read("tls-key", key);
+        let ca = ca.map(|ca| self.read("tls-client-ca", ca));
+        let mut tls = ServerTlsConfig::new().identity(Identity::from_pem(cert?, key?));
+        if let Some(ca) = ca {
+            tls = tls.client_ca_root(Certificate::from_pem(ca?));
+        }
+        Some(Some(tls))
+    }
+
+    fn read(&mut self, flag: &str, file: &Path) -> Option<Vec<u8>> {
+        fs::read(file).map_err(|error| self.add(flag, format_args!("{}: {error}", file.display()))).ok()
     }
 
     fn parse<T: FromStr>(&mut self, flag: &str, value: &str, expected: &str) -> Option<T> {

@@ -1,17 +1,23 @@
+use std::sync::Arc;
 use std::time::Duration;
 
+use anyhow::Context;
 use grasp_proto::FILE_DESCRIPTOR_SET;
 use grasp_proto::pb::grasp_service_server::GraspServiceServer;
 use tokio::net::TcpListener;
 use tokio::sync::watch;
+use tonic::body::Body;
 use tonic::service::interceptor::InterceptedService;
-use tonic::transport::Server;
-use tonic::transport::server::TcpIncoming;
+use tonic::transport::{Server, ServerTlsConfig};
 use tonic_health::pb::health_server::HealthServer;
+use tower::util::MapRequestLayer;
 
-use crate::deadline;
+use crate::auth::Tokens;
 use crate::health::{Health, State, draining};
+use crate::intake::{Intake, Limits};
+use crate::metrics::Metrics;
 use crate::service::Grasps;
+use crate::{auth, connections, deadline};
 
 /// HTTP/2's default of 64 KiB holds a quarter of a 40³ volume: the client would wait for us four times per request.
 const STREAM_WINDOW: u32 = 4 << 20;
@@ -22,51 +28,58 @@ const MAX_FRAME: u32 = 1 << 20;
 /// Clients that vanished without a word are noticed.
 const KEEPALIVE: Duration = Duration::from_secs(30);
 
+/// Calls that one connection may have open at a time: far more than queues take, few enough to bound what they hold.
+const MAX_STREAMS: u32 = 256;
+
+/// Who may connect and what is taken.
+pub(crate) struct Entrance {
+    /// TLS, where it is spoken.
+    pub tls: Option<ServerTlsConfig>,
+    /// The tokens that are taken, where one is needed.
+    pub tokens: Option<Arc<Tokens>>,
+    /// The most connections.
+    pub connections: usize,
+    pub limits: Limits,
+}
+
 /// Serves until the state is draining and every request that was taken is answered.
 pub(crate) async fn serve(
     listener: TcpListener,
-    max_message_bytes: usize,
+    entrance: Entrance,
     service: Grasps,
+    metrics: Arc<Metrics>,
     state: watch::Receiver<State>,
 ) -> anyhow::Result<()> {
+    let Entrance { tls, tokens, connections, limits } = entrance;
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
-    let grasps = GraspServiceServer::new(service).max_decoding_message_size(max_message_bytes);
-    Server::builder()
+    // The limit is kept by the intake, which counts what it refuses.
+    let grasps = GraspServiceServer::new(service).max_decoding_message_size(usize::MAX);
+    let guard = auth::guard(tokens, Arc::clone(&metrics));
+    let incoming = connections::accept(listener, connections, metrics.connections());
+    let intake = MapRequestLayer::new(move |request: http::Request<Body>| {
+        request.map(|body| Body::new(Intake::new(body, limits, Arc::clone(&metrics))))
+    });
+    let mut server = Server::builder();
+    if let Some(tls) = tls {
+        server = server.tls_config(tls).context("the certificate, its key or the clients' CA cannot be used")?;
+    }
+    server
+        .layer(intake)
         .initial_stream_window_size(STREAM_WINDOW)
         .initial_connection_window_size(CONNECTION_WINDOW)
         .max_frame_size(MAX_FRAME)
+        .max_concurrent_streams(MAX_STREAMS)
         .http2_keepalive_interval(Some(KEEPALIVE))
-        .add_service(InterceptedService::new(grasps, deadline::note))
+        .add_service(InterceptedService::new(InterceptedService::new(grasps, deadline::note), guard.clone()))
+        // Whoever watches over this process has no token.
         .add_service(HealthServer::new(Health(state.clone())))
-        .add_service(reflection().build_v1()?)
-        .add_service(reflection().build_v1alpha()?)
-        .serve_with_incoming_shutdown(incoming(listener), draining(state))
+        .add_service(InterceptedService::new(reflection().build_v1()?, guard.clone()))
+        .add_service(InterceptedService::new(reflection().build_v1alpha()?, guard))
+        .serve_with_incoming_shutdown(incoming, draining(state))
         .await?;
     Ok(())
-}
-
-/// The connections. `Server::tcp_nodelay` does nothing for a listener that was bound before; without TCP_NODELAY a
-/// reply of several packets waits 40 ms for the client to acknowledge the first.
-fn incoming(listener: TcpListener) -> TcpIncoming {
-    TcpIncoming::from(listener).with_nodelay(Some(true))
-}
-
-#[cfg(test)]
-mod tests {
-    use tokio::net::TcpStream;
-    use tokio_stream::StreamExt;
-
-    use super::*;
-
-    #[tokio::test]
-    async fn connections_do_not_wait_to_fill_packets() {
-        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let _client = TcpStream::connect(listener.local_addr().unwrap()).await.unwrap();
-        let connection = incoming(listener).next().await.unwrap().unwrap();
-        assert!(connection.nodelay().unwrap());
-    }
 }

@@ -1,12 +1,15 @@
 //! graspd: volumes in, grasps out, over gRPC.
 
+mod auth;
 mod config;
+mod connections;
 mod deadline;
 mod engine;
 mod folder;
 mod grpc;
 mod health;
 mod http;
+mod intake;
 mod metrics;
 mod models;
 mod queue;
@@ -28,6 +31,7 @@ use tracing::{error, info, warn};
 use crate::config::Config;
 use crate::engine::Sessions;
 use crate::folder::Folder;
+use crate::grpc::Entrance;
 use crate::health::Readiness;
 use crate::metrics::Metrics;
 use crate::models::Models;
@@ -90,7 +94,12 @@ async fn serve(config: &Config, metrics: &Arc<Metrics>, sessions: &Arc<Sessions>
     let models = Arc::new(Models::default());
     let http = tokio::spawn(http::serve(http, Arc::clone(metrics), state.clone()));
     let service = Grasps::new(Arc::clone(&models), Arc::clone(metrics), state.clone());
-    let mut grpc = tokio::spawn(grpc::serve(grpc, config.max_message_bytes, service, state.clone()));
+    let Config { tls, tokens, max_connections: connections, limits, .. } = config;
+    if let Some(tokens) = tokens {
+        tokio::spawn(Arc::clone(tokens).watch(self::hangup().context("cannot handle signals")?));
+    }
+    let entrance = Entrance { tls: tls.clone(), tokens: tokens.clone(), connections: *connections, limits: *limits };
+    let mut grpc = tokio::spawn(grpc::serve(grpc, entrance, service, Arc::clone(metrics), state.clone()));
 
     let folder = Folder::new(config, models, Arc::clone(sessions), Arc::clone(metrics));
     let entries = config.store.entries().to_vec();

@@ -29,6 +29,7 @@ pub(crate) struct Metrics {
     models: IntGaugeVec,
     reloads: IntCounterVec,
     rejected: IntGauge,
+    connections: IntGauge,
 }
 
 impl Metrics {
@@ -76,8 +77,11 @@ impl Metrics {
                 "Model files that cannot be served, as of the last reload.",
             )
             .expect(VALID),
+            connections: IntGauge::new("graspd_connections", "Connections to the gRPC listener that are open.")
+                .expect(VALID),
         };
-        let Self { registry, stages, requests, grasps, waiting, batches, models, reloads, rejected } = &metrics;
+        let Self { registry, stages, requests, grasps, waiting, batches, models, reloads, rejected, connections } =
+            &metrics;
         registry.register(Box::new(stages.clone())).expect(VALID);
         registry.register(Box::new(requests.clone())).expect(VALID);
         registry.register(Box::new(grasps.clone())).expect(VALID);
@@ -86,6 +90,7 @@ impl Metrics {
         registry.register(Box::new(models.clone())).expect(VALID);
         registry.register(Box::new(reloads.clone())).expect(VALID);
         registry.register(Box::new(rejected.clone())).expect(VALID);
+        registry.register(Box::new(connections.clone())).expect(VALID);
         metrics
     }
 
@@ -133,6 +138,11 @@ impl Metrics {
         Gauges { waiting: self.waiting.with_label_values(&[model]), batch: self.batches.with_label_values(&[model]) }
     }
 
+    /// How many connections are open.
+    pub fn connections(&self) -> IntGauge {
+        self.connections.clone()
+    }
+
     /// In Prometheus' text format.
     pub fn render(&self) -> String {
         TextEncoder::new().encode_to_string(&self.registry.gather()).expect("the encoder writes to memory")
@@ -147,6 +157,7 @@ fn code_name(code: Code) -> &'static str {
         Code::InvalidArgument => "INVALID_ARGUMENT",
         Code::NotFound => "NOT_FOUND",
         Code::ResourceExhausted => "RESOURCE_EXHAUSTED",
+        Code::Unauthenticated => "UNAUTHENTICATED",
         Code::Unavailable => "UNAVAILABLE",
         Code::DeadlineExceeded => "DEADLINE_EXCEEDED",
         Code::Internal => "INTERNAL",

@@ -48,21 +48,27 @@ impl Refusal {
     }
 }
 
-impl From<Refusal> for Status {
+impl Refusal {
     /// With what clients need to react to it by themselves: `google.rpc.BadRequest` names the field, `google.rpc.RetryInfo`
-    /// says when to come back, and so does the trailer that gRPC's own retries look at.
-    fn from(refusal: Refusal) -> Self {
+    /// says when to come back, and so does the trailer that gRPC's own retries look at; `google.rpc.RequestInfo` has the
+    /// id by which the server's log knows the request.
+    pub fn status(self, request_id: &str) -> Status {
         let mut details = ErrorDetails::new();
-        if let Refusal::Field(error) = &refusal {
+        details.set_request_info(request_id, "");
+        if let Self::Field(error) = &self {
             details.add_bad_request_violation(error.field, &error.message);
         }
         let mut metadata = MetadataMap::new();
-        if let Some(after) = refusal.retry_after() {
+        if let Some(after) = self.retry_after() {
             details.set_retry_info(Some(after));
             let milliseconds = u64::try_from(after.as_millis()).unwrap_or(u64::MAX);
             metadata.insert(RETRY_PUSHBACK, MetadataValue::from(milliseconds));
         }
-        Self::with_error_details_and_metadata(refusal.code(), refusal.to_string(), details, metadata)
+        let message = match self.code() {
+            Code::Internal => format!("{self} (request {request_id})"),
+            _ => self.to_string(),
+        };
+        Status::with_error_details_and_metadata(self.code(), message, details, metadata)
     }
 }
 
@@ -83,11 +89,13 @@ mod tests {
     #[test]
     fn clients_are_told_when_to_come_back_in_every_way_they_look_at() {
         let after = Duration::from_millis(1500);
-        let status = Status::from(Refusal::Starting(after));
+        let status = Refusal::Starting(after).status("7");
         assert_eq!(status.get_details_retry_info().and_then(|info| info.retry_delay), Some(after));
         assert_eq!(status.metadata().get(RETRY_PUSHBACK).unwrap(), "1500");
-        let gone = Status::from(Refusal::Failed(EngineError::Gone));
+        let gone = Refusal::Failed(EngineError::Gone).status("7");
+        assert_eq!(gone.message(), "the session is gone (request 7)");
+        assert_eq!(gone.get_details_request_info().unwrap().request_id, "7");
         assert!(gone.get_details_retry_info().is_none() && gone.metadata().get(RETRY_PUSHBACK).is_none());
-        assert_eq!(Status::from(Refusal::Failed(EngineError::Expired)).code(), Code::DeadlineExceeded);
+        assert_eq!(Refusal::Failed(EngineError::Expired).status("7").code(), Code::DeadlineExceeded);
     }
 }

@@ -226,7 +226,9 @@ impl GraspService for Grasps {
         request: Request<pb::DetectGraspsRequest>,
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
         let deadline = request.extensions().get().copied();
-        Ok(Response::new(self.begin(request.into_inner(), deadline).finish().await?))
+        let begun = self.begin(request.into_inner(), deadline);
+        let id = begun.call.id.clone();
+        begun.finish().await.map(Response::new).map_err(|refusal| refusal.status(&id))
     }
 
     type DetectGraspsStreamStream = BoxStream<pb::DetectGraspsStreamResponse>;

@@ -12,6 +12,9 @@ pub const RESOLUTION: usize = 16;
 /// The width that they predict everywhere, voxels.
 pub const WIDTH: f32 = 5.0;
 
+/// ONNX's number for the element type.
+const INT64: i64 = 7;
+
 /// Channels of the convolutions that make a model slow.
 const CHANNELS: i64 = 16;
 
@@ -25,6 +28,7 @@ pub struct TestModel {
     resolution: usize,
     convolutions: usize,
     rotation: [f32; 4],
+    fails_at_zero: bool,
 }
 
 impl TestModel {
@@ -37,6 +41,7 @@ impl TestModel {
             resolution: RESOLUTION,
             convolutions: 0,
             rotation: [0.0, 0.0, 0.0, 1.0],
+            fails_at_zero: false,
         }
     }
 
@@ -62,6 +67,12 @@ impl TestModel {
     #[must_use]
     pub fn broken(self) -> Self {
         Self { rotation: [0.0; 4], ..self }
+    }
+
+    /// ONNX Runtime fails in the middle of a batch in which any voxel is 0.
+    #[must_use]
+    pub fn fails_at_zero(self) -> Self {
+        Self { fails_at_zero: true, ..self }
     }
 
     /// Writes it into a folder.
@@ -98,6 +109,17 @@ impl TestModel {
         }
         if self.convolutions > 0 {
             delay = convolution(&mut graph, &delay, "delay", CHANNELS, 1);
+        }
+        if self.fails_at_zero {
+            // An index that exists only where no voxel is 0.
+            graph.initializer.push(TensorProto::from_f32("only", &[1], &[0.0]));
+            constant(&mut graph, "low", 0.01);
+            node(&mut graph, "ReduceMin", &["tsdf"], "least", vec![AttributeProto::int("keepdims", 0)]);
+            node(&mut graph, "Less", &["least", "low"], "is_zero", vec![]);
+            node(&mut graph, "Cast", &["is_zero"], "index", vec![AttributeProto::int("to", INT64)]);
+            node(&mut graph, "Gather", &["only", "index"], "nothing", vec![]);
+            node(&mut graph, "Add", &[&delay, "nothing"], "delay_or_failure", vec![]);
+            delay = "delay_or_failure".to_owned();
         }
         node(&mut graph, "Add", &["tsdf", &delay], "quality", vec![]);
 

@@ -21,7 +21,7 @@ async fn a_message_of_the_limit_is_taken_and_one_byte_more_is_not() {
     for _ in 0..3 {
         assert_eq!(client.detect_grasps(request(10)).await.unwrap().into_inner().grasps.len(), 1);
         let status = client.detect_grasps(request(11)).await.unwrap_err();
-        assert_eq!(status.code(), Code::OutOfRange);
+        assert_eq!(status.code(), Code::InvalidArgument);
         for number in [limit, limit + 1] {
             assert!(status.message().contains(&number.to_string()), "{}", status.message());
         }
@@ -36,7 +36,8 @@ async fn a_stream_ends_at_a_message_over_the_limit_and_the_connection_goes_on() 
     let requests = tokio_stream::iter([request(10), request(11), request(10)]);
     let mut replies = client.detect_grasps_stream(requests).await.unwrap().into_inner();
     assert_eq!(replies.next().await.unwrap().unwrap().request_id, "x".repeat(10));
-    assert_eq!(replies.next().await.unwrap().unwrap_err().code(), Code::OutOfRange);
+    assert_eq!(replies.next().await.unwrap().unwrap_err().code(), Code::InvalidArgument);
+    assert_eq!(server.metric("graspd_requests_total{code=\"INVALID_ARGUMENT\",model=\"\"}"), 1.0);
     assert!(replies.next().await.is_none());
     assert!(client.detect_grasps(request(10)).await.is_ok());
 }

@@ -102,7 +102,7 @@ async fn a_folder_that_is_gone_changes_nothing() {
 #[tokio::test]
 async fn nobody_who_asks_while_models_are_swapped_notices() {
     let model = TestModel::new("mirror").convolutions(2);
-    let server = Server::run(&[model.clone()], &["--watch", "0", "--queue", "16", "--workers", "2"]);
+    let server = Server::run(std::slice::from_ref(&model), &["--watch", "0", "--queue", "16", "--workers", "2"]);
     let (stop, answered) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicUsize::new(0)));
     let mut callers = JoinSet::new();
     for _ in 0..4 {

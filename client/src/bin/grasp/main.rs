@@ -3,11 +3,13 @@
 mod file;
 mod show;
 
+use std::fs;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
+use anyhow::{Context, anyhow};
 use clap::{Args, Parser, Subcommand};
-use grasp_client::{Client, Health, Options};
+use grasp_client::{Access, Certificate, Client, Health, Identity, Options, Retry, Token};
 
 /// Asks a graspd for grasps.
 #[derive(Parser)]
@@ -17,12 +19,34 @@ struct Cli {
     #[arg(long, global = true, env = "GRASPD_SERVER", value_name = "ADDR", default_value = "127.0.0.1:50051")]
     server: String,
 
+    #[command(flatten)]
+    access: AccessArgs,
+
     /// Print JSON instead of tables.
     #[arg(long, global = true)]
     json: bool,
 
     #[command(subcommand)]
     command: Command,
+}
+
+#[derive(Args)]
+struct AccessArgs {
+    /// CA that signed the server's certificate, PEM. By default those that this machine trusts, with https:// addresses.
+    #[arg(long, global = true, env = "GRASPD_TLS_CA", value_name = "FILE")]
+    tls_ca: Option<PathBuf>,
+
+    /// Certificate to show to a server that wants one, PEM.
+    #[arg(long, global = true, value_name = "FILE", requires = "tls_key")]
+    tls_cert: Option<PathBuf>,
+
+    /// Its private key, PEM.
+    #[arg(long, global = true, value_name = "FILE", requires = "tls_cert")]
+    tls_key: Option<PathBuf>,
+
+    /// File that holds the token that the server wants.
+    #[arg(long, global = true, env = "GRASPD_TOKEN_FILE", value_name = "FILE")]
+    token_file: Option<PathBuf>,
 }
 
 #[derive(Subcommand)]
@@ -66,6 +90,23 @@ struct Detect {
     explain: bool,
 }
 
+impl AccessArgs {
+    fn read(&self) -> anyhow::Result<Access> {
+        let file = |path: &Option<PathBuf>| match path {
+            Some(path) => fs::read(path).map(Some).with_context(|| format!("cannot read {}", path.display())),
+            None => Ok(None),
+        };
+        let token =
+            |bytes: Vec<u8>| String::from_utf8_lossy(&bytes).lines().next().unwrap_or_default().parse::<Token>();
+        Ok(Access {
+            ca: file(&self.tls_ca)?.map(Certificate::from_pem),
+            identity: file(&self.tls_cert)?.zip(file(&self.tls_key)?).map(|(cert, key)| Identity::from_pem(cert, key)),
+            token: file(&self.token_file)?.map(token).transpose().map_err(|fault| anyhow!("--token-file: {fault}"))?,
+            retry: Retry::RECOMMENDED,
+        })
+    }
+}
+
 #[tokio::main(flavor = "current_thread")]
 async fn main() -> ExitCode {
     match run(Cli::parse()).await {
@@ -77,7 +118,7 @@ async fn main() -> ExitCode {
     }
 }
 
-async fn run(Cli { server, json, command }: Cli) -> anyhow::Result<ExitCode> {
+async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitCode> {
     match command {
         Command::Detect(args) => {
             // The file first: a mistake in it needs no server to be found.
@@ -90,15 +131,15 @@ async fn run(Cli { server, json, command }: Cli) -> anyhow::Result<ExitCode> {
                 explain: args.explain,
                 ..Options::default()
             };
-            let detection = Client::connect(server).await?.detect(&volume, options).await?;
+            let detection = Client::connect_with(server, access.read()?).await?.detect(&volume, options).await?;
             println!("{}", if json { show::detection_json(&detection) } else { show::detection(&detection) });
         }
         Command::Models => {
-            let models = Client::connect(server).await?.list_models().await?;
+            let models = Client::connect_with(server, access.read()?).await?.list_models().await?;
             println!("{}", if json { show::models_json(&models) } else { show::models(&models) });
         }
         Command::Health => {
-            let serving = Client::connect(server).await?.health().await? == Health::Serving;
+            let serving = Client::connect_with(server, access.read()?).await?.health().await? == Health::Serving;
             println!("{}", if json { show::health_json(serving) } else { show::health(serving) });
             if !serving {
                 return Ok(ExitCode::FAILURE);

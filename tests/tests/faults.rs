@@ -1,0 +1,201 @@
+//! What goes wrong around a server, and inside it.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::time::Duration;
+
+use grasp::Volume;
+use grasp_client::{Client, DataType, Error, LocalServer, Options};
+use grasp_proto::{encode, pb};
+use grasp_tests::{RESOLUTION, Server, TestModel, blobs, graspd};
+use h2::client::SendRequest;
+use nalgebra::Isometry3;
+use prost::Message;
+use tokio::net::TcpStream;
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+use tokio_stream::StreamExt;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::Code;
+use tonic::codegen::Bytes;
+
+fn volume() -> Volume {
+    blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]])
+}
+
+/// The same, but for a voxel that was not observed.
+fn volume_with_a_zero() -> Volume {
+    let mut values = volume().values().to_vec();
+    values[0] = 0.0;
+    Volume::new(RESOLUTION, volume().voxel_size(), Isometry3::identity(), values).unwrap()
+}
+
+#[tokio::test]
+async fn when_a_batch_fails_only_its_requests_do_and_they_say_which_they_were() {
+    let model = TestModel::new("fragile").convolutions(60).fails_at_zero();
+    let server = Server::run(&[model], &["--queue", "8", "--max-batch", "4"]);
+    let client = server.client().await;
+    let detect = |id: &str, volume: Volume| {
+        let (client, request_id) = (client.clone(), id.to_owned());
+        async move { client.detect(&volume, Options { request_id, ..Options::default() }).await }
+    };
+    let running = tokio::spawn(detect("alone", volume()));
+    server.wait_for("graspd_batch_size_count{model=\"fragile 1\"}", 1.0).await;
+    // These wait together, hence they run together.
+    let mut batch = JoinSet::new();
+    for id in ["a", "b", "c"] {
+        batch.spawn(detect(id, volume()));
+    }
+    batch.spawn(detect("bad", volume_with_a_zero()));
+    server.wait_for("graspd_queue_requests{model=\"fragile 1\"}", 4.0).await;
+
+    assert_eq!(running.await.unwrap().unwrap().grasps.len(), 1);
+    let outcomes = batch.join_all().await;
+    assert_eq!(outcomes.len(), 4);
+    for outcome in outcomes {
+        let Err(Error::Refused { code: Code::Internal, message, .. }) = outcome else { panic!("{outcome:?}") };
+        assert!(["a", "b", "c", "bad"].iter().any(|id| message.ends_with(&format!("(request {id})"))), "{message}");
+    }
+    // The session lives on.
+    assert_eq!(detect("next", volume()).await.unwrap().grasps.len(), 1);
+    assert_eq!(server.metric("graspd_requests_total{code=\"INTERNAL\",model=\"fragile 1\"}"), 4.0);
+    assert_eq!(server.metric("graspd_requests_total{code=\"OK\",model=\"fragile 1\"}"), 2.0);
+}
+
+#[tokio::test]
+async fn a_log_that_cannot_be_written_stops_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    TestModel::new("mirror").write(folder.path());
+    let models = folder.path().to_str().unwrap();
+    // A disk that is always full.
+    let script = folder.path().join("graspd-with-full-disk");
+    fs::write(&script, format!("#!/bin/sh\nexec {} \"$@\" 2> /dev/full\n", graspd().display())).unwrap();
+    fs::set_permissions(&script, fs::Permissions::from_mode(0o755)).unwrap();
+    let mut server =
+        LocalServer::spawn(&script, ["--models", models, "--provider", "cpu", "--threads", "1", "--log", "trace"])
+            .unwrap();
+    let client = Client::connect(server.grpc().to_string()).await.unwrap();
+    for _ in 0..100 {
+        assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 1);
+    }
+    server.terminate().unwrap();
+    assert_eq!(server.wait().unwrap().code(), Some(0));
+}
+
+#[tokio::test]
+async fn a_client_that_does_not_read_holds_up_nobody_and_loses_nothing() {
+    const CALLS: usize = 3000;
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let endpoint = tonic::transport::Channel::from_shared(format!("http://{}", server.grpc())).unwrap();
+    let channel = endpoint.initial_stream_window_size(1024).connect().await.unwrap();
+    let mut slow = pb::grasp_service_client::GraspServiceClient::new(channel);
+    let message = encode(&volume(), DataType::U8, "");
+    let (send, requests) = mpsc::channel(1);
+    let mut replies = slow.detect_grasps_stream(ReceiverStream::new(requests)).await.unwrap().into_inner();
+    let sender = tokio::spawn(async move {
+        for number in 0..CALLS {
+            let request_id = number.to_string();
+            let request = pb::DetectGraspsRequest { request_id, volume: Some(message.clone()), ..Default::default() };
+            send.send(request).await.unwrap();
+        }
+    });
+
+    // Somebody else is answered meanwhile, more often than the slow one could have been if it were all read ahead.
+    let client = server.client().await;
+    for _ in 0..200 {
+        assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 1);
+    }
+    let answered = server.metric("graspd_requests_total{code=\"OK\",model=\"mirror 1\"}");
+    assert!(answered < 200.0 + CALLS as f64, "the server reads no further ahead than it can answer");
+
+    // It comes back to its senses, and finds every answer in its order.
+    for number in 0..CALLS {
+        let reply = replies.next().await.unwrap().unwrap();
+        assert_eq!(reply.request_id, number.to_string());
+    }
+    sender.await.unwrap();
+    assert!(replies.next().await.is_none());
+}
+
+#[tokio::test]
+async fn half_a_message_is_waited_for_no_longer_than_it_may_stand_still() {
+    let mut server = Server::run(&[TestModel::new("mirror")], &["--stall-timeout", "0.3"]);
+    let message = pb::DetectGraspsRequest { volume: Some(encode(&volume(), DataType::F32, "")), ..Default::default() };
+    let mut bytes = vec![0];
+    bytes.extend((message.encoded_len() as u32).to_be_bytes());
+    bytes.extend(message.encode_to_vec());
+    let mut h2 = connect(&server).await;
+
+    // A slow one is heard out, for it never stands still for long.
+    let pieces: Vec<&[u8]> = bytes.chunks(bytes.len() / 4 + 1).collect();
+    let status = call(&mut h2, &pieces, Duration::from_millis(100), true).await;
+    assert_eq!(status, (Code::Ok, String::new()));
+
+    for sent in [3, 5, 1000, bytes.len() - 1] {
+        let (code, message) = call(&mut h2, &[&bytes[..sent]], Duration::ZERO, false).await;
+        assert_eq!(code, Code::DeadlineExceeded);
+        let missing = if sent < 5 { "its length".to_owned() } else { format!("{} bytes", bytes.len() - sent) };
+        assert_eq!(
+            message,
+            format!("the message has stood still for 300ms, {missing} of it are missing; send it anew")
+        );
+    }
+    assert_eq!(server.metric("graspd_requests_total{code=\"DEADLINE_EXCEEDED\",model=\"\"}"), 4.0);
+
+    // Nor does it hold up the end.
+    let stuck = tokio::spawn(async move { call(&mut h2, &[&bytes[..1000]], Duration::ZERO, false).await });
+    tokio::task::yield_now().await;
+    server.terminate().unwrap();
+    assert_eq!(tokio::task::spawn_blocking(move || server.wait().unwrap().code()).await.unwrap(), Some(0));
+    // The connection may have been closed before the call was begun.
+    drop(stuck);
+}
+
+#[tokio::test]
+async fn connections_beyond_the_most_are_closed_and_those_below_are_not() {
+    let server = Server::run(&[TestModel::new("mirror")], &["--max-connections", "2"]);
+    let clients = [server.client().await, server.client().await];
+    for client in &clients {
+        client.detect(&volume(), Options::default()).await.unwrap();
+    }
+    assert_eq!(server.metric("graspd_connections"), 2.0);
+    let third = Client::connect(server.grpc().to_string()).await;
+    let answered = match third {
+        Ok(third) => third.detect(&volume(), Options::default()).await.is_ok(),
+        Err(_) => false,
+    };
+    assert!(!answered);
+    let [first, second] = clients;
+    drop(first);
+    server.wait_for("graspd_connections", 1.0).await;
+    server.client().await.detect(&volume(), Options::default()).await.unwrap();
+    second.detect(&volume(), Options::default()).await.unwrap();
+}
+
+async fn connect(server: &Server) -> SendRequest<Bytes> {
+    let stream = TcpStream::connect(server.grpc()).await.unwrap();
+    let (h2, connection) = h2::client::handshake(stream).await.unwrap();
+    tokio::spawn(connection);
+    h2
+}
+
+/// Calls `DetectGrasps` with these bytes, piece by piece; the status and its message.
+async fn call(h2: &mut SendRequest<Bytes>, pieces: &[&[u8]], pause: Duration, ends: bool) -> (Code, String) {
+    let request = http::Request::post("http://graspd/grasp.v1.GraspService/DetectGrasps");
+    let request = request.header("content-type", "application/grpc").header("te", "trailers").body(()).unwrap();
+    let (response, mut body) = h2.clone().ready().await.unwrap().send_request(request, false).unwrap();
+    for (index, piece) in pieces.iter().enumerate() {
+        body.send_data(Bytes::copy_from_slice(piece), ends && index + 1 == pieces.len()).unwrap();
+        tokio::time::sleep(pause).await;
+    }
+    let response = response.await.unwrap();
+    let mut headers = response.headers().clone();
+    let mut body = response.into_body();
+    while let Some(data) = body.data().await {
+        let length = data.unwrap().len();
+        body.flow_control().release_capacity(length).unwrap();
+    }
+    headers.extend(body.trailers().await.unwrap().unwrap_or_default());
+    let status = tonic::Status::from_header_map(&headers).expect("a status");
+    (status.code(), status.message().to_owned())
+}

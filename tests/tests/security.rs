@@ -1,0 +1,173 @@
+//! Who gets in, and how what they send is kept from others.
+
+use std::fs;
+use std::path::PathBuf;
+use std::process::Command;
+
+use grasp::Volume;
+use grasp_client::{Access, Certificate, Client, Error, Health, Identity, Options};
+use grasp_tests::{RESOLUTION, Server, TestModel, blobs, grasp, graspd};
+use nalgebra::Isometry3;
+use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
+use tempfile::TempDir;
+use tonic::Code;
+
+fn volume() -> Volume {
+    blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]])
+}
+
+/// A CA with the files that it makes.
+struct Authority {
+    issuer: CertifiedIssuer<'static, KeyPair>,
+    folder: TempDir,
+}
+
+impl Authority {
+    fn new() -> Self {
+        let mut params = CertificateParams::new([]).unwrap();
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        let issuer = CertifiedIssuer::self_signed(params, KeyPair::generate().unwrap()).unwrap();
+        let authority = Self { issuer, folder: tempfile::tempdir().unwrap() };
+        fs::write(authority.file("ca.pem"), authority.issuer.pem()).unwrap();
+        authority
+    }
+
+    /// Writes `NAME.pem` and `NAME.key`.
+    fn sign(&self, name: &str) -> Identity {
+        let key = KeyPair::generate().unwrap();
+        let params = CertificateParams::new(["localhost".to_owned(), "127.0.0.1".to_owned()]).unwrap();
+        let certificate = params.signed_by(&key, &self.issuer).unwrap().pem();
+        fs::write(self.file(&format!("{name}.pem")), &certificate).unwrap();
+        fs::write(self.file(&format!("{name}.key")), key.serialize_pem()).unwrap();
+        Identity::from_pem(certificate, key.serialize_pem())
+    }
+
+    fn file(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn path(&self, name: &str) -> String {
+        self.file(name).to_str().unwrap().to_owned()
+    }
+
+    fn access(&self) -> Access {
+        Access { ca: Some(Certificate::from_pem(self.issuer.pem())), ..Access::default() }
+    }
+}
+
+async fn detects(server: &Server, access: Access) -> Result<usize, Error> {
+    let client = Client::connect_with(server.grpc().to_string(), access).await?;
+    Ok(client.detect(&volume(), Options::default()).await?.grasps.len())
+}
+
+#[tokio::test]
+async fn over_tls_only_who_trusts_its_ca_talks_to_it() {
+    let authority = Authority::new();
+    authority.sign("server");
+    let flags = ["--tls-cert", &authority.path("server.pem"), "--tls-key", &authority.path("server.key")];
+    let server = Server::run(&[TestModel::new("mirror")], &flags);
+    assert_eq!(detects(&server, authority.access()).await.unwrap(), 1);
+    assert!(detects(&server, Authority::new().access()).await.is_err());
+    assert!(detects(&server, Access::default()).await.is_err(), "not in clear");
+
+    let output = Command::new(grasp())
+        .args(["--server", &server.grpc().to_string(), "--tls-ca", &authority.path("ca.pem"), "health"])
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+#[tokio::test]
+async fn who_has_to_show_a_certificate_gets_in_with_one_of_the_right_ca_only() {
+    let (authority, stranger) = (Authority::new(), Authority::new());
+    authority.sign("server");
+    let flags = [
+        ["--tls-cert", &authority.path("server.pem")],
+        ["--tls-key", &authority.path("server.key")],
+        ["--tls-client-ca", &authority.path("ca.pem")],
+    ];
+    let server = Server::run(&[TestModel::new("mirror")], flags.as_flattened());
+    let with = |identity| Access { identity, ..authority.access() };
+    assert_eq!(detects(&server, with(Some(authority.sign("robot")))).await.unwrap(), 1);
+    assert!(detects(&server, with(None)).await.is_err());
+    assert!(detects(&server, with(Some(stranger.sign("robot")))).await.is_err());
+}
+
+#[tokio::test]
+async fn only_bearers_of_a_token_are_answered_and_tokens_change_at_sighup() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("tokens");
+    fs::write(&file, "first-secret\n").unwrap();
+    let server = Server::run(&[TestModel::new("mirror")], &["--token-file", file.to_str().unwrap(), "--watch", "0"]);
+    let with = |token: &str| Access { token: Some(token.parse().unwrap()), ..Access::default() };
+    let refused = |error: Error| {
+        assert_eq!(error.code(), Some(Code::Unauthenticated), "{error}");
+        assert!(!error.to_string().contains("secret"), "{error}");
+    };
+    assert_eq!(detects(&server, with("first-secret")).await.unwrap(), 1);
+    refused(detects(&server, with("other-secret")).await.unwrap_err());
+    refused(detects(&server, Access::default()).await.unwrap_err());
+    assert_eq!(server.metric("graspd_requests_total{code=\"UNAUTHENTICATED\",model=\"\"}"), 2.0);
+
+    // A probe has no token; a list of models is no probe's business.
+    let client = server.client().await;
+    assert_eq!(client.health().await.unwrap(), Health::Serving);
+    refused(client.list_models().await.unwrap_err());
+
+    // Both for a while, then the new one alone; and a file that is gone locks nobody out.
+    for (text, good) in [("first-secret\nnew-secret\n", true), ("new-secret\n", false)] {
+        fs::write(&file, text).unwrap();
+        let reloads = server.metric("graspd_reloads_total{outcome=\"ok\"}");
+        server.reload().unwrap();
+        server.wait_for("graspd_reloads_total{outcome=\"ok\"}", reloads + 1.0).await;
+        while detects(&server, with("new-secret")).await.is_err()
+            || detects(&server, with("first-secret")).await.is_ok() != good
+        {
+            tokio::task::yield_now().await;
+        }
+    }
+    fs::remove_file(&file).unwrap();
+    server.reload().unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 3.0).await;
+    assert_eq!(detects(&server, with("new-secret")).await.unwrap(), 1);
+
+    let output = Command::new(grasp())
+        .args(["--server", &server.grpc().to_string(), "models"])
+        .env("GRASPD_TOKEN_FILE", &file)
+        .output()
+        .unwrap();
+    assert!(String::from_utf8_lossy(&output.stderr).contains("cannot read"), "it says which file is not there");
+}
+
+#[test]
+fn half_a_configuration_is_refused() {
+    let authority = Authority::new();
+    authority.sign("server");
+    let (cert, key) = (authority.path("server.pem"), authority.path("server.key"));
+    for (flags, mistake) in [
+        (vec!["--tls-cert", &cert], "--tls-key (GRASPD_TLS_KEY) is missing"),
+        (vec!["--tls-client-ca", &cert], "--tls-cert (GRASPD_TLS_CERT) is missing"),
+        (
+            vec!["--tls-cert", "/no/such.pem", "--tls-key", &key],
+            "--tls-cert (GRASPD_TLS_CERT) /no/such.pem: No such file",
+        ),
+        (vec!["--token-file", "/dev/null"], "--token-file (GRASPD_TOKEN_FILE) /dev/null holds no token"),
+        (vec!["--stall-timeout", "soon"], "--stall-timeout (GRASPD_STALL_TIMEOUT) is `soon`"),
+    ] {
+        let output = Command::new(graspd()).args(&flags).output().unwrap();
+        assert_eq!(output.status.code(), Some(2));
+        let text = String::from_utf8(output.stderr).unwrap();
+        assert!(text.contains(mistake), "`{mistake}` is not in:\n{text}");
+    }
+    // What only TLS itself can tell: a key where a certificate should be.
+    let folder = tempfile::tempdir().unwrap();
+    TestModel::new("mirror").write(folder.path());
+    let output = Command::new(graspd())
+        .args(["--models".as_ref(), folder.path().as_os_str()])
+        .args(["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0", "--tls-cert", &key, "--tls-key", &key])
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert!(text.contains("the certificate, its key or the clients' CA cannot be used"), "{text}");
+}
