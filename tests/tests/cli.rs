@@ -130,3 +130,27 @@ fn mistakes_are_explained() {
     let error = refused(&["detect", file, "--voxel-size", "7.5"]);
     assert!(error.contains("volume.voxel_size is 7.5, the model mirror 1 takes 0.01875 m"), "{error}");
 }
+
+#[test]
+fn a_benchmark_says_how_long_answers_took_and_what_was_refused() {
+    let (_folder, files) = files();
+    let server = Server::run(&[TestModel::new("slow").convolutions(20)], &["--queue", "1"]);
+    let bench = |flags: &[&str]| -> Value {
+        let output = Command::new(grasp())
+            .args(["--server", &server.grpc().to_string(), "--json", "bench"])
+            .arg(&files[0])
+            .args(flags)
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        serde_json::from_slice(&output.stdout).unwrap()
+    };
+    let alone = bench(&["--seconds", "0.5"]);
+    assert!(alone["outcomes"]["answered"]["calls"].as_u64().unwrap() > 0, "{alone}");
+    assert!(alone["answers_per_second"].as_f64().unwrap() > 0.0);
+    assert_eq!(alone["outcomes"].as_object().unwrap().len(), 1, "nobody is refused: {alone}");
+    let crowd = bench(&["--seconds", "0.5", "--callers", "8"]);
+    assert!(crowd["outcomes"]["ResourceExhausted"]["calls"].as_u64().unwrap() > 0, "{crowd}");
+    let steady = bench(&["--seconds", "0.5", "--rate", "20"]);
+    assert!(steady["outcomes"]["answered"]["p50_seconds"].as_f64().unwrap() > 0.0, "{steady}");
+}

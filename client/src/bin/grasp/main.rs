@@ -6,10 +6,13 @@ mod show;
 use std::fs;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::{Context, anyhow};
 use clap::{Args, Parser, Subcommand};
-use grasp_client::{Access, Certificate, Client, Health, Identity, Options, Retry, Token};
+use grasp_client::{Access, Arrivals, Certificate, Client, Health, Identity, Options, Retry, Token, Until, load};
+use tonic::Code;
 
 /// Asks a graspd for grasps.
 #[derive(Parser)]
@@ -53,6 +56,8 @@ struct AccessArgs {
 enum Command {
     /// Finds the grasps in a volume.
     Detect(Detect),
+    /// Asks for the grasps in a volume many times, and says how long that took.
+    Bench(Bench),
     /// Lists the models that are loaded.
     Models,
     /// Says whether the server is ready; the exit status is 1 when it is not.
@@ -60,10 +65,14 @@ enum Command {
 }
 
 #[derive(Args)]
-struct Detect {
+struct Volume {
     /// A .npy file, or a .npz file with one array or one called `grid`: N×N×N values in [0, 1] (u8: 0 to 255), indexed
     /// x, y, z, 0.5 on the surface and 0 where nothing was observed.
     file: PathBuf,
+
+    /// Edge of a voxel, metres. By default that of a cube of 0.3 m.
+    #[arg(long, value_name = "METRES")]
+    voxel_size: Option<f64>,
 
     /// Which model answers. By default the server chooses.
     #[arg(long, default_value = "", hide_default_value = true)]
@@ -72,10 +81,12 @@ struct Detect {
     /// Which version of it. By default the newest.
     #[arg(long, default_value = "", hide_default_value = true)]
     version: String,
+}
 
-    /// Edge of a voxel, metres. By default that of a cube of 0.3 m.
-    #[arg(long, value_name = "METRES")]
-    voxel_size: Option<f64>,
+#[derive(Args)]
+struct Detect {
+    #[command(flatten)]
+    volume: Volume,
 
     /// Smallest quality of a grasp, above 0 and at most 1. By default the model's own.
     #[arg(long)]
@@ -88,6 +99,29 @@ struct Detect {
     /// Also say why the other voxels hold no grasp.
     #[arg(long)]
     explain: bool,
+}
+
+#[derive(Args)]
+struct Bench {
+    #[command(flatten)]
+    volume: Volume,
+
+    /// How many ask at the same time, each again as soon as there is an answer.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..), conflicts_with = "rate")]
+    callers: u16,
+
+    /// Requests a second, at moments left to chance, however long the answers take.
+    #[arg(long, value_name = "PER_SECOND", value_parser = positive)]
+    rate: Option<f64>,
+
+    /// For how long, seconds.
+    #[arg(long, default_value_t = 10.0, value_parser = positive)]
+    seconds: f64,
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    let number = text.parse().ok().filter(|number: &f64| *number > 0.0 && *number <= 1e6);
+    number.ok_or_else(|| "must be a number above 0 and at most a million".to_owned())
 }
 
 impl AccessArgs {
@@ -122,10 +156,11 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
     match command {
         Command::Detect(args) => {
             // The file first: a mistake in it needs no server to be found.
-            let volume = file::read(&args.file, args.voxel_size)?;
+            let Detect { volume: Volume { file, voxel_size, model, version }, .. } = args;
+            let volume = file::read(&file, voxel_size)?;
             let options = Options {
-                model: args.model,
-                version: args.version,
+                model,
+                version,
                 threshold: args.threshold,
                 max_grasps: args.max_grasps,
                 explain: args.explain,
@@ -133,6 +168,26 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             };
             let detection = Client::connect_with(server, access.read()?).await?.detect(&volume, options).await?;
             println!("{}", if json { show::detection_json(&detection) } else { show::detection(&detection) });
+        }
+        Command::Bench(Bench { volume: Volume { file, voxel_size, model, version }, callers, rate, seconds }) => {
+            let volume = Arc::new(file::read(&file, voxel_size)?);
+            let options = Options { model, version, ..Options::default() };
+            // What is refused is to be seen, not to be tried again.
+            let access = Access { retry: Retry::NONE, ..access.read()? };
+            let client = Client::connect_with(server, access).await?;
+            // A mistake in the request is told at once, as the error that it is.
+            client.detect(&volume, options.clone()).await?;
+            let arrivals = rate.map_or(Arrivals::Callers(callers.into()), Arrivals::Rate);
+            let until = Until::Elapsed(Duration::from_secs_f64(seconds));
+            let report = load(arrivals, until, move |_| {
+                let (client, volume, options) = (client.clone(), Arc::clone(&volume), options.clone());
+                async move {
+                    let detection = client.detect(&volume, options).await;
+                    detection.map(drop).map_err(|error| error.code().unwrap_or(Code::Unknown))
+                }
+            });
+            let report = report.await;
+            println!("{}", if json { show::report_json(&report) } else { show::report(&report) });
         }
         Command::Models => {
             let models = Client::connect_with(server, access.read()?).await?.list_models().await?;

@@ -1,6 +1,9 @@
+use std::time::Duration;
+
 use comfy_table::{Cell, CellAlignment, Table, presets};
-use grasp_client::{Detection, Dropped, Latency, Model};
+use grasp_client::{Detection, Dropped, Latency, Model, Report};
 use serde_json::{Value, json};
+use tonic::Code;
 
 pub(crate) fn detection(detection: &Detection) -> String {
     let mut text = String::new();
@@ -45,6 +48,40 @@ pub(crate) fn detection_json(detection: &Detection) -> String {
         "grasps": grasps.collect::<Vec<_>>(),
         "latency_seconds": object(&stages(&detection.latency).map(|(stage, seconds)| (stage, json!(seconds)))),
         "dropped": detection.dropped.as_ref().map(|d| object(&reasons(d).map(|(reason, n)| (reason, json!(n))))),
+    });
+    format!("{value:#}")
+}
+
+const QUANTILES: [(&str, f64); 4] = [("p50", 0.5), ("p90", 0.9), ("p99", 0.99), ("max", 1.0)];
+
+/// What became of calls, how many, and how long they took.
+fn outcomes(report: &Report) -> impl Iterator<Item = (String, &Vec<Duration>)> {
+    let refused = report.refused.iter().map(|(&code, times)| (format!("{:?}", Code::from_i32(code)), times));
+    std::iter::once(("answered".to_owned(), &report.answered)).chain(refused)
+}
+
+pub(crate) fn report(report: &Report) -> String {
+    let mut table = numbers(&["", "calls", "p50 ms", "p90 ms", "p99 ms", "max ms"]);
+    for (outcome, times) in outcomes(report) {
+        let quantiles =
+            QUANTILES.map(|(_, share)| format!("{:.2}", Report::quantile(times, share).as_secs_f64() * 1e3));
+        table.add_row(right([outcome, times.len().to_string()].into_iter().chain(quantiles)));
+    }
+    format!("{table}\n{:.1} answers a second, for {:.1} s", report.throughput(), report.elapsed.as_secs_f64())
+}
+
+pub(crate) fn report_json(report: &Report) -> String {
+    let outcomes = outcomes(report).map(|(outcome, times)| {
+        let quantiles = QUANTILES
+            .map(|(name, share)| (format!("{name}_seconds"), json!(Report::quantile(times, share).as_secs_f64())));
+        let calls = [("calls".to_owned(), json!(times.len()))];
+        (outcome, calls.into_iter().chain(quantiles).collect::<Value>())
+    });
+    let outcomes: Value = outcomes.collect();
+    let value = json!({
+        "elapsed_seconds": report.elapsed.as_secs_f64(),
+        "answers_per_second": report.throughput(),
+        "outcomes": outcomes,
     });
     format!("{value:#}")
 }

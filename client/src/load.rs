@@ -1,0 +1,216 @@
+//! Many calls, and how they went.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
+
+use rand::rngs::SmallRng;
+use rand::{RngExt, SeedableRng};
+use tokio::task::JoinSet;
+use tokio::time::{Instant, sleep_until};
+use tonic::Code;
+
+/// When calls are made.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Arrivals {
+    /// By so many callers, each of whom asks again as soon as there is an answer.
+    Callers(usize),
+    /// At moments left to chance, so many a second, however long the answers take: what many robots that know nothing of
+    /// each other do (a Poisson process).
+    Rate(f64),
+}
+
+/// When no more calls are made; those that have begun are waited for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Until {
+    /// After so many.
+    Calls(usize),
+    /// After so long.
+    Elapsed(Duration),
+}
+
+/// How the calls went.
+#[derive(Clone, Debug, Default)]
+pub struct Report {
+    /// From the first call to the last answer.
+    pub elapsed: Duration,
+    /// How long each call that was answered took, sorted. At a rate this is counted from the moment at which the call
+    /// was to be made, so that a server cannot hide its slowness by keeping callers busy.
+    pub answered: Vec<Duration>,
+    /// How long each of the others took, sorted, by the status that it ended with.
+    pub refused: BTreeMap<i32, Vec<Duration>>,
+}
+
+impl Report {
+    /// Of these sorted times, that which the share `share` of them does not exceed; zero where there is none.
+    #[must_use]
+    pub fn quantile(times: &[Duration], share: f64) -> Duration {
+        let rank = (times.len() as f64 * share).ceil() as usize;
+        times.get(rank.clamp(1, times.len().max(1)) - 1).copied().unwrap_or_default()
+    }
+
+    /// Answers a second.
+    #[must_use]
+    pub fn throughput(&self) -> f64 {
+        self.answered.len() as f64 / self.elapsed.as_secs_f64().max(f64::MIN_POSITIVE)
+    }
+
+    /// Calls that were not answered.
+    #[must_use]
+    pub fn refusals(&self) -> usize {
+        self.refused.values().map(Vec::len).sum()
+    }
+
+    fn add(&mut self, took: Duration, outcome: Result<(), Code>) {
+        match outcome {
+            Ok(()) => self.answered.push(took),
+            Err(code) => self.refused.entry(code.into()).or_default().push(took),
+        }
+    }
+
+    fn merge(&mut self, other: Self) {
+        self.answered.extend(other.answered);
+        for (code, times) in other.refused {
+            self.refused.entry(code).or_default().extend(times);
+        }
+    }
+}
+
+/// Makes calls. Each gets its number, from 0 on.
+pub async fn load<C, F>(arrivals: Arrivals, until: Until, call: C) -> Report
+where
+    C: Fn(usize) -> F + Send + Sync + 'static,
+    F: Future<Output = Result<(), Code>> + Send,
+{
+    let call = Arc::new(call);
+    let started = Instant::now();
+    let goes_on = move |number: usize, now: Instant| match until {
+        Until::Calls(calls) => number < calls,
+        Until::Elapsed(duration) => now < started + duration,
+    };
+    let mut report = match arrivals {
+        Arrivals::Callers(callers) => by_callers(callers, goes_on, &call).await,
+        Arrivals::Rate(rate) => at_rate(rate, goes_on, &call).await,
+    };
+    report.elapsed = started.elapsed();
+    report.answered.sort_unstable();
+    report.refused.values_mut().for_each(|times| times.sort_unstable());
+    report
+}
+
+async fn by_callers<C, F>(
+    callers: usize,
+    goes_on: impl Fn(usize, Instant) -> bool + Copy + Send + 'static,
+    call: &Arc<C>,
+) -> Report
+where
+    C: Fn(usize) -> F + Send + Sync + 'static,
+    F: Future<Output = Result<(), Code>> + Send,
+{
+    let next = Arc::new(AtomicUsize::new(0));
+    let mut tasks = JoinSet::new();
+    for _ in 0..callers {
+        let (call, next) = (Arc::clone(call), Arc::clone(&next));
+        tasks.spawn(async move {
+            let mut report = Report::default();
+            loop {
+                let (number, begun) = (next.fetch_add(1, Ordering::Relaxed), Instant::now());
+                if !goes_on(number, begun) {
+                    return report;
+                }
+                let outcome = call(number).await;
+                report.add(begun.elapsed(), outcome);
+            }
+        });
+    }
+    let mut report = Report::default();
+    for one in tasks.join_all().await {
+        report.merge(one);
+    }
+    report
+}
+
+async fn at_rate<C, F>(rate: f64, goes_on: impl Fn(usize, Instant) -> bool, call: &Arc<C>) -> Report
+where
+    C: Fn(usize) -> F + Send + Sync + 'static,
+    F: Future<Output = Result<(), Code>> + Send,
+{
+    // The same moments in every run: comparisons are fair.
+    let mut random = SmallRng::seed_from_u64(1);
+    let mut tasks = JoinSet::new();
+    let mut due = Instant::now();
+    let mut report = Report::default();
+    let mut number = 0;
+    loop {
+        // The time between two events of a Poisson process is exponential.
+        due += Duration::from_secs_f64(-(1.0 - random.random::<f64>()).ln() / rate);
+        if !goes_on(number, due) {
+            break;
+        }
+        sleep_until(due).await;
+        let call = Arc::clone(call);
+        tasks.spawn(async move {
+            let outcome = call(number).await;
+            (due.elapsed(), outcome)
+        });
+        number += 1;
+        while let Some(done) = tasks.try_join_next() {
+            add(&mut report, done);
+        }
+    }
+    while let Some(done) = tasks.join_next().await {
+        add(&mut report, done);
+    }
+    report
+}
+
+/// A call that panicked takes the whole load with it: its numbers would be wrong.
+fn add(report: &mut Report, done: Result<(Duration, Result<(), Code>), tokio::task::JoinError>) {
+    match done {
+        Ok((took, outcome)) => report.add(took, outcome),
+        Err(error) => std::panic::resume_unwind(error.into_panic()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn every_call_is_made_once_and_counted() {
+        for arrivals in [Arrivals::Callers(4), Arrivals::Rate(1e5)] {
+            let made = Arc::new(AtomicUsize::new(0));
+            let sum = Arc::clone(&made);
+            let report = load(arrivals, Until::Calls(100), move |number| {
+                sum.fetch_add(number, Ordering::Relaxed);
+                async move { if number % 4 == 0 { Err(Code::ResourceExhausted) } else { Ok(()) } }
+            });
+            let report = report.await;
+            assert_eq!(made.load(Ordering::Relaxed), 4950, "{arrivals:?}");
+            assert_eq!((report.answered.len(), report.refusals()), (75, 25));
+            assert!(report.answered.is_sorted() && report.throughput() > 0.0);
+        }
+    }
+
+    #[tokio::test]
+    async fn time_ends_it_too() {
+        for arrivals in [Arrivals::Callers(2), Arrivals::Rate(1000.0)] {
+            let report = load(arrivals, Until::Elapsed(Duration::from_millis(100)), async |_| {
+                tokio::time::sleep(Duration::from_millis(1)).await;
+                Ok(())
+            });
+            let report = report.await;
+            assert!(!report.answered.is_empty(), "{arrivals:?}");
+            assert!(report.answered[0] >= Duration::from_millis(1));
+        }
+    }
+
+    #[test]
+    fn quantiles_are_values_that_were_there() {
+        let times: Vec<_> = (1..=10).map(Duration::from_millis).collect();
+        let at = |share| Report::quantile(&times, share).as_millis();
+        assert_eq!([at(0.0), at(0.5), at(0.9), at(0.91), at(1.0)], [1, 5, 9, 10, 10]);
+        assert_eq!(Report::quantile(&[], 0.5), Duration::ZERO);
+    }
+}
