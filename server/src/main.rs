@@ -25,6 +25,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use anyhow::Context;
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::net::TcpListener;
 use tracing::{error, info, warn};
 
@@ -58,6 +59,7 @@ fn main() -> ExitCode {
 
 /// From the configuration to the last session dropped.
 fn run(config: &Config) -> anyhow::Result<()> {
+    allow_connections(config.max_connections);
     let onnxruntime = grasp_models::init()?;
     info!(version = onnxruntime.version, library = %onnxruntime.library.display(), "ONNX Runtime");
 
@@ -133,6 +135,20 @@ async fn serve(config: &Config, metrics: &Arc<Metrics>, sessions: &Arc<Sessions>
 
 async fn bind(address: SocketAddr, flag: &str) -> anyhow::Result<TcpListener> {
     TcpListener::bind(address).await.with_context(|| format!("cannot listen on {flag} {address}"))
+}
+
+/// Raises the limit of open files as far as this process may: many systems give 1024 to who does not ask for more.
+fn allow_connections(connections: usize) {
+    // Models, listeners and logs are files, too.
+    const OTHERS: u64 = 64;
+    let limit = getrlimit(Resource::Nofile);
+    if let Err(error) = setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit }) {
+        warn!(%error, "the limit of open files stays as it is");
+    }
+    let files = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
+    if files < connections as u64 + OTHERS {
+        warn!(files, connections, "fewer files may be open than connections are allowed (--max-connections)");
+    }
 }
 
 /// Tells whoever started this process; it need not be listening.

@@ -116,11 +116,28 @@ impl Server {
         panic!("{series} is {}, not {value}", self.metric(series));
     }
 
+    /// The memory that it has in use.
+    ///
+    /// # Panics
+    /// When the system does not say.
+    #[must_use]
+    pub fn resident_bytes(&self) -> u64 {
+        memory(self.id(), "VmRSS")
+    }
+
     /// The folder of its models.
     #[must_use]
     pub fn models(&self) -> &std::path::Path {
         self.models.path()
     }
+}
+
+/// What Linux says of a process's memory, bytes.
+fn memory(process: u32, field: &str) -> u64 {
+    let status = std::fs::read_to_string(format!("/proc/{process}/status")).expect("the process runs, on Linux");
+    let value = status.lines().find_map(|line| line.strip_prefix(field)?.strip_prefix(':'));
+    let kilobytes = value.and_then(|value| value.trim().strip_suffix(" kB")?.parse::<u64>().ok());
+    kilobytes.expect("a number of kB") * 1024
 }
 
 impl Deref for Server {

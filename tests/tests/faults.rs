@@ -172,6 +172,30 @@ async fn connections_beyond_the_most_are_closed_and_those_below_are_not() {
     second.detect(&volume(), Options::default()).await.unwrap();
 }
 
+#[tokio::test]
+#[ignore = "opens as many files: make test-faults"]
+async fn ten_thousand_idle_connections_cost_little_and_hold_up_nobody() {
+    const CONNECTIONS: usize = 10_000;
+    let server = Server::run(&[TestModel::new("mirror")], &["--log", "warn"]);
+    let client = server.client().await;
+    client.detect(&volume(), Options::default()).await.unwrap();
+    let before = server.resident_bytes();
+    let mut idle = Vec::new();
+    for _ in 0..CONNECTIONS {
+        idle.push(connect(&server).await);
+    }
+    server.wait_for("graspd_connections", CONNECTIONS as f64 + 1.0).await;
+    for _ in 0..100 {
+        assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 1);
+    }
+    server.client().await.detect(&volume(), Options::default()).await.unwrap();
+    let each = (server.resident_bytes() - before) / CONNECTIONS as u64;
+    println!("{each} bytes a connection");
+    assert!(each < 100_000, "{each} bytes a connection");
+    drop(idle);
+    server.wait_for("graspd_connections", 1.0).await;
+}
+
 async fn connect(server: &Server) -> SendRequest<Bytes> {
     let stream = TcpStream::connect(server.grpc()).await.unwrap();
     let (h2, connection) = h2::client::handshake(stream).await.unwrap();

@@ -1,0 +1,58 @@
+"""NVIDIA Triton serving the same ONNX file: the model `grasp`, `tsdf` in, `quality`, `rotation` and `width` out.
+
+    python tests/peers/triton.py --model models/zoo/vgn-packed.onnx --threads 2
+
+Triton's package on PyPI brings its Python backend alone, so onnxruntime runs the network. Says on stdout where the
+`inference.GRPCInferenceService` listens, then `ready`. SIGTERM ends it and Triton's processes.
+"""
+
+import contextlib
+import signal
+import socket
+import sys
+
+import numpy as np
+from plain_grpc import INPUT, OUTPUTS, arguments, end_at_sigterm, open_session, say
+from pytriton.client import ModelClient
+from pytriton.decorators import batch
+from pytriton.model_config import ModelConfig, Tensor
+from pytriton.triton import Triton, TritonConfig
+
+MODEL = "grasp"
+MAX_BATCH = 8
+
+
+def free_port() -> int:
+    """Triton takes no port 0."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def main() -> None:
+    chosen = arguments(__doc__)
+    end_at_sigterm()
+    session = open_session(chosen)
+
+    @batch
+    def infer(tsdf: np.ndarray) -> dict[str, np.ndarray]:
+        return dict(zip(OUTPUTS, session.run(OUTPUTS, {INPUT: tsdf})))
+
+    def tensors(values: list) -> list[Tensor]:
+        return [Tensor(name=value.name, dtype=np.float32, shape=tuple(value.shape[1:])) for value in values]
+
+    port = free_port()
+    config = TritonConfig(grpc_address="127.0.0.1", grpc_port=port, allow_http=False, allow_metrics=False, exit_timeout_secs=0)
+    # Triton's log, which comes by print().
+    with contextlib.redirect_stdout(sys.stderr), Triton(config=config) as triton:
+        inputs, outputs = tensors(session.get_inputs()), tensors(session.get_outputs())
+        triton.bind(MODEL, infer, inputs, outputs, config=ModelConfig(max_batch_size=MAX_BATCH))
+        with ModelClient(f"grpc://127.0.0.1:{port}", MODEL) as client:
+            client.infer_sample(np.full(inputs[0].shape, 0.5, np.float32))
+        say(f"grpc listening on 127.0.0.1:{port}")
+        say("ready")
+        signal.pause()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+//! Two servers behind a load balancer, of which one dies. `make test-faults` runs these: they need haproxy, or many files.
+
+use std::net::{SocketAddr, TcpListener};
+use std::process::{Child, Command};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
+
+use grasp_client::{Access, Arrivals, Client, DataType, Options, Retry, Until, load};
+use grasp_tests::{Server, TestModel, blobs};
+use nalgebra::Isometry3;
+use tonic::Code;
+
+const RESOLUTION: usize = 40;
+
+/// haproxy with the configuration that deploy/ has.
+struct Balancer {
+    process: Child,
+    address: SocketAddr,
+}
+
+impl Balancer {
+    fn run(replicas: [&Server; 2]) -> Self {
+        let haproxy = std::env::var_os("GRASPD_HAPROXY").expect("GRASPD_HAPROXY names haproxy: run `make test-faults`");
+        let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+        let mut command = Command::new(haproxy);
+        command.args(["-f", concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/haproxy.cfg")]);
+        command.env("GRASPD_BALANCER", address.to_string());
+        for (number, replica) in (1..).zip(replicas) {
+            command.env(format!("GRASPD_REPLICA_{number}"), replica.grpc().to_string());
+            command.env(format!("GRASPD_REPLICA_{number}_HTTP"), replica.http().port().to_string());
+        }
+        Self { process: command.spawn().unwrap(), address }
+    }
+}
+
+impl Drop for Balancer {
+    fn drop(&mut self) {
+        self.process.kill().unwrap();
+        self.process.wait().unwrap();
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[ignore = "needs haproxy: make test-faults"]
+async fn nobody_who_asks_again_notices_that_a_replica_was_killed() {
+    const CALLS: usize = 2000;
+    let model = || TestModel::new("mirror").resolution(RESOLUTION);
+    let (survivor, victim) = (Server::run(&[model()], &["--log", "warn"]), Server::run(&[model()], &["--log", "warn"]));
+    let balancer = Balancer::run([&survivor, &victim]);
+    Client::wait_ready(balancer.address.to_string(), Duration::from_mins(1)).await.unwrap();
+    let access = Access { retry: Retry::RECOMMENDED, ..Access::default() };
+    let client = Client::connect_with(balancer.address.to_string(), access).await.unwrap();
+    let volume = Arc::new(blobs(RESOLUTION, Isometry3::identity(), &[[10, 20, 15]]));
+
+    let by_victim = || victim.metric("graspd_requests_total{code=\"OK\",model=\"mirror 1\"}");
+    let made = Arc::new(AtomicUsize::new(0));
+    let calls = {
+        let made = Arc::clone(&made);
+        load(Arrivals::Callers(8), Until::Calls(CALLS), move |_| {
+            let (client, volume) = (client.clone(), Arc::clone(&volume));
+            made.fetch_add(1, Ordering::Relaxed);
+            async move {
+                let options = Options { dtype: DataType::F32, ..Options::default() };
+                let detection = client.detect(&volume, options).await.map_err(|error| {
+                    eprintln!("{error}");
+                    error.code().unwrap_or(Code::Unknown)
+                })?;
+                assert_eq!(detection.grasps.len(), 1);
+                Ok(())
+            }
+        })
+    };
+    let calls = tokio::spawn(calls);
+    while made.load(Ordering::Relaxed) < CALLS / 4 {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    assert!(by_victim() > 0.0, "it has had its share");
+    // SIGKILL.
+    drop(victim);
+    let report = calls.await.unwrap();
+    assert_eq!((report.answered.len(), report.refusals()), (CALLS, 0), "{:?}", report.refused.keys());
+    println!("{CALLS} calls, slowest {:?}", report.answered.last().unwrap());
+}
