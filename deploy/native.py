@@ -4,6 +4,7 @@
     native.py onnxruntime    the shared library, for ORT_DYLIB_PATH
     native.py libtorch       a folder with lib/ and include/, for LIBTORCH (training only)
     native.py python         the interpreter that runs the Python client's tests, for GRASPD_PYTHON
+    native.py peers          the interpreter that runs what graspd is compared with, for GRASPD_PEERS
 
 The path is all that goes to stdout. Where the named variable is set already, its path is checked and
 printed. What is fetched stays in ${GRASPD_CACHE:-~/.cache/graspd}: a second run touches no network.
@@ -75,7 +76,7 @@ UNPACKED = [
 CACHE_HOME = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
 CACHE = Path(os.environ.get("GRASPD_CACHE") or f"{CACHE_HOME}/graspd").expanduser().absolute()
 WHEELS = CACHE / "wheels"  # for wheels brought from another machine; looked at first
-REQUIREMENTS = Path(__file__).resolve().parent.parent / "tests/python/requirements.txt"
+TESTS = Path(__file__).resolve().parent.parent / "tests"
 PLATFORM = "{0.sysname}-{0.machine}".format(os.uname()) if hasattr(os, "uname") else sys.platform
 
 
@@ -106,27 +107,44 @@ def libtorch() -> Path:
 def python() -> Path:
     if os.environ.get("GRASPD_PYTHON"):
         return given("GRASPD_PYTHON")
-    version = "{}.{}".format(*sys.version_info)
     if sys.version_info < (3, 11):
+        version = "{}.{}".format(*sys.version_info)
         raise Unavailable(f"The Python client's tests need Python 3.11 or newer; {sys.executable} is {version}.")
-    import hashlib
+    return interpreter("python", sys.executable, "The Python packages of the tests", 95, "GRASPD_PYTHON")
 
-    folder = CACHE / f"python-{version}-{hashlib.sha256(REQUIREMENTS.read_bytes()).hexdigest()[:12]}"
+
+def peers() -> Path:
+    if os.environ.get("GRASPD_PEERS"):
+        return given("GRASPD_PEERS")
+    # The system's, which has a shared library beside it for Triton to load, wherever others are first on PATH.
+    system = "/usr/bin/python3"
+    if PLATFORM != "Linux-x86_64" or not os.path.exists(system):
+        raise Unavailable(f"The peers are for Linux on x86-64 with a {system}; this is {PLATFORM}.")
+    return interpreter("peers", system, "The Python packages of graspd's peers", 283, "GRASPD_PEERS")
+
+
+def interpreter(name: str, base: str, title: str, megabytes: int, variable: str) -> Path:
+    """One of its own, made from `base`, with the packages that `tests/{name}/requirements.txt` lists."""
+    import hashlib
+    import subprocess
+
+    requirements = TESTS / name / "requirements.txt"
+    ask = [base, "-c", "import sysconfig; print(sysconfig.get_python_version())"]
+    version = subprocess.check_output(ask, text=True).strip()
+    folder = CACHE / f"{name}-{version}-{hashlib.sha256(requirements.read_bytes()).hexdigest()[:12]}"
 
     def build(part: Path) -> None:
-        import venv
-
-        say(f"The Python packages of the tests, 95 MB of wheels -> {folder}")
+        say(f"{title}, {megabytes} MB of wheels -> {folder}")
         # Without a pip of its own, since Debian's Python has none to give. Nothing in bin/ but
         # `python` is used, which is what survives the renaming of the folder.
-        venv.create(part, with_pip=False)
-        names = [word for word in REQUIREMENTS.read_text().split() if "==" in word]
-        pip(["--python", f"{part}/bin/python", "install", "--requirement", str(REQUIREMENTS)], names, f"""\
-The Python packages of the tests could not be installed; pip says above why.
+        subprocess.run([base, "-m", "venv", "--without-pip", str(part)], stdout=sys.stderr, check=True)
+        names = [word for word in requirements.read_text().split() if "==" in word]
+        pip(["--python", f"{part}/bin/python", "install", "--requirement", str(requirements)], names, f"""\
+{title} could not be installed; pip says above why.
 To bring them from a machine with a network and Python {version}, run this there,
-    python3 -m pip download --dest wheels --requirement {REQUIREMENTS}
+    python3 -m pip download --dest wheels --requirement {requirements}
 and copy the wheels into {WHEELS}/
-or set GRASPD_PYTHON to an interpreter that has these packages.""")
+or set {variable} to an interpreter that has these packages.""")
 
     return built_once(folder, build) / "bin/python"
 
@@ -238,7 +256,7 @@ def say(line: str) -> None:
 
 
 if __name__ == "__main__":
-    subcommands = {"onnxruntime": onnxruntime, "libtorch": libtorch, "python": python}
+    subcommands = {"onnxruntime": onnxruntime, "libtorch": libtorch, "python": python, "peers": peers}
     if sys.argv[1:] not in [[name] for name in subcommands]:
         sys.exit(__doc__)
     try:

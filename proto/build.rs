@@ -9,10 +9,20 @@ use prost::Message;
 
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo:rerun-if-changed=proto");
-    let descriptors = protox::compile(["grasp/v1/grasp.proto"], ["proto"])?;
+    let descriptors = protox::compile(["grasp/v1/grasp.proto", "inference/inference.proto"], ["proto"])?;
+    // Reflection tells what is served.
+    let served = protox::compile(["grasp/v1/grasp.proto"], ["proto"])?;
     let out = PathBuf::from(env::var("OUT_DIR")?);
-    fs::write(out.join("descriptors.bin"), descriptors.encode_to_vec())?;
+    fs::write(out.join("descriptors.bin"), served.encode_to_vec())?;
     // `Bytes` shares the buffer that the message arrived in instead of copying the volume out of it.
-    tonic_prost_build::configure().bytes(".grasp.v1.Volume.data").compile_fds(descriptors)?;
+    let mut config = tonic_prost_build::configure();
+    for field in [
+        ".grasp.v1.Volume.data",
+        ".inference.ModelInferRequest.raw_input_contents",
+        ".inference.ModelInferResponse.raw_output_contents",
+    ] {
+        config = config.bytes(field);
+    }
+    config.compile_fds(descriptors)?;
     Ok(())
 }

@@ -1,7 +1,9 @@
 //! What every network here ends in (the paper, section "Grasping Heads"; the layers are VGN's).
 
+use std::iter;
+
 use crate::graph::{Builder, Conv};
-use crate::onnx::AttributeProto;
+use crate::onnx::{AttributeProto, ModelProto, NodeProto, TensorProto};
 
 /// The name of the heads' convolution.
 pub(crate) const HEADS: &str = "heads";
@@ -65,6 +67,42 @@ pub(crate) fn heads(b: &mut Builder, features: &str, channels: usize, resolution
     for (name, value, channels) in [("quality", quality, 1), ("rotation", rotation, 4), ("width", width, 1)] {
         b.output(name, &value, &[channels, resolution, resolution, resolution]);
     }
+}
+
+/// A network made here, with weights in f32, with a convolution for each of its heads, as VGN and the paper have it: the
+/// same mathematics at the published cost, to compare speeds with. `None` if it was made elsewhere.
+#[must_use]
+pub fn with_published_heads(model: &ModelProto) -> Option<ModelProto> {
+    let mut model = model.clone();
+    let graph = model.graph.as_mut()?;
+    let (weight, bias) = (format!("{HEADS}.weight"), format!("{HEADS}.bias"));
+    let conv = graph.node.iter().position(|node| node.input.get(1) == Some(&weight))?;
+    let all = graph.node[conv].output.first()?.clone();
+    let split = graph.node.iter().position(|node| node.op_type() == "Split" && node.input.first() == Some(&all))?;
+    let fused = graph.node[conv].clone();
+    let outputs = graph.node[split].output.clone();
+    let parameter = |name: &str| graph.initializer.iter().find(|tensor| tensor.name() == name).cloned();
+    let (weight, bias) = (parameter(&weight)?, parameter(&bias)?);
+    let (weights, biases) = (weight.to_f32().ok()?, bias.to_f32().ok()?);
+    let channels = biases.len().checked_sub(2)?;
+    let each = weights.len() / biases.len();
+
+    let mut first = 0;
+    let mut convolutions = Vec::new();
+    for (output, count) in outputs.into_iter().zip([1, channels, 1]) {
+        let part = |values: &[f32], each: usize| values[first * each..(first + count) * each].to_vec();
+        let names = ["weight", "bias"].map(|name| format!("{HEADS}.{output}.{name}"));
+        let dims: Vec<i64> = iter::once(count as i64).chain(weight.dims.iter().skip(1).copied()).collect();
+        graph.initializer.push(TensorProto::from_f32(&names[0], &dims, &part(&weights, each)));
+        graph.initializer.push(TensorProto::from_f32(&names[1], &[count as i64], &part(&biases, 1)));
+        let input = iter::once(fused.input[0].clone()).chain(names).collect();
+        convolutions.push(NodeProto { input, name: Some(output.clone()), output: vec![output], ..fused.clone() });
+        first += count;
+    }
+    graph.initializer.retain(|tensor| tensor.name() != weight.name() && tensor.name() != bias.name());
+    graph.node.remove(split);
+    graph.node.splice(conv..=conv, convolutions);
+    Some(model)
 }
 
 /// The quaternion of an approach (−z, x, y), of 2ψ (its cosine, its sine), and of how level the fingers close, none of unit

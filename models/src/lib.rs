@@ -19,7 +19,7 @@ mod turns;
 mod vgn;
 
 pub use half::{with_full_weights, with_half_weights};
-pub use heads::Orientation;
+pub use heads::{Orientation, with_published_heads};
 pub use metadata::{Metadata, MetadataError, ValueConvention};
 pub use networks::{Architecture, BuildError, build};
 pub use quantize::{QuantizeError, Range, quantized_activations, with_int8};

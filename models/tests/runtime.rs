@@ -8,7 +8,7 @@ use grasp::{SurfacePoint, Volume};
 use grasp_models::onnx::{Dimension, ModelProto, ValueInfoProto};
 use grasp_models::{
     Architecture, Backend, Classifier, Network, Options, Orientation, Precision, Provider, RuntimeError, TurnsError,
-    averaged_over_turns, build, gpd, init,
+    averaged_over_turns, build, gpd, init, with_published_heads,
 };
 use nalgebra::{Isometry3, Point3, Quaternion, UnitQuaternion, Vector3};
 use tempfile::TempDir;
@@ -54,6 +54,29 @@ fn vgn_gives_qualities_unit_quaternions_and_widths() {
         let length: f32 = (0..4).map(|c| maps.rotation[c * voxels + voxel].powi(2)).sum();
         assert!((length - 1.0).abs() < 1e-4, "voxel {voxel}: |r|² = {length}");
     }
+}
+
+#[test]
+fn heads_apart_give_what_they_give_together() {
+    let volume = volume(40, 3);
+    for (name, orientation) in [("vgn", Orientation::Axes), ("transformer-small", Orientation::Quaternion)] {
+        let model = name.parse::<Architecture>().unwrap().build_with(40, orientation, 5).unwrap();
+        let published = with_published_heads(&model).unwrap();
+        let convolutions = |model: &ModelProto| {
+            model.graph.as_ref().unwrap().node.iter().filter(|node| node.op_type() == "Conv").count()
+        };
+        assert_eq!(convolutions(&published), convolutions(&model) + 2);
+        let [mut together, mut apart] = [load(&model), load(&published)];
+        let (together, apart) = (together.infer(&[&volume]).unwrap(), apart.infer(&[&volume]).unwrap());
+        let (together, apart) = (together.maps(0), apart.maps(0));
+        for (a, b) in
+            [(together.quality, apart.quality), (together.rotation, apart.rotation), (together.width, apart.width)]
+        {
+            let largest = a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(largest < 1e-4, "{name}: {largest}");
+        }
+    }
+    assert!(with_published_heads(&gpd::gpd(0)).is_none());
 }
 
 /// The rotation that a network which regresses axes gives for these six numbers.

@@ -1,5 +1,5 @@
 //! `grasp.v1` on the wire: the types generated from `proto/grasp/v1/grasp.proto`, and their conversions to and from
-//! the domain.
+//! the domain; and those of the Open Inference Protocol.
 //!
 //! [`pb::Volume`] → [`grasp::Volume`] is where a request is checked: a [`FieldError`] names the field and its value.
 
@@ -12,6 +12,12 @@ mod volume;
 #[allow(missing_docs, reason = "the .proto file documents them, and prost copies that only where there is a comment")]
 pub mod pb {
     tonic::include_proto!("grasp.v1");
+}
+
+/// The same of the Open Inference Protocol.
+#[allow(missing_docs, reason = "the .proto file documents them")]
+pub mod oip {
+    tonic::include_proto!("inference");
 }
 
 pub use error::FieldError;

@@ -6,10 +6,12 @@ Triton's package on PyPI brings its Python backend alone, so onnxruntime runs th
 `inference.GRPCInferenceService` listens, then `ready`. SIGTERM ends it and Triton's processes.
 """
 
-import contextlib
+import os
 import signal
 import socket
 import sys
+from pathlib import Path
+from threading import Timer
 
 import numpy as np
 from plain_grpc import INPUT, OUTPUTS, arguments, end_at_sigterm, open_session, say
@@ -29,6 +31,11 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
+def kill_triton() -> None:
+    for child in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split():
+        os.kill(int(child), signal.SIGKILL)
+
+
 def main() -> None:
     chosen = arguments(__doc__)
     end_at_sigterm()
@@ -42,16 +49,26 @@ def main() -> None:
         return [Tensor(name=value.name, dtype=np.float32, shape=tuple(value.shape[1:])) for value in values]
 
     port = free_port()
-    config = TritonConfig(grpc_address="127.0.0.1", grpc_port=port, allow_http=False, allow_metrics=False, exit_timeout_secs=0)
-    # Triton's log, which comes by print().
-    with contextlib.redirect_stdout(sys.stderr), Triton(config=config) as triton:
+    # At the end no answer is waited for any more.
+    config = TritonConfig(
+        grpc_address="127.0.0.1", grpc_port=port, allow_http=False, allow_metrics=False, exit_timeout_secs=0
+    )
+    # Triton's log comes by print().
+    sys.stdout = sys.stderr
+    with Triton(config=config) as triton:
         inputs, outputs = tensors(session.get_inputs()), tensors(session.get_outputs())
         triton.bind(MODEL, infer, inputs, outputs, config=ModelConfig(max_batch_size=MAX_BATCH))
         with ModelClient(f"grpc://127.0.0.1:{port}", MODEL) as client:
             client.infer_sample(np.full(inputs[0].shape, 0.5, np.float32))
         say(f"grpc listening on 127.0.0.1:{port}")
         say("ready")
-        signal.pause()
+        try:
+            signal.pause()
+        finally:
+            # All is done in two seconds, but then Triton's gRPC sometimes takes eight more to shut down.
+            impatience = Timer(2.5, kill_triton)
+            impatience.daemon = True
+            impatience.start()
 
 
 if __name__ == "__main__":

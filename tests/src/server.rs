@@ -116,15 +116,6 @@ impl Server {
         panic!("{series} is {}, not {value}", self.metric(series));
     }
 
-    /// The memory that it has in use.
-    ///
-    /// # Panics
-    /// When the system does not say.
-    #[must_use]
-    pub fn resident_bytes(&self) -> u64 {
-        memory(self.id(), "VmRSS")
-    }
-
     /// The folder of its models.
     #[must_use]
     pub fn models(&self) -> &std::path::Path {
@@ -132,10 +123,27 @@ impl Server {
     }
 }
 
-/// What Linux says of a process's memory, bytes.
+/// The memory that a process has in use.
+///
+/// # Panics
+/// When it does not run, or not on Linux.
+#[must_use]
+pub fn resident_bytes(process: u32) -> u64 {
+    memory(process, "VmRSS:")
+}
+
+/// The most memory that a process ever had in use.
+///
+/// # Panics
+/// When it does not run, or not on Linux.
+#[must_use]
+pub fn peak_bytes(process: u32) -> u64 {
+    memory(process, "VmHWM:")
+}
+
 fn memory(process: u32, field: &str) -> u64 {
     let status = std::fs::read_to_string(format!("/proc/{process}/status")).expect("the process runs, on Linux");
-    let value = status.lines().find_map(|line| line.strip_prefix(field)?.strip_prefix(':'));
+    let value = status.lines().find_map(|line| line.strip_prefix(field));
     let kilobytes = value.and_then(|value| value.trim().strip_suffix(" kB")?.parse::<u64>().ok());
     kilobytes.expect("a number of kB") * 1024
 }

@@ -7,7 +7,7 @@ use std::time::Duration;
 use grasp::Volume;
 use grasp_client::{Client, DataType, Error, LocalServer, Options};
 use grasp_proto::{encode, pb};
-use grasp_tests::{RESOLUTION, Server, TestModel, blobs, graspd};
+use grasp_tests::{RESOLUTION, Server, TestModel, blobs, graspd, resident_bytes};
 use h2::client::SendRequest;
 use nalgebra::Isometry3;
 use prost::Message;
@@ -179,7 +179,7 @@ async fn ten_thousand_idle_connections_cost_little_and_hold_up_nobody() {
     let server = Server::run(&[TestModel::new("mirror")], &["--log", "warn"]);
     let client = server.client().await;
     client.detect(&volume(), Options::default()).await.unwrap();
-    let before = server.resident_bytes();
+    let before = resident_bytes(server.id());
     let mut idle = Vec::new();
     for _ in 0..CONNECTIONS {
         idle.push(connect(&server).await);
@@ -189,7 +189,7 @@ async fn ten_thousand_idle_connections_cost_little_and_hold_up_nobody() {
         assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 1);
     }
     server.client().await.detect(&volume(), Options::default()).await.unwrap();
-    let each = (server.resident_bytes() - before) / CONNECTIONS as u64;
+    let each = (resident_bytes(server.id()) - before) / CONNECTIONS as u64;
     println!("{each} bytes a connection");
     assert!(each < 100_000, "{each} bytes a connection");
     drop(idle);

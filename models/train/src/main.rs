@@ -6,6 +6,7 @@ mod device;
 mod evaluate;
 mod export;
 mod run;
+mod time;
 
 use std::path::PathBuf;
 
@@ -44,6 +45,8 @@ enum Command {
     Classify(classify::Classify),
     /// Writes a network with its weights in another precision.
     Export(export::Export),
+    /// Times a network in libtorch's eager mode, in which published networks are usually run.
+    Time(time::Time),
 }
 
 /// How a network is trained. Where VGN's training and the paper's differ, the default follows the network.
@@ -193,5 +196,6 @@ fn main() -> anyhow::Result<()> {
         Command::Train(training) => run::train(&training),
         Command::Classify(command) => command.run(),
         Command::Export(command) => command.run(),
+        Command::Time(command) => command.run(),
     }
 }

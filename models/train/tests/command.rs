@@ -245,3 +245,13 @@ fn what_cannot_be_done_is_said() {
         assert!(said(&output).contains(expected), "{arguments}: {}", said(&output));
     }
 }
+
+#[test]
+fn the_eager_mode_is_timed() {
+    let folder = tempfile::tempdir().unwrap();
+    assert!(command(folder.path(), "init --network vgn --out vgn.onnx").status().unwrap().success());
+    let output = command(folder.path(), "time --model vgn.onnx --calls 2").output().unwrap();
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert!(report["p50_ms"].as_f64().unwrap() > 0.0 && report["published_p50_ms"].as_f64().unwrap() > 0.0, "{report}");
+    assert_eq!(report["calls"], 2);
+}

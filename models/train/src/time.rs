@@ -1,0 +1,70 @@
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result};
+use clap::Args;
+use grasp::RESOLUTION;
+use grasp_models::onnx::ModelProto;
+use grasp_models::{with_full_weights, with_published_heads};
+use grasp_train::{Execution, Executor};
+use serde::Serialize;
+use tch::{Device, Kind, Tensor};
+
+/// Volumes before those that are timed.
+const WARM_UP: usize = 3;
+
+/// How long libtorch takes for one volume in fp32, an operator at a time: what PyTorch does in eager mode.
+#[derive(Args)]
+pub(crate) struct Time {
+    /// The model.
+    #[arg(long)]
+    model: PathBuf,
+    /// How many volumes to time.
+    #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..))]
+    calls: u32,
+    /// Threads that libtorch uses.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
+    threads: u16,
+}
+
+/// What is printed.
+#[derive(Serialize)]
+struct Report {
+    calls: u32,
+    threads: u16,
+    /// The file's graph.
+    p50_ms: f64,
+    /// With a convolution for each of the three heads, as VGN and the paper have it.
+    published_p50_ms: f64,
+}
+
+impl Time {
+    pub fn run(&self) -> Result<()> {
+        tch::set_num_threads(self.threads.into());
+        let model = ModelProto::read(&self.model)?;
+        let published = with_published_heads(&with_full_weights(&model)?).context("the network was not made here")?;
+        let published_p50_ms = self.median(published)?;
+        let p50_ms = self.median(model)?;
+        let report = Report { calls: self.calls, threads: self.threads, p50_ms, published_p50_ms };
+        println!("{}", serde_json::to_string(&report)?);
+        Ok(())
+    }
+
+    /// Milliseconds.
+    fn median(&self, model: ModelProto) -> Result<f64> {
+        let execution = Execution { device: Device::Cpu, bf16: false, channels_last: false };
+        let executor = Executor::new(model, execution)?;
+        let edge = RESOLUTION as i64;
+        let volume = Tensor::rand([1, 1, edge, edge, edge], (Kind::Float, Device::Cpu));
+        let mut times = Vec::new();
+        let _no_gradients = tch::no_grad_guard();
+        for _ in 0..WARM_UP + self.calls as usize {
+            let started = Instant::now();
+            executor.forward(&volume)?;
+            times.push(started.elapsed());
+        }
+        let times = &mut times[WARM_UP..];
+        times.sort_unstable();
+        Ok(times.get(times.len() / 2).map_or(0.0, Duration::as_secs_f64) * 1e3)
+    }
+}

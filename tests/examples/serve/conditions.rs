@@ -1,0 +1,47 @@
+use std::fs::{self, File};
+use std::path::Path;
+use std::process::Command;
+
+use anyhow::{Context, ensure};
+use grasp::Volume;
+use grasp_models::init;
+use grasp_tests::grasp_sim;
+use nalgebra::Isometry3;
+use npyz::npz::NpzArchive;
+
+/// The network that is measured, with what it learnt.
+pub(crate) const ZOO: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo/vgn-packed.onnx");
+
+/// On what everything was measured.
+pub(crate) fn describe(threads: usize) -> anyhow::Result<String> {
+    ensure!(!cfg!(debug_assertions), "this measures: build it with --release");
+    let cpu = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let cpu = cpu.lines().find_map(|line| line.strip_prefix("model name")).unwrap_or("\t: an unknown CPU");
+    let load = fs::read_to_string("/proc/loadavg").unwrap_or_default();
+    let runtime = init()?;
+    let seconds = std::time::SystemTime::UNIX_EPOCH.elapsed()?.as_secs();
+    Ok(format!(
+        "{} × {threads}, {threads} threads a session, callers on the same CPUs, release build; ONNX Runtime {}; load {} \
+         before; Unix time {seconds}",
+        cpu.trim_start_matches(['\t', ':', ' ']),
+        runtime.version,
+        load.split(' ').next().unwrap_or("?"),
+    ))
+}
+
+/// A packed scene seen from one side, as the simulator makes it.
+pub(crate) fn scene(folder: &Path) -> anyhow::Result<Volume> {
+    let out = folder.join("scene");
+    let label = "label --scene packed --scenes 1 --points 1 --seed 51 --format processed --out";
+    let output = Command::new(grasp_sim()).args(label.split(' ')).arg(&out).output()?;
+    ensure!(output.status.success(), "grasp-sim: {}", String::from_utf8_lossy(&output.stderr));
+    let path = fs::read_dir(out.join("scenes"))?.next().context("a scene")??.path();
+    let mut archive = NpzArchive::new(File::open(path)?)?;
+    let grid = archive.by_name("grid")?.context("a grid")?;
+    let values: Vec<f32> = match grid.dtype().num_bytes() {
+        Some(1) => grid.into_vec::<u8>()?.into_iter().map(|value| f32::from(value) / 255.0).collect(),
+        _ => grid.into_vec::<f32>()?,
+    };
+    let voxel_size = grasp::WORKSPACE_SIZE / grasp::RESOLUTION as f64;
+    Ok(Volume::new(grasp::RESOLUTION, voxel_size, Isometry3::identity(), values)?)
+}

@@ -1,0 +1,328 @@
+//! How fast the server answers, beside what it is made of and beside other servers, all in one run.
+//!
+//! `make bench-serve`, or `cargo run --release -p grasp-tests --example serve [SECONDS]` with `ORT_DYLIB_PATH` set; `SECONDS`
+//! is how long each load lasts, 5 by default. `GRASP_TRAIN` names grasp-train, for libtorch's eager mode; `GRASPD_PEERS`
+//! names a Python with the packages of tests/peers, for the other servers. What is not there is left out.
+//!
+//! The last line is one JSON object. Times are those of one machine that does nothing else; compare ratios.
+
+mod conditions;
+mod peers;
+mod table;
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, ensure};
+use grasp::{Volume, decode};
+use grasp_client::{Arrivals, Client, DataType, LocalServer, Options, Report, Until, load};
+use grasp_models::{Architecture, Network, Options as Running};
+use grasp_tests::{TestModel, graspd, peak_bytes};
+use tempfile::TempDir;
+use tonic::Code;
+
+use crate::peers::{Peer, eager, openvino};
+use crate::table::{Figures, Table, milliseconds};
+
+/// Calls of the identity network, of which only the hop is left.
+const HOPS: usize = 10_000;
+/// Calls before those that count.
+const WARM_UP: usize = 20;
+/// Each row is measured in so many turns, one row after the other, so that a slow minute falls on all of them.
+const TURNS: usize = 5;
+/// How many ask at the same time.
+const CROWDS: [usize; 3] = [1, 8, 32];
+/// The batch sizes of which the best is what a machine can do.
+const BATCHES: [usize; 4] = [1, 2, 4, 8];
+
+#[tokio::main(flavor = "current_thread")]
+async fn main() -> anyhow::Result<()> {
+    let seconds = std::env::args().nth(1).map_or(Ok(5.0), |seconds| seconds.parse())?;
+    let bench = Bench::new(Duration::from_secs_f64(seconds))?;
+    let mut figures = Figures::default();
+    println!("{}", conditions::describe(bench.threads)?);
+    bench.hop(&mut figures).await?;
+    for network in ["vgn", "transformer"] {
+        bench.latency(network, &mut figures).await?;
+    }
+    bench.throughput(&mut figures).await?;
+    bench.life(&mut figures)?;
+    println!("{}", figures.json());
+    Ok(())
+}
+
+struct Bench {
+    threads: usize,
+    seconds: Duration,
+    folder: TempDir,
+    scene: Volume,
+}
+
+impl Bench {
+    /// Makes a scene and a folder for each network.
+    fn new(seconds: Duration) -> anyhow::Result<Self> {
+        let threads = std::thread::available_parallelism()?.get();
+        let folder = tempfile::tempdir()?;
+        let models = |name: &str| -> anyhow::Result<PathBuf> {
+            let models = folder.path().join(name);
+            std::fs::create_dir(&models)?;
+            Ok(models)
+        };
+        TestModel::new("mirror").resolution(grasp::RESOLUTION).write(&models("mirror")?);
+        std::fs::copy(conditions::ZOO, models("vgn")?.join("vgn.onnx"))
+            .with_context(|| format!("cannot copy {}", conditions::ZOO))?;
+        // Nobody has trained one yet; how long it takes does not depend on what it knows.
+        let transformer = Architecture::Transformer.build(grasp::RESOLUTION, 0)?;
+        transformer.write(&models("transformer")?.join("transformer.onnx"))?;
+        let scene = conditions::scene(folder.path())?;
+        Ok(Self { threads, seconds, folder, scene })
+    }
+
+    fn models(&self, network: &str) -> PathBuf {
+        self.folder.path().join(network)
+    }
+
+    fn file(&self, network: &str) -> PathBuf {
+        let name = if network == "mirror" { "mirror-1" } else { network };
+        self.models(network).join(format!("{name}.onnx"))
+    }
+
+    /// graspd as it is by default.
+    fn serve(&self, network: &str, flags: &[&str]) -> anyhow::Result<LocalServer> {
+        let models = self.models(network);
+        let fixed = ["--log".as_ref(), "warn".as_ref(), "--models".as_ref(), models.as_os_str()];
+        Ok(LocalServer::spawn(graspd(), fixed.into_iter().chain(flags.iter().map(AsRef::as_ref)))?)
+    }
+
+    /// What gRPC costs: the identity network leaves nothing else.
+    async fn hop(&self, figures: &mut Figures) -> anyhow::Result<()> {
+        let mut network = Network::load(&self.file("mirror"), &Running::default())?;
+        let server = self.serve("mirror", &["--provider", "cpu", "--threads", "1"])?;
+        let client = Client::connect(server.grpc().to_string()).await?;
+        let mut table = Table::new(&format!("identity network, {HOPS} calls, one at a time"), &["p50 ms", "p99 ms"]);
+        network.fill(&[&self.scene])?;
+        let run = times(HOPS, || network.run(1).map(drop))?;
+        table.row("session.run", [0.5, 0.99].map(|share| milliseconds(Report::quantile(&run, share))));
+        for (name, dtype) in [("f32", DataType::F32), ("f16", DataType::F16), ("u8", DataType::U8)] {
+            let options = Options { dtype, ..Options::default() };
+            let calls = self.calls(&client, Arrivals::Callers(1), Until::Calls(HOPS), options).await?;
+            let hop = [0.5, 0.99].map(|share| {
+                milliseconds(Report::quantile(&calls, share)) - milliseconds(Report::quantile(&run, share))
+            });
+            table.row(&format!("gRPC beyond it, {name}"), hop);
+            if dtype == DataType::F32 {
+                figures.add("hop_p50_ms", hop[0]);
+                figures.add("hop_p99_ms", hop[1]);
+            }
+        }
+        table.print();
+        Ok(())
+    }
+
+    /// One caller: bare, in this process, and over gRPC, in turns; then what others take for the same.
+    async fn latency(&self, name: &str, figures: &mut Figures) -> anyhow::Result<()> {
+        let mut network = Network::load(&self.file(name), &Running::auto(self.threads))?;
+        let server = self.serve(name, &[])?;
+        let client = Client::connect(server.grpc().to_string()).await?;
+        let (backend, params) = (network.backend(), network.metadata().decode_params());
+        let [mut bare, mut service, mut grpc] = [const { Vec::new() }; 3];
+        network.fill(&[&self.scene])?;
+        let probe = times(WARM_UP, || network.run(1).map(drop))?;
+        let typical = Report::quantile(&probe, 0.5);
+        let calls = (self.seconds.as_secs_f64() / typical.as_secs_f64()).ceil() as usize / TURNS + 1;
+        for _ in 0..TURNS {
+            bare.extend(times(calls, || network.run(1).map(drop))?);
+            service.extend(times(calls, || {
+                let output = network.infer(&[&self.scene])?;
+                decode(&self.scene, &output.maps(0), &params)?;
+                anyhow::Ok(())
+            })?);
+            grpc.extend(self.calls(&client, Arrivals::Callers(1), Until::Calls(calls), Options::default()).await?);
+        }
+        drop((server, network));
+
+        let title = format!("{name}, {backend}, {} calls, one at a time", calls * TURNS);
+        let mut table = Table::new(&title, &["p50 ms", "p99 ms", "gRPC's p50 to it"]);
+        let mut p50 = 0.0;
+        for (row, times) in [("gRPC", &mut grpc), ("infer + decode", &mut service), ("session.run", &mut bare)] {
+            times.sort_unstable();
+            let [median, p99] = [0.5, 0.99].map(|share| milliseconds(Report::quantile(times, share)));
+            if row == "gRPC" {
+                p50 = median;
+            }
+            table.row(row, [median, p99, p50 / median]);
+        }
+        if let Some(eager) = eager(&self.file(name), self.threads)? {
+            table.row("libtorch, eager, fp32", [eager.p50_ms, f64::NAN, p50 / eager.p50_ms]);
+            table.row(
+                "  its heads apart, as published",
+                [eager.published_p50_ms, f64::NAN, p50 / eager.published_p50_ms],
+            );
+            figures.add(&format!("{name}_vs_torch"), p50 / eager.published_p50_ms);
+        }
+        if let Some(latency) = openvino(&self.file(name), self.threads, backend.precision, calls * TURNS)? {
+            let row = format!("OpenVINO {} alone, {}", latency.version, backend.precision);
+            table.row(&row, [latency.p50_ms, latency.p99_ms, p50 / latency.p50_ms]);
+            if name == "vgn" {
+                figures.add("openvino_ratio", p50 / latency.p50_ms);
+            }
+        }
+        figures.add(&format!("{name}_p50_ms"), p50);
+        table.print();
+        Ok(())
+    }
+
+    /// Many callers, beside the best that this machine can do and beside other servers; then callers who come by chance.
+    async fn throughput(&self, figures: &mut Figures) -> anyhow::Result<()> {
+        let mut network = Network::load(&self.file("vgn"), &Running::auto(self.threads))?;
+        let (backend, mut best, mut bare_p50) = (network.backend(), 0.0_f64, 0.0);
+        let mut table = Table::new(&format!("vgn, {backend}, session.run in batches"), &["volumes/s", "p50 ms"]);
+        for batch in BATCHES {
+            network.fill(&vec![&self.scene; batch])?;
+            times(WARM_UP, || network.run(batch).map(drop))?;
+            let (started, mut taken) = (Instant::now(), Vec::new());
+            while started.elapsed() < self.seconds {
+                taken.extend(times(1, || network.run(batch).map(drop))?);
+            }
+            taken.sort_unstable();
+            let volumes = (batch * taken.len()) as f64 / started.elapsed().as_secs_f64();
+            let p50 = milliseconds(Report::quantile(&taken, 0.5));
+            table.row(&format!("{batch}"), [volumes, p50]);
+            best = best.max(volumes);
+            if batch == 1 {
+                bare_p50 = p50;
+            }
+        }
+        drop(network);
+        table.print();
+
+        let mut table = Table::new(
+            &format!("vgn, {backend}, many callers, {:?} each", self.seconds),
+            &["callers", "answers/s", "p50 ms", "p99 ms"],
+        );
+        let mut crowd = |server: &str, callers: usize, report: &Report| {
+            let [p50, p99] = [0.5, 0.99].map(|share| milliseconds(Report::quantile(&report.answered, share)));
+            table.row(server, [callers as f64, report.throughput(), p50, p99]);
+            report.throughput()
+        };
+        let mut capacity = 0.0;
+        {
+            let server = self.serve("vgn", &["--queue", "64"])?;
+            let client = Client::connect(server.grpc().to_string()).await?;
+            for callers in CROWDS {
+                let report = self.load(&client, Arrivals::Callers(callers), self.until(), Options::default()).await;
+                let throughput = crowd("graspd", callers, &report);
+                ensure!(report.refusals() == 0, "graspd refused {} calls", report.refusals());
+                if callers == 8 {
+                    capacity = throughput;
+                }
+            }
+        }
+        figures.add("throughput_ratio", capacity / best);
+        for kind in ["plain_grpc", "triton"] {
+            let Some(peer) = Peer::run(kind, &self.file("vgn"), self.threads, backend)? else { continue };
+            for callers in CROWDS {
+                let report = peer.load(&self.scene, callers, self.until()).await?;
+                let throughput = crowd(kind, callers, &report);
+                ensure!(report.refusals() == 0, "{kind} refused {} calls", report.refusals());
+                if callers == 8 {
+                    figures.add(&format!("{kind}_ratio"), capacity / throughput);
+                }
+            }
+        }
+        table.print();
+        self.chance(capacity, bare_p50, figures).await
+    }
+
+    /// The highest rate at which callers who come by chance wait no longer than three bare inferences, but for one in a
+    /// hundred.
+    async fn chance(&self, capacity: f64, bare_p50: f64, figures: &mut Figures) -> anyhow::Result<()> {
+        let server = self.serve("vgn", &[])?;
+        let client = Client::connect(server.grpc().to_string()).await?;
+        let mut table = Table::new(
+            "vgn, callers who come by chance",
+            &["a second", "of capacity", "p50 ms", "p99 ms", "p99 to bare"],
+        );
+        let (mut good, mut bad) = (0.0, 1.0);
+        for _ in 0..6 {
+            let share = f64::midpoint(good, bad);
+            let rate = share * capacity;
+            let until = Until::Elapsed(2 * self.seconds);
+            let report = self.load(&client, Arrivals::Rate(rate), until, Options::default()).await;
+            let [p50, p99] = [0.5, 0.99].map(|share| milliseconds(Report::quantile(&report.answered, share)));
+            table.row("", [rate, share, p50, p99, p99 / bare_p50]);
+            if report.refusals() == 0 && p99 <= 3.0 * bare_p50 { good = share } else { bad = share }
+        }
+        table.print();
+        figures.add("poisson_rate", good * capacity);
+        figures.add("poisson_share", good);
+        Ok(())
+    }
+
+    /// From nothing to the first answer, and the memory that took.
+    fn life(&self, figures: &mut Figures) -> anyhow::Result<()> {
+        let mut table = Table::new("graspd's life", &["s to ready", "MB at most"]);
+        for network in ["vgn", "transformer"] {
+            let started = Instant::now();
+            let server = self.serve(network, &[])?;
+            let ready = started.elapsed().as_secs_f64();
+            let peak = peak_bytes(server.id()) as f64 / 1e6;
+            table.row(network, [ready, peak]);
+            figures.add(&format!("{network}_ready_s"), ready);
+            figures.add(&format!("{network}_peak_mb"), peak);
+        }
+        table.print();
+        Ok(())
+    }
+
+    fn until(&self) -> Until {
+        Until::Elapsed(self.seconds)
+    }
+
+    /// The sorted times of calls that must all be answered.
+    async fn calls(
+        &self,
+        client: &Client,
+        arrivals: Arrivals,
+        until: Until,
+        options: Options,
+    ) -> anyhow::Result<Vec<Duration>> {
+        let report = self.load(client, arrivals, until, options).await;
+        ensure!(report.refusals() == 0, "graspd refused {} calls: {:?}", report.refusals(), report.refused.keys());
+        Ok(report.answered)
+    }
+
+    async fn load(&self, client: &Client, arrivals: Arrivals, until: Until, options: Options) -> Report {
+        for _ in 0..WARM_UP {
+            // What is wrong is seen in what follows.
+            let _ = client.detect(&self.scene, options.clone()).await;
+        }
+        let (client, scene) = (client.clone(), Arc::new(self.scene.clone()));
+        load(arrivals, until, move |_| {
+            let (client, scene, options) = (client.clone(), Arc::clone(&scene), options.clone());
+            async move {
+                let detection = client.detect(&scene, options).await;
+                detection.map(drop).map_err(|error| error.code().unwrap_or(Code::Unknown))
+            }
+        })
+        .await
+    }
+}
+
+/// How long each of so many takes, sorted.
+fn times<E>(count: usize, mut work: impl FnMut() -> Result<(), E>) -> Result<Vec<Duration>, E> {
+    let mut times = Vec::with_capacity(count);
+    for _ in 0..count {
+        let started = Instant::now();
+        work()?;
+        times.push(started.elapsed());
+    }
+    times.sort_unstable();
+    Ok(times)
+}
+
+/// A path below this crate's folder.
+fn beside(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
+}

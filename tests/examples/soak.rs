@@ -1,0 +1,121 @@
+//! Whether the server stays what it is, under more than it can do and for long.
+//!
+//! `make soak`, or `cargo run --release -p grasp-tests --example soak [MINUTES]` with `ORT_DYLIB_PATH` set. First a minute in
+//! which four times as many ask as can be answered, then, for 20 minutes unless told otherwise, callers who come by chance
+//! at 80 % of what it can do. The last line is one JSON object.
+
+use std::fs;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::ensure;
+use grasp::Volume;
+use grasp_client::{Arrivals, Client, LocalServer, Options, Report, Until, load};
+use grasp_tests::{blobs, graspd};
+use nalgebra::Isometry3;
+use serde_json::json;
+use tonic::Code;
+
+const ZOO: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo");
+const MINUTE: Duration = Duration::from_mins(1);
+/// How long the capacity is measured.
+const CAPACITY: Duration = Duration::from_secs(15);
+/// So many ask at the same time for it.
+const CALLERS: usize = 4;
+/// What the overload is, in capacities.
+const OVERLOAD: f64 = 4.0;
+/// What the soak is.
+const SOAK: f64 = 0.8;
+
+#[tokio::main(flavor = "current_thread")]
+async fn main() -> anyhow::Result<()> {
+    ensure!(!cfg!(debug_assertions), "this measures: build it with --release");
+    let minutes: u32 = std::env::args().nth(1).map_or(Ok(20), |minutes| minutes.parse())?;
+    let server = LocalServer::spawn(graspd(), ["--models", ZOO, "--log", "error"])?;
+    let caller = Caller {
+        client: Client::connect(server.grpc().to_string()).await?,
+        volume: Arc::new(blobs(grasp::RESOLUTION, Isometry3::identity(), &[[10, 20, 15], [30, 12, 25]])),
+    };
+    caller.load(Arrivals::Callers(1), Duration::from_secs(2)).await;
+    let capacity = caller.load(Arrivals::Callers(CALLERS), CAPACITY).await.throughput();
+    println!("capacity: {capacity:.1} answers a second to {CALLERS} callers, in {CAPACITY:?}");
+
+    let before = Use::of(&server)?;
+    let report = caller.load(Arrivals::Rate(OVERLOAD * capacity), MINUTE).await;
+    let after = Use::of(&server)?;
+    let only_overload = report.refused.keys().all(|&code| code == i32::from(Code::ResourceExhausted));
+    ensure!(only_overload, "other refusals than for want of room: {:?}", report.refused.keys());
+    let refused = report.refused.values().next().map_or(&[][..], Vec::as_slice);
+    let goodput = report.throughput() / capacity;
+    let [refusal_p50, refusal_p99] = [0.5, 0.99].map(|share| Report::quantile(refused, share).as_secs_f64() * 1e3);
+    println!(
+        "{OVERLOAD} × that for {MINUTE:?}: {} answered, {:.1} % of capacity; {} refused, in {refusal_p50:.2} ms (p50), \
+         {refusal_p99:.2} ms (p99); memory {:.1} MB before, {:.1} MB after",
+        report.answered.len(),
+        100.0 * goodput,
+        refused.len(),
+        before.megabytes,
+        after.megabytes
+    );
+
+    println!(
+        "\n{:.1} a second for {minutes} minutes\nminute   answered  p50 ms  p99 ms      MB  files",
+        SOAK * capacity
+    );
+    let mut course = Vec::new();
+    for minute in 1..=minutes {
+        let report = caller.load(Arrivals::Rate(SOAK * capacity), MINUTE).await;
+        ensure!(report.refusals() == 0, "{} calls were refused: {:?}", report.refusals(), report.refused.keys());
+        let [p50, p99] = [0.5, 0.99].map(|share| Report::quantile(&report.answered, share).as_secs_f64() * 1e3);
+        let used = Use::of(&server)?;
+        println!("{minute:6} {:10} {p50:7.2} {p99:7.2} {:7.1} {:6}", report.answered.len(), used.megabytes, used.files);
+        course.push((p99, used));
+    }
+    let (Some((first_p99, first)), Some((last_p99, last))) = (course.first(), course.last()) else { return Ok(()) };
+    let figures = json!({
+        "capacity_per_s": capacity,
+        "goodput_ratio": goodput,
+        "refusal_p99_ms": refusal_p99,
+        "overload_memory_growth": after.megabytes / before.megabytes - 1.0,
+        "p99_last_to_first": last_p99 / first_p99,
+        "memory_growth": last.megabytes / first.megabytes - 1.0,
+        "files_first": first.files,
+        "files_last": last.files,
+    });
+    println!("{figures}");
+    Ok(())
+}
+
+struct Caller {
+    client: Client,
+    volume: Arc<Volume>,
+}
+
+impl Caller {
+    async fn load(&self, arrivals: Arrivals, duration: Duration) -> Report {
+        let (client, volume) = (self.client.clone(), Arc::clone(&self.volume));
+        load(arrivals, Until::Elapsed(duration), move |_| {
+            let (client, volume) = (client.clone(), Arc::clone(&volume));
+            async move {
+                let detection = client.detect(&volume, Options::default()).await;
+                detection.map(drop).map_err(|error| error.code().unwrap_or(Code::Unknown))
+            }
+        })
+        .await
+    }
+}
+
+/// What a process holds.
+struct Use {
+    megabytes: f64,
+    files: usize,
+}
+
+impl Use {
+    fn of(server: &LocalServer) -> anyhow::Result<Self> {
+        let process = format!("/proc/{}", server.id());
+        let files = fs::read_dir(Path::new(&process).join("fd"))?.count();
+        Ok(Self { megabytes: grasp_tests::resident_bytes(server.id()) as f64 / 1e6, files })
+    }
+}
