@@ -18,7 +18,10 @@ with_python = GRASPD_PYTHON="$$($(PYTHON) deploy/native.py python)" && export GR
 with_libtorch = LIBTORCH="$$($(PYTHON) deploy/native.py libtorch)" && export LIBTORCH && \
 	LD_LIBRARY_PATH="$$LIBTORCH/lib$${LD_LIBRARY_PATH:+:$$LD_LIBRARY_PATH}" && export LD_LIBRARY_PATH &&
 
-.PHONY: help demo build test fmt fmt-check lint doc deny test-rust test-train test-python bench-sim tables clean
+with_haproxy = GRASPD_HAPROXY="$$($(PYTHON) deploy/native.py haproxy)" && export GRASPD_HAPROXY &&
+
+.PHONY: help demo build test fmt fmt-check lint doc deny test-rust test-train test-python test-faults fuzz bench-sim \
+	bench-serve soak tables clean
 # The order of test's parts is the order in which they fail fastest, also under `make -j`.
 .NOTPARALLEL:
 
@@ -60,8 +63,25 @@ test-train: ## test training, in libtorch on the CPU
 test-python: ## of test-rust, only the tests whose names say python
 	$(with_onnxruntime) $(with_python) $(CARGO) test $(WORKSPACE) python
 
+test-faults: ## test what test leaves out: a replica killed behind haproxy, ten thousand connections
+	$(with_onnxruntime) $(with_haproxy) $(CARGO) test --package grasp-tests --locked \
+		--test replicas --test faults -- --ignored --nocapture
+
+fuzz: ## send a million made-up requests to the decoder (needs cargo-fuzz)
+	RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run --fuzz-dir tests/fuzz --target-dir $(CARGO_TARGET_DIR)/fuzz --sanitizer none \
+		request -- -runs=1000000 -max_len=4096
+
 bench-sim: ## how fast scenes are made, seen and labelled on one core
 	$(CARGO) run --release --package grasp-sim --example speed --locked
+
+bench-serve: ## how fast the server answers, beside libtorch, OpenVINO, Triton and a server in Python; quiet machines only
+	$(CARGO) build --release $(WORKSPACE) --bins
+	$(with_libtorch) $(CARGO) build --release $(TRAIN)
+	$(with_onnxruntime) $(with_libtorch) GRASPD_PEERS="$$($(PYTHON) deploy/native.py peers)" && export GRASPD_PEERS && \
+		GRASP_TRAIN=$(RELEASE)/grasp-train $(CARGO) run --release --package grasp-tests --example serve --locked
+
+soak: ## a minute of four times what the server can do, then 20 minutes of 80 % of it; MINUTES=N
+	$(with_onnxruntime) $(CARGO) run --release --package grasp-tests --example soak --locked -- $(MINUTES)
 
 tables: ## play the paper's tables into docs/tables.md; VGN=DIR adds VGN's released weights
 	$(with_onnxruntime) $(CARGO) run --release --package grasp-sim --locked -- tables $(if $(VGN),--released $(VGN))

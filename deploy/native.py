@@ -5,6 +5,7 @@
     native.py libtorch       a folder with lib/ and include/, for LIBTORCH (training only)
     native.py python         the interpreter that runs the Python client's tests, for GRASPD_PYTHON
     native.py peers          the interpreter that runs what graspd is compared with, for GRASPD_PEERS
+    native.py haproxy        the load balancer of `make test-faults`, for GRASPD_HAPROXY
 
 The path is all that goes to stdout. Where the named variable is set already, its path is checked and
 printed. What is fetched stays in ${GRASPD_CACHE:-~/.cache/graspd}: a second run touches no network.
@@ -121,6 +122,45 @@ def peers() -> Path:
     if PLATFORM != "Linux-x86_64" or not os.path.exists(system):
         raise Unavailable(f"The peers are for Linux on x86-64 with a {system}; this is {PLATFORM}.")
     return interpreter("peers", system, "The Python packages of graspd's peers", 283, "GRASPD_PEERS")
+
+
+def haproxy() -> Path:
+    if os.environ.get("GRASPD_HAPROXY"):
+        return given("GRASPD_HAPROXY")
+    return from_debian("haproxy", "usr/sbin/haproxy", "GRASPD_HAPROXY")
+
+
+def from_debian(package: str, program: str, variable: str) -> Path:
+    """A program of Debian's with the libraries that this machine lacks, unpacked instead of installed: nobody has to be
+    root, and nothing starts at boot."""
+    import shutil
+    import subprocess
+
+    name = Path(program).name
+    there = shutil.which(name, path=os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin"]))
+    if there:
+        return Path(there)
+    if not shutil.which("apt-get"):
+        raise Unavailable(f"There is no {name} here, and no apt-get to fetch it: set {variable} to one.")
+    folder = CACHE / f"debian-{package}-{PLATFORM}"
+
+    def build(part: Path) -> None:
+        say(f"Debian's {package} -> {folder}")
+        wanted = ["apt-get", "install", "--simulate", "--no-install-recommends", package]
+        plan = subprocess.run(wanted, capture_output=True, text=True)
+        names = [line.split()[1] for line in plan.stdout.splitlines() if line.startswith("Inst ")]
+        if not names or subprocess.run(["apt-get", "download", *names], cwd=part, stdout=sys.stderr).returncode:
+            said = plan.stderr.strip() or "apt-get says above why"
+            raise Unavailable(f"{package} could not be fetched ({said}): run `apt-get update` as root or set {variable}.")
+        for archive in part.glob("*.deb"):
+            subprocess.run(["dpkg-deb", "--extract", archive, part], check=True)
+            archive.unlink()
+        libraries = os.pathsep.join(str(folder / path.relative_to(part)) for path in part.glob("usr/lib/*-linux-gnu"))
+        script = part / name
+        script.write_text(f'#!/bin/sh\nLD_LIBRARY_PATH="{libraries}" exec "{folder}/{program}" "$@"\n')
+        script.chmod(0o755)
+
+    return built_once(folder, build) / name
 
 
 def interpreter(name: str, base: str, title: str, megabytes: int, variable: str) -> Path:
@@ -256,7 +296,9 @@ def say(line: str) -> None:
 
 
 if __name__ == "__main__":
-    subcommands = {"onnxruntime": onnxruntime, "libtorch": libtorch, "python": python, "peers": peers}
+    subcommands = {
+        command.__name__: command for command in [onnxruntime, libtorch, python, peers, haproxy]
+    }
     if sys.argv[1:] not in [[name] for name in subcommands]:
         sys.exit(__doc__)
     try:

@@ -518,4 +518,14 @@ impl ValueInfoProto {
         let tensor_type = Some(TensorTypeProto { elem_type: Some(DataType::Float.into()), shape });
         Self { name: Some(name.to_owned()), r#type: Some(TypeProto { tensor_type }) }
     }
+
+    /// What a free dimension is called, if it is free and has a name.
+    #[must_use]
+    pub fn free(&self, dimension: usize) -> Option<&str> {
+        let shape = self.r#type.as_ref()?.tensor_type.as_ref()?.shape.as_ref()?;
+        match shape.dim.get(dimension)?.value.as_ref()? {
+            DimensionValue::Name(name) if !name.is_empty() => Some(name),
+            DimensionValue::Name(_) | DimensionValue::Size(_) => None,
+        }
+    }
 }

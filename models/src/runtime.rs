@@ -3,8 +3,8 @@
 mod agreement;
 mod backend;
 mod classifier;
+mod plan;
 
-use std::collections::{BTreeMap, btree_map};
 use std::env::consts::{DLL_PREFIX, DLL_SUFFIX};
 use std::fs;
 use std::iter;
@@ -14,19 +14,18 @@ use std::sync::OnceLock;
 use grasp::{Maps, Volume};
 use ort::environment::Environment;
 use ort::logging::LogLevel;
-use ort::memory::Allocator;
-use ort::session::{IoBinding, Session};
-use ort::value::{Outlet, Tensor, TensorElementType};
+use ort::session::Session;
+use ort::value::{Outlet, TensorElementType};
 use thiserror::Error;
 use tracing::warn;
 
-use crate::onnx::ModelProto;
 use crate::{Entry, Metadata, MetadataError};
 
 pub use backend::{Backend, BackendError, Choice, NameError, Precision, Provider};
 pub use classifier::Classifier;
 
 use backend::Machine;
+use plan::{Model, Outputs, Plan};
 
 /// The input every network has: `[batch, 1, N, N, N]`.
 const INPUT: &str = "tsdf";
@@ -59,6 +58,14 @@ pub enum RuntimeError {
     /// A batch without a volume.
     #[error("the batch is empty")]
     EmptyBatch,
+    /// A batch with more volumes than was said when the network was loaded.
+    #[error("a batch of {got}, the network was loaded for batches of at most {largest}")]
+    Batch {
+        /// Volumes in the batch.
+        got: usize,
+        /// The most that are taken.
+        largest: usize,
+    },
     /// A volume is of another size than the network reads.
     #[error("resolution is {got}, the model `{model}` reads {expected}")]
     Resolution {
@@ -198,12 +205,14 @@ pub struct Options {
     pub provider: Option<Provider>,
     /// In which numbers; `None` takes the fastest.
     pub precision: Option<Precision>,
+    /// The largest batch that it will be asked about. Some providers need to know.
+    pub max_batch: usize,
 }
 
 impl Default for Options {
-    /// One thread of ONNX Runtime's own kernels: the same numbers everywhere.
+    /// One thread of ONNX Runtime's own kernels, one volume at a time: the same numbers everywhere.
     fn default() -> Self {
-        Self { threads: 1, provider: Some(Provider::Cpu), precision: None }
+        Self { threads: 1, provider: Some(Provider::Cpu), precision: None, max_batch: 1 }
     }
 }
 
@@ -211,7 +220,7 @@ impl Options {
     /// The fastest there is.
     #[must_use]
     pub fn auto(threads: usize) -> Self {
-        Self { threads, provider: None, precision: None }
+        Self { threads, provider: None, ..Self::default() }
     }
 }
 
@@ -220,36 +229,13 @@ impl Options {
 pub struct Network {
     metadata: Metadata,
     backend: Backend,
-    session: Session,
-    /// By batch size; a batch of a size that was seen before allocates nothing.
-    buffers: BTreeMap<usize, Buffers>,
-}
-
-/// Input and outputs of one batch size, in place where ONNX Runtime reads and writes.
-struct Buffers {
-    binding: IoBinding,
-    input: Tensor<f32>,
-    outputs: [Tensor<f32>; 3],
-}
-
-fn open(bytes: &[u8], backend: Backend, threads: usize) -> Result<Session, LoadReason> {
-    let runtime = runtime()?;
-    let builder = Session::builder(&runtime.environment)?;
-    let builder = builder.with_intra_threads(threads).map_err(ort::Error::from)?;
-    let mut builder = builder.with_inter_threads(1).map_err(ort::Error::from)?;
-    if let Some(provider) = backend.dispatch(threads) {
-        builder = builder.with_execution_providers([provider]).map_err(ort::Error::from)?;
-    }
-    if backend.provider == Provider::OpenVino {
-        // What OpenVINO does not take would be computed elsewhere, and nobody would know.
-        builder = builder.with_config_entry("session.disable_cpu_ep_fallback", "1").map_err(ort::Error::from)?;
-    }
-    Ok(builder.commit_from_memory(bytes)?)
+    /// The smallest batch first.
+    plans: Vec<Plan>,
 }
 
 /// The maps of a batch, in the network's buffers until it runs again.
 pub struct Output<'a> {
-    outputs: &'a [Tensor<f32>; 3],
+    outputs: &'a Outputs,
     batch: usize,
     voxels: usize,
 }
@@ -275,7 +261,8 @@ impl Network {
             let bytes = entry.bytes()?;
             let first = Self::choose(&entry.path, &bytes, options)?;
             let backend = first.backend();
-            let others = (1..count).map(|_| Self::with(&entry.path, &bytes, backend, options.threads));
+            let model = Model::new(&entry.path, &bytes, options);
+            let others = (1..count).map(|_| Self::with(&model, backend, options.max_batch));
             iter::once(Ok(first)).chain(others).take(count).collect::<Result<_, LoadReason>>()
         };
         load().map_err(|reason| LoadError { path: entry.path.clone(), reason })
@@ -289,23 +276,23 @@ impl Network {
 
     /// The first way to run it, of those that may, that gives its answers.
     fn choose(path: &Path, bytes: &[u8], options: &Options) -> Result<Self, LoadReason> {
-        let Options { threads, provider, precision } = *options;
-        let backends = Machine::here().backends(provider, precision, is_int8(bytes))?;
+        let model = Model::new(path, bytes, options);
+        let backends = Machine::here().backends(options.provider, options.precision, model.is_int8)?;
         let (&last, others) = backends.split_last().ok_or(RuntimeError::EmptyBatch)?;
         for &backend in others {
-            match Self::checked(path, bytes, backend, threads) {
+            match Self::checked(&model, backend, options.max_batch) {
                 Ok(network) => return Ok(network),
                 Err(error) => warn!(model = %path.display(), %backend, %error, "passed over"),
             }
         }
-        Self::checked(path, bytes, last, threads)
+        Self::checked(&model, last, options.max_batch)
     }
 
     /// Compared with the reference, unless it is the reference.
-    fn checked(path: &Path, bytes: &[u8], backend: Backend, threads: usize) -> Result<Self, LoadReason> {
-        let mut network = Self::with(path, bytes, backend, threads)?;
+    fn checked(model: &Model, backend: Backend, max_batch: usize) -> Result<Self, LoadReason> {
+        let mut network = Self::with(model, backend, max_batch)?;
         if backend.provider != Provider::Cpu {
-            let mut reference = Self::with(path, bytes, Backend::REFERENCE, threads)?;
+            let mut reference = Self::with(model, Backend::REFERENCE, 1)?;
             if let Some(what) = agreement::difference(&mut network, &mut reference)? {
                 return Err(LoadReason::Disagrees { backend, what });
             }
@@ -313,15 +300,16 @@ impl Network {
         Ok(network)
     }
 
-    fn with(path: &Path, bytes: &[u8], backend: Backend, threads: usize) -> Result<Self, LoadReason> {
-        let session = open(bytes, backend, threads)?;
-        let resolution = check_signature(session.inputs(), session.outputs())?;
-        let metadata = read_metadata(&session, Metadata::defaults(path, resolution))?;
+    fn with(model: &Model, backend: Backend, max_batch: usize) -> Result<Self, LoadReason> {
+        let plans = Plan::all(model, backend, max_batch)?;
+        let session = plans[0].session();
+        let resolution = check_signature(session.inputs(), session.outputs(), plans[0].size().map(|size| size as i64))?;
+        let metadata = read_metadata(session, Metadata::defaults(model.path, resolution))?;
         if let Some(resolution) = resolution.filter(|&resolution| resolution != metadata.resolution) {
             let what = format!("its metadata says N = {}, its input has N = {resolution}", metadata.resolution);
             return Err(LoadReason::Signature { what });
         }
-        Ok(Self { metadata, backend, session, buffers: BTreeMap::new() })
+        Ok(Self { metadata, backend, plans })
     }
 
     /// What runs it.
@@ -361,7 +349,9 @@ impl Network {
             }
         }
         let voxels = expected.pow(3);
-        let (_, input) = self.buffers(batch.len())?.input.extract_tensor_mut();
+        let Self { metadata, plans, .. } = self;
+        let refused = |error| refusal(&metadata.name, &error);
+        let input = plan(plans, batch.len())?.input(batch.len(), expected).map_err(refused)?;
         for (values, volume) in input.chunks_exact_mut(voxels).zip(batch) {
             values.copy_from_slice(volume.values());
         }
@@ -372,44 +362,22 @@ impl Network {
     /// without the copy, which is what a bare `session.run` is measured by.
     ///
     /// # Errors
-    /// [`RuntimeError::Run`] when ONNX Runtime fails.
+    /// [`RuntimeError`] when no batch of this size can be run, or ONNX Runtime fails.
     pub fn run(&mut self, batch: usize) -> Result<Output<'_>, RuntimeError> {
-        self.buffers(batch)?;
-        let Self { metadata, session, buffers, .. } = self;
-        let buffers = buffers.get_mut(&batch).ok_or(RuntimeError::EmptyBatch)?;
-        let mut run = |buffers: &mut Buffers| -> ort::Result<()> {
-            // Bound anew each time, for on some devices binding is what copies the input there.
-            buffers.binding.bind_input(INPUT, &buffers.input)?;
-            session.run_binding(&buffers.binding).map(drop)
-        };
-        run(buffers).map_err(|error| refusal(&metadata.name, &error))?;
-        Ok(Output { outputs: &buffers.outputs, batch, voxels: metadata.resolution.pow(3) })
-    }
-
-    fn buffers(&mut self, batch: usize) -> Result<&mut Buffers, RuntimeError> {
-        match self.buffers.entry(batch) {
-            btree_map::Entry::Occupied(entry) => Ok(entry.into_mut()),
-            btree_map::Entry::Vacant(entry) => {
-                let buffers = Buffers::new(&self.session, batch, self.metadata.resolution);
-                Ok(entry.insert(buffers.map_err(|error| refusal(&self.metadata.name, &error))?))
-            }
-        }
+        let Self { metadata, plans, .. } = self;
+        let resolution = metadata.resolution;
+        let outputs = plan(plans, batch)?.run(batch, resolution).map_err(|error| refusal(&metadata.name, &error))?;
+        Ok(Output { outputs, batch, voxels: resolution.pow(3) })
     }
 }
 
-impl Buffers {
-    fn new(session: &Session, batch: usize, resolution: usize) -> ort::Result<Self> {
-        let tensor =
-            |channels| Tensor::<f32>::new(&Allocator::default(), [batch, channels, resolution, resolution, resolution]);
-        let mut input = tensor(1)?;
-        input.extract_tensor_mut().1.fill(0.0);
-        let mut outputs = [tensor(OUTPUTS[0].1)?, tensor(OUTPUTS[1].1)?, tensor(OUTPUTS[2].1)?];
-        let mut binding = session.create_binding()?;
-        for ((name, _), tensor) in OUTPUTS.iter().zip(&mut outputs) {
-            binding.bind_output(*name, tensor)?;
-        }
-        Ok(Self { binding, input, outputs })
+/// The first that takes a batch of this size.
+fn plan(plans: &mut [Plan], batch: usize) -> Result<&mut Plan, RuntimeError> {
+    if batch == 0 {
+        return Err(RuntimeError::EmptyBatch);
     }
+    let largest = plans.last().and_then(Plan::size).unwrap_or(usize::MAX);
+    plans.iter_mut().find(|plan| plan.takes(batch)).ok_or(RuntimeError::Batch { got: batch, largest })
 }
 
 impl Output<'_> {
@@ -439,29 +407,28 @@ impl Output<'_> {
     }
 }
 
-/// Whether a file computes in 8 bits. One that is no model is none, which ONNX Runtime says better.
-fn is_int8(bytes: &[u8]) -> bool {
-    let graph = ModelProto::from_bytes(bytes).ok().and_then(|model| model.graph);
-    graph.is_some_and(|graph| graph.node.iter().any(|node| node.op_type() == "QuantizeLinear"))
-}
-
 fn refusal(model: &str, error: &ort::Error) -> RuntimeError {
     RuntimeError::Run { model: model.to_owned(), reason: error.to_string() }
 }
 
-/// The resolution, if the input's shape fixes it.
-fn check_signature(inputs: &[Outlet], outputs: &[Outlet]) -> Result<Option<usize>, LoadReason> {
+/// The resolution, if the input's shape fixes it. The batch must be free, but for the size that it was fixed to here.
+fn check_signature(inputs: &[Outlet], outputs: &[Outlet], fixed: Option<i64>) -> Result<Option<usize>, LoadReason> {
     if let Some(extra) = inputs.iter().find(|input| input.name() != INPUT) {
         return Err(LoadReason::Signature { what: format!("it has an input `{}`", extra.name()) });
     }
-    let resolution = check_tensor(inputs, INPUT, 1)?;
+    let resolution = check_tensor(inputs, INPUT, 1, fixed)?;
     for (name, channels) in OUTPUTS {
-        check_tensor(outputs, name, channels)?;
+        check_tensor(outputs, name, channels, fixed)?;
     }
     Ok(resolution)
 }
 
-fn check_tensor(outlets: &[Outlet], name: &str, channels: usize) -> Result<Option<usize>, LoadReason> {
+fn check_tensor(
+    outlets: &[Outlet],
+    name: &str,
+    channels: usize,
+    fixed: Option<i64>,
+) -> Result<Option<usize>, LoadReason> {
     let wrong = |what: String| LoadReason::Signature { what };
     let outlet = outlets.iter().find(|outlet| outlet.name() == name);
     let dtype = outlet.ok_or_else(|| wrong(format!("it has no `{name}`")))?.dtype();
@@ -469,7 +436,7 @@ fn check_tensor(outlets: &[Outlet], name: &str, channels: usize) -> Result<Optio
     match dtype.tensor_shape().map(|shape| &**shape) {
         Some(&[batch, c, x, y, z])
             if dtype.tensor_type() == Some(TensorElementType::Float32)
-                && batch < 0
+                && (batch < 0 || Some(batch) == fixed)
                 && fits(c, channels)
                 && [y, z].iter().all(|&edge| edge < 0 || x < 0 || edge == x) =>
         {

@@ -322,7 +322,8 @@ fn what_runs_a_network_is_what_was_asked_for() {
     let reference = Network::load(&path, &Options::default()).unwrap();
     assert_eq!(reference.backend(), Backend::REFERENCE);
     let auto = Network::load(&path, &Options::auto(2)).unwrap().backend();
-    let explicit = Options { threads: 2, provider: Some(auto.provider), precision: Some(auto.precision) };
+    let explicit =
+        Options { threads: 2, provider: Some(auto.provider), precision: Some(auto.precision), ..Options::default() };
     assert_eq!(Network::load(&path, &explicit).unwrap().backend(), auto, "what auto takes can be asked for");
 
     let refused = |options: Options| Network::load(&path, &options).err().unwrap().to_string();
@@ -343,7 +344,8 @@ fn openvino_gives_the_networks_answers() {
     let mut reference = Network::load(&path, &Options::default()).unwrap();
     let precisions = [(Precision::Fp32, 1e-4), (Precision::Bf16, 0.02)];
     for (precision, tolerance) in precisions {
-        let options = Options { threads: 2, provider: Some(Provider::OpenVino), precision: Some(precision) };
+        let provider = Some(Provider::OpenVino);
+        let options = Options { threads: 2, provider, precision: Some(precision), max_batch: 3 };
         let mut network = match Network::load(&path, &options) {
             Ok(network) => network,
             // Older processors do not multiply bf16, and say so.
@@ -363,5 +365,7 @@ fn openvino_gives_the_networks_answers() {
                 assert!(precision == Precision::Fp32 || largest > 0.0, "bf16 rounds");
             }
         }
+        let error = network.infer(&[&volumes[0]; 4]).err().unwrap().to_string();
+        assert_eq!(error, "a batch of 4, the network was loaded for batches of at most 3");
     }
 }

@@ -29,7 +29,7 @@ pub(crate) struct Folder {
 impl Folder {
     pub fn new(config: &Config, models: Arc<Models>, sessions: Arc<Sessions>, metrics: Arc<Metrics>) -> Self {
         let Config { workers, threads, provider, precision, queue, batching, .. } = *config;
-        let options = Options { threads, provider, precision };
+        let options = Options { threads, provider, precision, max_batch: batching.max };
         let serving = Serving { workers, options, capacity: queue, batching };
         let (directory, default_model) = (config.store.directory().to_owned(), config.default_model.clone());
         let stamps = config.stamps.clone();

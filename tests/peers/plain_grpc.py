@@ -51,11 +51,13 @@ def arguments(description: str) -> argparse.Namespace:
     return chosen
 
 
-def open_session(chosen: argparse.Namespace) -> ort.InferenceSession:
+def open_session(chosen: argparse.Namespace, batch: int | None = None) -> ort.InferenceSession:
     """With the options that graspd gives its own sessions (models/src/runtime)."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = chosen.threads
     options.inter_op_num_threads = 1
+    if batch:
+        options.add_free_dimension_override_by_name("batch", batch)
     if chosen.provider == "cpu":
         return ort.InferenceSession(chosen.model, options, ["CPUExecutionProvider"])
     # What OpenVINO does not take would be computed elsewhere, and nobody would know.
@@ -235,7 +237,7 @@ def main() -> None:
     chosen = arguments(__doc__)
     end_at_sigterm()
     pb = messages()
-    service = GraspService(pb, open_session(chosen), chosen.model)
+    service = GraspService(pb, open_session(chosen, batch=1), chosen.model)
     service.warm_up()
     # While one thread has the session, the others read, check, decode and write.
     server = grpc.server(ThreadPoolExecutor(max_workers=10))

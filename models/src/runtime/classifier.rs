@@ -5,7 +5,8 @@ use grasp::gpd::{CHANNELS, IMAGE_SIZE, Image};
 use ort::session::Session;
 use ort::value::{Outlet, Tensor, TensorElementType};
 
-use super::{Backend, LoadError, LoadReason, Options, RuntimeError, open, refusal};
+use super::plan::Model;
+use super::{Backend, LoadError, LoadReason, Options, RuntimeError, refusal};
 use crate::gpd::{INPUT, OUTPUT};
 
 /// Images that are scored together, to bound the memory: 5.5 MB of input.
@@ -26,7 +27,7 @@ impl Classifier {
     pub fn load(path: &Path, options: &Options) -> Result<Self, LoadError> {
         let at_path = |reason| LoadError { path: path.to_owned(), reason };
         let bytes = fs::read(path).map_err(|error| at_path(error.into()))?;
-        let session = open(&bytes, Backend::REFERENCE, options.threads).map_err(at_path)?;
+        let session = Model::new(path, &bytes, options).open(Backend::REFERENCE, None).map_err(at_path)?;
         check(session.inputs(), INPUT, &[CHANNELS, IMAGE_SIZE, IMAGE_SIZE]).map_err(at_path)?;
         check(session.outputs(), OUTPUT, &[2]).map_err(at_path)?;
         Ok(Self { session, name: path.display().to_string() })

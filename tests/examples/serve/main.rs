@@ -18,7 +18,8 @@ use anyhow::{Context, ensure};
 use grasp::{Volume, decode};
 use grasp_client::{Arrivals, Client, DataType, LocalServer, Options, Report, Until, load};
 use grasp_models::{Architecture, Network, Options as Running};
-use grasp_tests::{TestModel, graspd, peak_bytes};
+use grasp_tests::{TestModel, blobs, graspd, peak_bytes};
+use nalgebra::Isometry3;
 use tempfile::TempDir;
 use tonic::Code;
 
@@ -56,7 +57,7 @@ struct Bench {
     threads: usize,
     seconds: Duration,
     folder: TempDir,
-    scene: Volume,
+    scene: Arc<Volume>,
 }
 
 impl Bench {
@@ -75,7 +76,7 @@ impl Bench {
         // Nobody has trained one yet; how long it takes does not depend on what it knows.
         let transformer = Architecture::Transformer.build(grasp::RESOLUTION, 0)?;
         transformer.write(&models("transformer")?.join("transformer.onnx"))?;
-        let scene = conditions::scene(folder.path())?;
+        let scene = Arc::new(conditions::scene(folder.path())?);
         Ok(Self { threads, seconds, folder, scene })
     }
 
@@ -101,12 +102,14 @@ impl Bench {
         let server = self.serve("mirror", &["--provider", "cpu", "--threads", "1"])?;
         let client = Client::connect(server.grpc().to_string()).await?;
         let mut table = Table::new(&format!("identity network, {HOPS} calls, one at a time"), &["p50 ms", "p99 ms"]);
-        network.fill(&[&self.scene])?;
+        // Two blocks, in which the identity sees two grasps; in a scene it would see hundreds.
+        let volume = Arc::new(blobs(grasp::RESOLUTION, Isometry3::identity(), &[[10, 20, 15], [30, 12, 25]]));
+        network.fill(&[&volume])?;
         let run = times(HOPS, || network.run(1).map(drop))?;
         table.row("session.run", [0.5, 0.99].map(|share| milliseconds(Report::quantile(&run, share))));
         for (name, dtype) in [("f32", DataType::F32), ("f16", DataType::F16), ("u8", DataType::U8)] {
             let options = Options { dtype, ..Options::default() };
-            let calls = self.calls(&client, Arrivals::Callers(1), Until::Calls(HOPS), options).await?;
+            let calls = calls(&client, &volume, Arrivals::Callers(1), Until::Calls(HOPS), options).await?;
             let hop = [0.5, 0.99].map(|share| {
                 milliseconds(Report::quantile(&calls, share)) - milliseconds(Report::quantile(&run, share))
             });
@@ -130,19 +133,20 @@ impl Bench {
         network.fill(&[&self.scene])?;
         let probe = times(WARM_UP, || network.run(1).map(drop))?;
         let typical = Report::quantile(&probe, 0.5);
-        let calls = (self.seconds.as_secs_f64() / typical.as_secs_f64()).ceil() as usize / TURNS + 1;
+        let count = (self.seconds.as_secs_f64() / typical.as_secs_f64()).ceil() as usize / TURNS + 1;
         for _ in 0..TURNS {
-            bare.extend(times(calls, || network.run(1).map(drop))?);
-            service.extend(times(calls, || {
+            bare.extend(times(count, || network.run(1).map(drop))?);
+            service.extend(times(count, || {
                 let output = network.infer(&[&self.scene])?;
                 decode(&self.scene, &output.maps(0), &params)?;
                 anyhow::Ok(())
             })?);
-            grpc.extend(self.calls(&client, Arrivals::Callers(1), Until::Calls(calls), Options::default()).await?);
+            let until = Until::Calls(count);
+            grpc.extend(calls(&client, &self.scene, Arrivals::Callers(1), until, Options::default()).await?);
         }
         drop((server, network));
 
-        let title = format!("{name}, {backend}, {} calls, one at a time", calls * TURNS);
+        let title = format!("{name}, {backend}, {} calls, one at a time", count * TURNS);
         let mut table = Table::new(&title, &["p50 ms", "p99 ms", "gRPC's p50 to it"]);
         let mut p50 = 0.0;
         for (row, times) in [("gRPC", &mut grpc), ("infer + decode", &mut service), ("session.run", &mut bare)] {
@@ -161,7 +165,7 @@ impl Bench {
             );
             figures.add(&format!("{name}_vs_torch"), p50 / eager.published_p50_ms);
         }
-        if let Some(latency) = openvino(&self.file(name), self.threads, backend.precision, calls * TURNS)? {
+        if let Some(latency) = openvino(&self.file(name), self.threads, backend.precision, count * TURNS)? {
             let row = format!("OpenVINO {} alone, {}", latency.version, backend.precision);
             table.row(&row, [latency.p50_ms, latency.p99_ms, p50 / latency.p50_ms]);
             if name == "vgn" {
@@ -175,11 +179,13 @@ impl Bench {
 
     /// Many callers, beside the best that this machine can do and beside other servers; then callers who come by chance.
     async fn throughput(&self, figures: &mut Figures) -> anyhow::Result<()> {
-        let mut network = Network::load(&self.file("vgn"), &Running::auto(self.threads))?;
+        let max_batch = BATCHES.into_iter().max().unwrap_or(1);
+        let running = Running { max_batch, ..Running::auto(self.threads) };
+        let mut network = Network::load(&self.file("vgn"), &running)?;
         let (backend, mut best, mut bare_p50) = (network.backend(), 0.0_f64, 0.0);
         let mut table = Table::new(&format!("vgn, {backend}, session.run in batches"), &["volumes/s", "p50 ms"]);
         for batch in BATCHES {
-            network.fill(&vec![&self.scene; batch])?;
+            network.fill(&vec![&*self.scene; batch])?;
             times(WARM_UP, || network.run(batch).map(drop))?;
             let (started, mut taken) = (Instant::now(), Vec::new());
             while started.elapsed() < self.seconds {
@@ -211,7 +217,8 @@ impl Bench {
             let server = self.serve("vgn", &["--queue", "64"])?;
             let client = Client::connect(server.grpc().to_string()).await?;
             for callers in CROWDS {
-                let report = self.load(&client, Arrivals::Callers(callers), self.until(), Options::default()).await;
+                let report =
+                    ask(&client, &self.scene, Arrivals::Callers(callers), self.until(), Options::default()).await;
                 let throughput = crowd("graspd", callers, &report);
                 ensure!(report.refusals() == 0, "graspd refused {} calls", report.refusals());
                 if callers == 8 {
@@ -249,7 +256,7 @@ impl Bench {
             let share = f64::midpoint(good, bad);
             let rate = share * capacity;
             let until = Until::Elapsed(2 * self.seconds);
-            let report = self.load(&client, Arrivals::Rate(rate), until, Options::default()).await;
+            let report = ask(&client, &self.scene, Arrivals::Rate(rate), until, Options::default()).await;
             let [p50, p99] = [0.5, 0.99].map(|share| milliseconds(Report::quantile(&report.answered, share)));
             table.row("", [rate, share, p50, p99, p99 / bare_p50]);
             if report.refusals() == 0 && p99 <= 3.0 * bare_p50 { good = share } else { bad = share }
@@ -279,35 +286,36 @@ impl Bench {
     fn until(&self) -> Until {
         Until::Elapsed(self.seconds)
     }
+}
 
-    /// The sorted times of calls that must all be answered.
-    async fn calls(
-        &self,
-        client: &Client,
-        arrivals: Arrivals,
-        until: Until,
-        options: Options,
-    ) -> anyhow::Result<Vec<Duration>> {
-        let report = self.load(client, arrivals, until, options).await;
-        ensure!(report.refusals() == 0, "graspd refused {} calls: {:?}", report.refusals(), report.refused.keys());
-        Ok(report.answered)
+/// The sorted times of calls that must all be answered.
+async fn calls(
+    client: &Client,
+    volume: &Arc<Volume>,
+    arrivals: Arrivals,
+    until: Until,
+    options: Options,
+) -> anyhow::Result<Vec<Duration>> {
+    let report = ask(client, volume, arrivals, until, options).await;
+    ensure!(report.refusals() == 0, "graspd refused {} calls: {:?}", report.refusals(), report.refused.keys());
+    Ok(report.answered)
+}
+
+/// Asks graspd, a few times before it counts.
+async fn ask(client: &Client, volume: &Arc<Volume>, arrivals: Arrivals, until: Until, options: Options) -> Report {
+    for _ in 0..WARM_UP {
+        // What is wrong is seen in what follows.
+        let _ = client.detect(volume, options.clone()).await;
     }
-
-    async fn load(&self, client: &Client, arrivals: Arrivals, until: Until, options: Options) -> Report {
-        for _ in 0..WARM_UP {
-            // What is wrong is seen in what follows.
-            let _ = client.detect(&self.scene, options.clone()).await;
+    let (client, volume) = (client.clone(), Arc::clone(volume));
+    load(arrivals, until, move |_| {
+        let (client, volume, options) = (client.clone(), Arc::clone(&volume), options.clone());
+        async move {
+            let detection = client.detect(&volume, options).await;
+            detection.map(drop).map_err(|error| error.code().unwrap_or(Code::Unknown))
         }
-        let (client, scene) = (client.clone(), Arc::new(self.scene.clone()));
-        load(arrivals, until, move |_| {
-            let (client, scene, options) = (client.clone(), Arc::clone(&scene), options.clone());
-            async move {
-                let detection = client.detect(&scene, options).await;
-                detection.map(drop).map_err(|error| error.code().unwrap_or(Code::Unknown))
-            }
-        })
-        .await
-    }
+    })
+    .await
 }
 
 /// How long each of so many takes, sorted.

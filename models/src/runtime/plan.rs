@@ -1,0 +1,156 @@
+//! A session and its buffers: what runs batches of one size, or of any.
+
+use std::collections::{BTreeMap, btree_map};
+use std::path::Path;
+
+use ort::memory::Allocator;
+use ort::session::{IoBinding, Session};
+use ort::value::Tensor;
+
+use super::backend::{Backend, Provider};
+use super::{INPUT, LoadReason, OUTPUTS, Options, runtime};
+use crate::onnx::ModelProto;
+
+/// A file, and what has to be known of it before it is loaded.
+pub(super) struct Model<'a> {
+    pub path: &'a Path,
+    bytes: &'a [u8],
+    threads: usize,
+    /// Whether it computes in 8 bits.
+    pub is_int8: bool,
+    /// What it calls the size of its batch.
+    batch: Option<String>,
+}
+
+/// Runs batches.
+pub(super) struct Plan {
+    session: Session,
+    /// The size of every batch; smaller ones are filled up. Any without.
+    size: Option<usize>,
+    /// By batch size; a batch of a size that was seen before allocates nothing.
+    buffers: BTreeMap<usize, Buffers>,
+}
+
+/// Input and outputs of one batch size, in place where ONNX Runtime reads and writes.
+struct Buffers {
+    binding: IoBinding,
+    input: Tensor<f32>,
+    outputs: Outputs,
+}
+
+/// In the order of [`OUTPUTS`].
+pub(super) type Outputs = [Tensor<f32>; 3];
+
+impl<'a> Model<'a> {
+    /// Of one that is no model nothing is known; ONNX Runtime says better what is wrong with it.
+    pub fn new(path: &'a Path, bytes: &'a [u8], options: &Options) -> Self {
+        let graph = ModelProto::from_bytes(bytes).ok().and_then(|model| model.graph).unwrap_or_default();
+        let is_int8 = graph.node.iter().any(|node| node.op_type() == "QuantizeLinear");
+        let batch = graph.input.iter().find(|input| input.name() == INPUT).and_then(|input| input.free(0));
+        Self { path, bytes, threads: options.threads, is_int8, batch: batch.map(str::to_owned) }
+    }
+
+    /// Loads it, for batches of one size, if one is given.
+    pub fn open(&self, backend: Backend, size: Option<usize>) -> Result<Session, LoadReason> {
+        let runtime = runtime()?;
+        let builder = Session::builder(&runtime.environment)?;
+        let builder = builder.with_intra_threads(self.threads).map_err(ort::Error::from)?;
+        let mut builder = builder.with_inter_threads(1).map_err(ort::Error::from)?;
+        if let (Some(name), Some(size)) = (&self.batch, size) {
+            builder = builder.with_dimension_override(name, size as i64).map_err(ort::Error::from)?;
+        }
+        if let Some(provider) = backend.dispatch(self.threads) {
+            builder = builder.with_execution_providers([provider]).map_err(ort::Error::from)?;
+        }
+        if backend.provider == Provider::OpenVino {
+            // What OpenVINO does not take would be computed elsewhere, and nobody would know.
+            builder = builder.with_config_entry("session.disable_cpu_ep_fallback", "1").map_err(ort::Error::from)?;
+        }
+        Ok(builder.commit_from_memory(self.bytes)?)
+    }
+}
+
+impl Plan {
+    /// What runs batches of up to `max_batch`, the smallest first: one session for all sizes where the provider does not
+    /// mind that they change, else one for each power of two and for the largest.
+    ///
+    /// OpenVINO fuses what follows the heads only if it knows the shape, which halves the time of VGN's network in bf16;
+    /// TensorRT would build its engine anew for each size that it meets.
+    pub fn all(model: &Model, backend: Backend, max_batch: usize) -> Result<Vec<Self>, LoadReason> {
+        let fixed = matches!(backend.provider, Provider::OpenVino | Provider::TensorRt) && model.batch.is_some();
+        let sizes = if fixed { sizes(max_batch).into_iter().map(Some).collect() } else { vec![None] };
+        let plan = |size| Ok(Self { session: model.open(backend, size)?, size, buffers: BTreeMap::new() });
+        sizes.into_iter().map(plan).collect()
+    }
+
+    pub fn session(&self) -> &Session {
+        &self.session
+    }
+
+    pub fn size(&self) -> Option<usize> {
+        self.size
+    }
+
+    pub fn takes(&self, batch: usize) -> bool {
+        self.size.is_none_or(|size| batch <= size)
+    }
+
+    /// Where a batch's volumes are read from, one after the other.
+    pub fn input(&mut self, batch: usize, resolution: usize) -> ort::Result<&mut [f32]> {
+        let (_, buffers) = self.session_and_buffers(batch, resolution)?;
+        Ok(buffers.input.extract_tensor_mut().1)
+    }
+
+    /// Runs a batch over what its buffers hold. Where they have room for more, what an earlier batch left there is
+    /// computed, too, and nobody looks at it.
+    pub fn run(&mut self, batch: usize, resolution: usize) -> ort::Result<&Outputs> {
+        let (session, buffers) = self.session_and_buffers(batch, resolution)?;
+        // Bound anew each time, for on some devices binding is what copies the input there.
+        buffers.binding.bind_input(INPUT, &buffers.input)?;
+        session.run_binding(&buffers.binding)?;
+        Ok(&buffers.outputs)
+    }
+
+    fn session_and_buffers(&mut self, batch: usize, resolution: usize) -> ort::Result<(&mut Session, &mut Buffers)> {
+        let size = self.size.unwrap_or(batch);
+        let buffers = match self.buffers.entry(size) {
+            btree_map::Entry::Occupied(entry) => entry.into_mut(),
+            btree_map::Entry::Vacant(entry) => entry.insert(Buffers::new(&self.session, size, resolution)?),
+        };
+        Ok((&mut self.session, buffers))
+    }
+}
+
+/// The powers of two below a number, and the number.
+fn sizes(max_batch: usize) -> Vec<usize> {
+    let powers = (0..usize::BITS).map(|bit| 1 << bit);
+    powers.take_while(|&size| size < max_batch).chain([max_batch]).collect()
+}
+
+impl Buffers {
+    fn new(session: &Session, batch: usize, resolution: usize) -> ort::Result<Self> {
+        let tensor =
+            |channels| Tensor::<f32>::new(&Allocator::default(), [batch, channels, resolution, resolution, resolution]);
+        let mut input = tensor(1)?;
+        input.extract_tensor_mut().1.fill(0.0);
+        let mut outputs = [tensor(OUTPUTS[0].1)?, tensor(OUTPUTS[1].1)?, tensor(OUTPUTS[2].1)?];
+        let mut binding = session.create_binding()?;
+        for ((name, _), tensor) in OUTPUTS.iter().zip(&mut outputs) {
+            binding.bind_output(*name, tensor)?;
+        }
+        Ok(Self { binding, input, outputs })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_batch_fits_one_that_is_less_than_twice_its_size() {
+        assert_eq!(sizes(1), [1]);
+        assert_eq!(sizes(2), [1, 2]);
+        assert_eq!(sizes(6), [1, 2, 4, 6]);
+        assert_eq!(sizes(8), [1, 2, 4, 8]);
+    }
+}
