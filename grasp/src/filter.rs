@@ -17,6 +17,7 @@ pub(crate) fn gaussian(values: &[f32], n: usize, sigma: f32, radius: usize) -> V
         return values.to_vec();
     }
     let kernel = gaussian_kernel(sigma, radius);
+    let radius = kernel.len() / 2;
     let mut a = vec![0.0; values.len()];
     let mut b = vec![0.0; values.len()];
     along_blocks(values, &mut a, n, n * n, &kernel);
@@ -28,12 +29,7 @@ pub(crate) fn gaussian(values: &[f32], n: usize, sigma: f32, radius: usize) -> V
         padded[..radius].fill(source[0]);
         padded[radius..radius + n].copy_from_slice(source);
         padded[radius + n..].fill(source[n - 1]);
-        target.fill(0.0);
-        for (k, &weight) in kernel.iter().enumerate() {
-            for (t, s) in target.iter_mut().zip(&padded[k..k + n]) {
-                *t += weight * s;
-            }
-        }
+        weigh(target, &kernel, |k| &padded[k..k + n]);
     }
     a
 }
@@ -42,14 +38,39 @@ pub(crate) fn gaussian(values: &[f32], n: usize, sigma: f32, radius: usize) -> V
 /// vectorises whatever the axis.
 fn along_blocks(source: &[f32], target: &mut [f32], n: usize, block: usize, kernel: &[f32]) {
     let radius = kernel.len() / 2;
+    let mut blocks = Vec::with_capacity(kernel.len());
     for (i, target) in target.chunks_exact_mut(block).enumerate() {
-        target.fill(0.0);
-        for (k, &weight) in kernel.iter().enumerate() {
-            let j = (i + k).saturating_sub(radius).min(n - 1);
-            for (t, s) in target.iter_mut().zip(&source[j * block..(j + 1) * block]) {
-                *t += weight * s;
+        blocks.clear();
+        blocks.extend((i..=i + 2 * radius).map(|j| {
+            let j = j.saturating_sub(radius).min(n - 1);
+            &source[j * block..(j + 1) * block]
+        }));
+        weigh(target, kernel, |k| blocks[k]);
+    }
+}
+
+/// Values that are summed up together before they are written: few enough for the registers of any processor.
+const LANES: usize = 8;
+
+/// `target` becomes the sum of `source(k)`, each as long as it is, weighted by a kernel that is the same from both ends.
+fn weigh<'a>(target: &mut [f32], kernel: &[f32], source: impl Fn(usize) -> &'a [f32]) {
+    let radius = kernel.len() / 2;
+    let (chunks, rest) = target.as_chunks_mut::<LANES>();
+    let done = chunks.len() * LANES;
+    for (chunk, target) in chunks.iter_mut().enumerate() {
+        // As long as the target, the source has this chunk, too.
+        let at = |k: usize| source(k)[chunk * LANES..].first_chunk::<LANES>().unwrap_or(&[0.0; LANES]);
+        let mut sums = at(radius).map(|value| kernel[radius] * value);
+        for (k, &weight) in kernel[..radius].iter().enumerate() {
+            let (before, after) = (at(k), at(2 * radius - k));
+            for lane in 0..LANES {
+                sums[lane] += weight * (before[lane] + after[lane]);
             }
         }
+        *target = sums;
+    }
+    for (index, target) in rest.iter_mut().enumerate() {
+        *target = kernel.iter().enumerate().map(|(k, weight)| weight * source(k)[done + index]).sum();
     }
 }
 
