@@ -16,6 +16,7 @@ mod runtime;
 mod store;
 mod transformer;
 mod turns;
+mod upsampling;
 mod vgn;
 
 pub use half::{with_full_weights, with_half_weights};

@@ -288,11 +288,12 @@ impl Network {
         Self::checked(&model, last, options.max_batch)
     }
 
-    /// Compared with the reference, unless it is the reference.
+    /// Compared with the file as it is, run by ONNX Runtime's own kernels, unless this is just that.
     fn checked(model: &Model, backend: Backend, max_batch: usize) -> Result<Self, LoadReason> {
         let mut network = Self::with(model, backend, max_batch)?;
-        if backend.provider != Provider::Cpu {
-            let mut reference = Self::with(model, Backend::REFERENCE, 1)?;
+        let original = model.original();
+        if backend.provider != Provider::Cpu || original.is_some() {
+            let mut reference = Self::with(original.as_ref().unwrap_or(model), Backend::REFERENCE, 1)?;
             if let Some(what) = agreement::difference(&mut network, &mut reference)? {
                 return Err(LoadReason::Disagrees { backend, what });
             }

@@ -6,15 +6,21 @@ use std::path::Path;
 use ort::memory::Allocator;
 use ort::session::{IoBinding, Session};
 use ort::value::Tensor;
+use prost::Message;
 
 use super::backend::{Backend, Provider};
 use super::{INPUT, LoadReason, OUTPUTS, Options, runtime};
 use crate::onnx::ModelProto;
+use crate::upsampling::with_upsampling_folded;
+use crate::with_full_weights;
 
 /// A file, and what has to be known of it before it is loaded.
 pub(super) struct Model<'a> {
     pub path: &'a Path,
+    /// As it is.
     bytes: &'a [u8],
+    /// As cheap as the mathematics allows, where that is another graph.
+    cheaper: Option<Vec<u8>>,
     threads: usize,
     /// Whether it computes in 8 bits.
     pub is_int8: bool,
@@ -44,10 +50,18 @@ pub(super) type Outputs = [Tensor<f32>; 3];
 impl<'a> Model<'a> {
     /// Of one that is no model nothing is known; ONNX Runtime says better what is wrong with it.
     pub fn new(path: &'a Path, bytes: &'a [u8], options: &Options) -> Self {
-        let graph = ModelProto::from_bytes(bytes).ok().and_then(|model| model.graph).unwrap_or_default();
+        let model = ModelProto::from_bytes(bytes).unwrap_or_default();
+        let cheaper = cheaper(&model, bytes);
+        let graph = model.graph.unwrap_or_default();
         let is_int8 = graph.node.iter().any(|node| node.op_type() == "QuantizeLinear");
         let batch = graph.input.iter().find(|input| input.name() == INPUT).and_then(|input| input.free(0));
-        Self { path, bytes, threads: options.threads, is_int8, batch: batch.map(str::to_owned) }
+        Self { path, bytes, cheaper, threads: options.threads, is_int8, batch: batch.map(str::to_owned) }
+    }
+
+    /// The file as it is, if it was to be run at less cost.
+    pub fn original(&self) -> Option<Self> {
+        self.cheaper.as_ref()?;
+        Some(Self { cheaper: None, batch: self.batch.clone(), ..*self })
     }
 
     /// Loads it, for batches of one size, if one is given.
@@ -66,8 +80,17 @@ impl<'a> Model<'a> {
             // What OpenVINO does not take would be computed elsewhere, and nobody would know.
             builder = builder.with_config_entry("session.disable_cpu_ep_fallback", "1").map_err(ort::Error::from)?;
         }
-        Ok(builder.commit_from_memory(self.bytes)?)
+        Ok(builder.commit_from_memory(self.cheaper.as_deref().unwrap_or(self.bytes))?)
     }
+}
+
+/// The graph at less cost, if there is a way, and nothing of the file is lost on it: what our own types do not know of
+/// would be missing from what they write.
+fn cheaper(model: &ModelProto, bytes: &[u8]) -> Option<Vec<u8>> {
+    if model.encoded_len() != bytes.len() {
+        return None;
+    }
+    with_upsampling_folded(&with_full_weights(model).ok()?).map(|model| model.encode_to_vec())
 }
 
 impl Plan {
