@@ -30,3 +30,4 @@ pub use runtime::{
 };
 pub use store::{Entry, EntryError, Scan, Store, StoreError};
 pub use turns::{TurnsError, averaged_over_turns};
+pub use upsampling::{upsampled_convolutions, upsampled_taps};

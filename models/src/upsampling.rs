@@ -47,6 +47,29 @@ pub(crate) fn with_upsampling_folded(model: &ModelProto) -> Option<ModelProto> {
     Some(ModelProto { graph: Some(graph), ..model.clone() })
 }
 
+/// Which convolutions of a graph gain, by their indices among its nodes, each with the index of the node that repeats the
+/// voxels it reads, and that nobody else reads.
+#[must_use]
+pub fn upsampled_convolutions(graph: &GraphProto) -> HashMap<usize, usize> {
+    let facts = Facts::of(graph);
+    let pair = |(index, node): (usize, &NodeProto)| {
+        facts.folded(node)?;
+        let large = node.input.first()?;
+        let readers = graph.node.iter().filter(|node| node.input.contains(large)).count();
+        let resize = graph.node.iter().position(|node| node.output.contains(large))?;
+        (readers == 1).then_some((index, resize))
+    };
+    graph.node.iter().enumerate().filter_map(pair).collect()
+}
+
+/// For each parity of an output's coordinate and each tap of a kernel, which tap of the small kernel it belongs to, and how
+/// many taps that has.
+#[must_use]
+pub fn upsampled_taps(kernel: usize) -> ([Vec<usize>; 2], usize) {
+    let small = Small::of(kernel);
+    ([0, 1].map(|parity| (0..kernel).map(|tap| small.position(parity, tap)).collect()), small.kernel)
+}
+
 /// What has to be known of a graph.
 struct Facts<'a> {
     /// Initialisers and constants.

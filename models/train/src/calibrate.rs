@@ -18,7 +18,7 @@ pub(crate) fn ranges(
 ) -> Result<HashMap<String, Range>> {
     let names = quantized_activations(model);
     let execution = Execution { device: Device::Cpu, bf16: false, channels_last: false };
-    let executor = Executor::new(model.clone(), execution)?;
+    let executor = Executor::new(model.clone(), execution)?.as_written();
     let (n, share) = (data.resolution() as i64, 1.0 / scenes.len() as f32);
     let mut ranges = vec![Range { low: 0.0, high: 0.0 }; names.len()];
     for scene in scenes {

@@ -9,7 +9,7 @@ use std::collections::{HashMap, HashSet};
 use std::ops::RangeInclusive;
 
 use grasp_models::onnx::{ModelProto, NodeProto, OperatorSetIdProto, TensorError, TensorProto};
-use grasp_models::with_full_weights;
+use grasp_models::{upsampled_convolutions, with_full_weights};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 use thiserror::Error;
 
@@ -103,6 +103,8 @@ pub struct Executor {
     constants: HashMap<String, Tensor>,
     /// The nodes from which on single voxels can be computed.
     heads: HashSet<usize>,
+    /// Convolutions that are computed before the voxels they read are repeated, with the node that would repeat them.
+    upsampled: HashMap<usize, usize>,
 }
 
 /// What a grasp network computes, f32: over a batch of volumes, or at single voxels, which are then volumes of 1³.
@@ -149,8 +151,14 @@ impl Executor {
                 constants.insert(output_name(node, 0), constant(value, execution.device)?);
             }
         }
-        let heads = heads(graph);
-        Ok(Self { model, execution, parameters, constants, heads })
+        let (heads, upsampled) = (heads(graph), upsampled_convolutions(graph));
+        Ok(Self { model, execution, parameters, constants, heads, upsampled })
+    }
+
+    /// Computes every value that the graph names, at the graph's own cost.
+    #[must_use]
+    pub fn as_written(self) -> Self {
+        Self { upsampled: HashMap::new(), ..self }
     }
 
     /// The weights, by the names of their initialisers.
@@ -237,10 +245,21 @@ impl Executor {
         for (name, tensor) in self.constants.iter().chain(self.parameters.iter().map(|(name, weight)| (name, weight))) {
             values.insert(name.clone(), tensor.shallow_clone());
         }
-        for (index, node) in graph.node.iter().enumerate().filter(|(_, node)| node.op_type() != "Constant") {
-            let inputs = node
-                .input
-                .iter()
+        // The heads at single voxels read them in the large array.
+        let is_at_cells = |index: &usize| cells.is_some() && self.heads.contains(index);
+        let upsampled: HashMap<usize, &NodeProto> = self
+            .upsampled
+            .iter()
+            .filter(|(conv, _)| !is_at_cells(conv))
+            .map(|(&conv, &resize)| (conv, &graph.node[resize]))
+            .collect();
+        let skipped: HashSet<&String> = upsampled.values().flat_map(|resize| &resize.output).collect();
+        let nodes = graph.node.iter().enumerate().filter(|(_, node)| node.op_type() != "Constant");
+        for (index, node) in nodes.filter(|(_, node)| !node.output.iter().any(|name| skipped.contains(name))) {
+            let small = upsampled.get(&index).and_then(|resize| resize.input.first());
+            let inputs = small
+                .into_iter()
+                .chain(node.input.iter().skip(usize::from(small.is_some())))
                 .map(|name| match values.get(name) {
                     Some(value) => Ok(Some(value)),
                     None if name.is_empty() => Ok(None),
@@ -254,6 +273,7 @@ impl Executor {
             let step = Step { node, inputs, execution: self.execution };
             let outputs = match cells.filter(|_| self.heads.contains(&index)) {
                 Some(cells) => vec![step.convolution_at(cells)?],
+                None if small.is_some() => vec![step.convolution_before_upsampling()?],
                 None => step.run()?,
             };
             values.extend(node.output.iter().cloned().zip(outputs));

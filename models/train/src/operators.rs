@@ -1,6 +1,7 @@
 //! What each operator of ONNX is in libtorch.
 
 use grasp_models::onnx::{AttributeProto, NodeProto};
+use grasp_models::upsampled_taps;
 use tch::{Device, Kind, TchError, Tensor};
 
 use crate::execute::{ExecuteError, Execution, values_of};
@@ -161,6 +162,39 @@ impl Step<'_> {
             self.int("group", 1),
         );
         Ok(vec![y.map_err(|source| self.torch(source))?])
+    }
+
+    /// A convolution over what is twice as large as its input, of which it is told the small array
+    /// ([`grasp_models::upsampled_convolutions`]).
+    pub fn convolution_before_upsampling(&self) -> Result<Tensor, ExecuteError> {
+        let (x, weight) = (self.reduced(0)?, self.input(1)?);
+        let compute = || {
+            let (channels, inputs, kernel, ..) = weight.size5()?;
+            let (taps, small) = upsampled_taps(kernel as usize);
+            let small = small as i64;
+            // [2 · small, kernel]: which taps of the large kernel each tap of the small one is the sum of, per parity.
+            let sums = Tensor::f_zeros([2 * small, kernel], (Kind::Float, weight.device()))?;
+            for (parity, taps) in (0..).zip(&taps) {
+                for (tap, &position) in (0..).zip(taps) {
+                    let _ = sums.f_get(parity * small + position as i64)?.f_get(tap)?.f_fill_(1.0)?;
+                }
+            }
+            let weight = Tensor::f_einsum(
+                "nabc,ia,jb,kc->nijk",
+                &[weight.f_reshape([-1, kernel, kernel, kernel])?, sums.shallow_clone(), sums.shallow_clone(), sums],
+                None::<i64>,
+            )?;
+            let weight = weight.f_reshape([channels, inputs, 2, small, 2, small, 2, small])?;
+            let weight = weight.f_permute([2, 4, 6, 0, 1, 3, 5, 7])?;
+            let weight = weight.f_reshape([8 * channels, inputs, small, small, small])?;
+            let weight = self.execution.arrange(&weight).f_to_kind(x.kind())?;
+            let bias = self.optional(2).map(|bias| bias.f_repeat([8])?.f_to_kind(x.kind())).transpose()?;
+            let y = x.f_conv3d(&weight, bias.as_ref(), [1; 3], [small / 2; 3], [1; 3], 1)?;
+            let (batch, _, edge, ..) = y.size5()?;
+            let apart = y.f_reshape([batch, 2, 2, 2, channels, edge, edge, edge])?;
+            apart.f_permute([0, 4, 5, 1, 6, 2, 7, 3])?.f_reshape([batch, channels, 2 * edge, 2 * edge, 2 * edge])
+        };
+        compute().map_err(|source| self.torch(source))
     }
 
     /// The maximum over windows of images.
