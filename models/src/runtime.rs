@@ -259,9 +259,9 @@ impl Network {
         let load = || {
             runtime()?;
             let bytes = entry.bytes()?;
-            let first = Self::choose(&entry.path, &bytes, options)?;
-            let backend = first.backend();
             let model = Model::new(&entry.path, &bytes, options);
+            let first = Self::choose(&model, options)?;
+            let backend = first.backend();
             let others = (1..count).map(|_| Self::with(&model, backend, options.max_batch));
             iter::once(Ok(first)).chain(others).take(count).collect::<Result<_, LoadReason>>()
         };
@@ -271,21 +271,20 @@ impl Network {
     fn try_load(path: &Path, options: &Options) -> Result<Self, LoadReason> {
         // Before anything is asked of it.
         runtime()?;
-        Self::choose(path, &fs::read(path)?, options)
+        Self::choose(&Model::new(path, &fs::read(path)?, options), options)
     }
 
     /// The first way to run it, of those that may, that gives its answers.
-    fn choose(path: &Path, bytes: &[u8], options: &Options) -> Result<Self, LoadReason> {
-        let model = Model::new(path, bytes, options);
+    fn choose(model: &Model, options: &Options) -> Result<Self, LoadReason> {
         let backends = Machine::here().backends(options.provider, options.precision, model.is_int8)?;
         let (&last, others) = backends.split_last().ok_or(RuntimeError::EmptyBatch)?;
         for &backend in others {
-            match Self::checked(&model, backend, options.max_batch) {
+            match Self::checked(model, backend, options.max_batch) {
                 Ok(network) => return Ok(network),
-                Err(error) => warn!(model = %path.display(), %backend, %error, "passed over"),
+                Err(error) => warn!(model = %model.path.display(), %backend, %error, "passed over"),
             }
         }
-        Self::checked(&model, last, options.max_batch)
+        Self::checked(model, last, options.max_batch)
     }
 
     /// Compared with the file as it is, run by ONNX Runtime's own kernels, unless this is just that.

@@ -110,12 +110,13 @@ impl Folder {
                 engines.push(kept);
             }
         }
-        self.metrics.reloaded(Ok(refused.len()));
         if engines.is_empty() {
             warn!("nothing in the folder can be served, the models stay as they are");
         } else {
             self.replace(engines);
         }
+        // Last, so that whoever sees it in the metrics is answered by what was loaded.
+        self.metrics.reloaded(Ok(refused.len()));
     }
 
     fn start(&self, entry: Entry) -> anyhow::Result<Arc<Engine>> {
