@@ -1,11 +1,15 @@
 #!/usr/bin/env python3
 """Gets the native libraries that cargo cannot get, and prints where they are.
 
-    native.py onnxruntime    the shared library, for ORT_DYLIB_PATH
-    native.py libtorch       a folder with lib/ and include/, for LIBTORCH (training only)
-    native.py python         the interpreter that runs the Python client's tests, for GRASPD_PYTHON
-    native.py peers          the interpreter that runs what graspd is compared with, for GRASPD_PEERS
-    native.py haproxy        the load balancer of `make test-faults`, for GRASPD_HAPROXY
+    native.py onnxruntime      the shared library, for ORT_DYLIB_PATH
+    native.py onnxruntime-gpu  the one for NVIDIA cards, likewise; it needs CUDA 13
+    native.py libtorch         a folder with lib/ and include/, for LIBTORCH (training only)
+    native.py python           the interpreter that runs the tests in Python, for GRASPD_PYTHON
+    native.py peers            the interpreter that runs what graspd is compared with, for GRASPD_PEERS
+    native.py haproxy          the load balancer of `make test-faults`, for GRASPD_HAPROXY
+    native.py prometheus       what the tests of deploy/prometheus and deploy/grafana ask, for GRASPD_PROMETHEUS
+    native.py promtool         what checks its rules, for GRASPD_PROMTOOL
+    native.py cpp              a prefix with CMake, protoc and gRPC for C++, for GRASPD_CPP
 
 The path is all that goes to stdout. Where the named variable is set already, its path is checked and
 printed. What is fetched stays in ${GRASPD_CACHE:-~/.cache/graspd}: a second run touches no network.
@@ -15,7 +19,7 @@ import os
 import sys
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Callable, List, NamedTuple
+from typing import Callable, Dict, List, NamedTuple
 
 # Wheels are the one form in which these libraries are published, with a hash, for every platform.
 # Only C libraries are taken out of them, so one CPython's wheels do whatever Python runs this file.
@@ -52,6 +56,11 @@ ONNXRUNTIME = {
         Wheel("onnxruntime==1.31.1", 21, "60b6b69bfe580eab576cacc5d132a0e9cf2a37fcfd18d46dd191042b1d1ed0d7"),
     ]),
 }
+ONNXRUNTIME_GPU = {
+    "Linux-x86_64": Artefact("ONNX Runtime 1.31.1 for CUDA 13", "onnxruntime-gpu-1.31.1", "libonnxruntime.so.1.31.1", [
+        Wheel("onnxruntime-gpu==1.31.1", 256, "e26c475fe361b2015f45b4b824bd13f0bb20204e59b62814e6f0acd5f3d491a6"),
+    ]),
+}
 LIBTORCH = {
     # libtorch_cpu.so is linked against two CUDA libraries even where there is no GPU.
     "Linux-x86_64": Artefact("libtorch 2.11.0 for the CPU", "libtorch-2.11.0", "", [
@@ -86,12 +95,20 @@ class Unavailable(Exception):
 
 
 def onnxruntime() -> Path:
+    return runtime("ONNX Runtime", ONNXRUNTIME)
+
+
+def onnxruntime_gpu() -> Path:
+    return runtime("ONNX Runtime with CUDA", ONNXRUNTIME_GPU)
+
+
+def runtime(title: str, artefacts: Dict[str, Artefact]) -> Path:
     if os.environ.get("ORT_DYLIB_PATH"):
         return given("ORT_DYLIB_PATH")
     otherwise = "set ORT_DYLIB_PATH to the shared library of an ONNX Runtime, 1.24 or newer"
-    if PLATFORM not in ONNXRUNTIME:
-        raise Unavailable(f"There is no wheel of ONNX Runtime for {PLATFORM}: {otherwise}.")
-    return from_wheels(ONNXRUNTIME[PLATFORM], otherwise)
+    if PLATFORM not in artefacts:
+        raise Unavailable(f"There is no wheel of {title} for {PLATFORM}: {otherwise}.")
+    return from_wheels(artefacts[PLATFORM], otherwise)
 
 
 def libtorch() -> Path:
@@ -127,40 +144,78 @@ def peers() -> Path:
 def haproxy() -> Path:
     if os.environ.get("GRASPD_HAPROXY"):
         return given("GRASPD_HAPROXY")
-    return from_debian("haproxy", "usr/sbin/haproxy", "GRASPD_HAPROXY")
+    return from_debian("haproxy", "haproxy", "GRASPD_HAPROXY")
 
 
-def from_debian(package: str, program: str, variable: str) -> Path:
-    """A program of Debian's with the libraries that this machine lacks, unpacked instead of installed: nobody has to be
-    root, and nothing starts at boot."""
+def prometheus() -> Path:
+    if os.environ.get("GRASPD_PROMETHEUS"):
+        return given("GRASPD_PROMETHEUS")
+    return from_debian("prometheus", "prometheus", "GRASPD_PROMETHEUS")
+
+
+def promtool() -> Path:
+    if os.environ.get("GRASPD_PROMTOOL"):
+        return given("GRASPD_PROMTOOL")
+    return from_debian("prometheus", "promtool", "GRASPD_PROMTOOL")
+
+
+def cpp() -> Path:
+    import shutil
+
+    if os.environ.get("GRASPD_CPP"):
+        return given("GRASPD_CPP", "include/grpcpp", "include/google/protobuf")
+    programs = [shutil.which(name) for name in ["grpc_cpp_plugin", "protoc", "cmake"]]
+    if all(programs):
+        prefix = Path(programs[0]).resolve().parent.parent
+        if (prefix / "include/grpcpp").exists():
+            return prefix
+    packages = ["cmake", "libgrpc++-dev", "libprotobuf-dev", "protobuf-compiler-grpc"]
+    return unpacked("cpp", packages, "prefix with CMake, protoc and gRPC for C++", "GRASPD_CPP") / "usr"
+
+
+def from_debian(package: str, name: str, variable: str) -> Path:
+    """A program of Debian's."""
+    import shutil
+
+    there = shutil.which(name, path=os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin"]))
+    return Path(there) if there else unpacked(package, [package], name, variable) / name
+
+
+def unpacked(name: str, packages: List[str], title: str, variable: str) -> Path:
+    """A folder with packages of Debian's and the libraries that this machine lacks, unpacked instead of installed: nobody
+    has to be root, and nothing starts at boot."""
     import shutil
     import subprocess
 
-    name = Path(program).name
-    there = shutil.which(name, path=os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin"]))
-    if there:
-        return Path(there)
     if not shutil.which("apt-get"):
-        raise Unavailable(f"There is no {name} here, and no apt-get to fetch it: set {variable} to one.")
-    folder = CACHE / f"debian-{package}-{PLATFORM}"
+        raise Unavailable(f"There is no {title} here, and no apt-get to fetch it: set {variable} to one.")
+    folder = CACHE / f"debian-{name}-{PLATFORM}"
 
     def build(part: Path) -> None:
-        say(f"Debian's {package} -> {folder}")
-        wanted = ["apt-get", "install", "--simulate", "--no-install-recommends", package]
-        plan = subprocess.run(wanted, capture_output=True, text=True)
+        wanted = " ".join(packages)
+        say(f"Debian's {wanted} -> {folder}")
+        simulate = ["apt-get", "install", "--simulate", "--no-install-recommends", *packages]
+        plan = subprocess.run(simulate, capture_output=True, text=True)
         names = [line.split()[1] for line in plan.stdout.splitlines() if line.startswith("Inst ")]
         if not names or subprocess.run(["apt-get", "download", *names], cwd=part, stdout=sys.stderr).returncode:
             said = plan.stderr.strip() or "apt-get says above why"
-            raise Unavailable(f"{package} could not be fetched ({said}): run `apt-get update` as root or set {variable}.")
+            raise Unavailable(f"{wanted} could not be fetched ({said}): run `apt-get update` as root or set {variable}.")
         for archive in part.glob("*.deb"):
             subprocess.run(["dpkg-deb", "--extract", archive, part], check=True)
             archive.unlink()
+        for link in part.glob("usr/lib/*-linux-gnu/*.so"):
+            if not link.exists():  # what is linked with is here, but its library is the system's
+                library = Path("/", link.relative_to(part)).with_name(os.readlink(link))
+                for name in {library.name, library.resolve().name}:
+                    link.with_name(name).symlink_to(library)
         libraries = os.pathsep.join(str(folder / path.relative_to(part)) for path in part.glob("usr/lib/*-linux-gnu"))
-        script = part / name
-        script.write_text(f'#!/bin/sh\nLD_LIBRARY_PATH="{libraries}" exec "{folder}/{program}" "$@"\n')
-        script.chmod(0o755)
+        # A script for each program: the package may have several.
+        for program in [*part.glob("usr/bin/*"), *part.glob("usr/sbin/*")]:
+            script = part / program.name
+            script.write_text(f'#!/bin/sh\nLD_LIBRARY_PATH="{libraries}" exec "{folder / program.relative_to(part)}" "$@"\n')
+            script.chmod(0o755)
 
-    return built_once(folder, build) / name
+    return built_once(folder, build)
 
 
 def interpreter(name: str, base: str, title: str, megabytes: int, variable: str) -> Path:
@@ -296,9 +351,8 @@ def say(line: str) -> None:
 
 
 if __name__ == "__main__":
-    subcommands = {
-        command.__name__: command for command in [onnxruntime, libtorch, python, peers, haproxy]
-    }
+    commands = [onnxruntime, onnxruntime_gpu, libtorch, python, peers, haproxy, prometheus, promtool, cpp]
+    subcommands = {command.__name__.replace("_", "-"): command for command in commands}
     if sys.argv[1:] not in [[name] for name in subcommands]:
         sys.exit(__doc__)
     try:

@@ -10,14 +10,14 @@ use prost::Message;
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo:rerun-if-changed=proto");
     let descriptors = protox::compile(["grasp/v1/grasp.proto", "inference/inference.proto"], ["proto"])?;
-    // Reflection tells what is served.
-    let served = protox::compile(["grasp/v1/grasp.proto"], ["proto"])?;
     let out = PathBuf::from(env::var("OUT_DIR")?);
-    fs::write(out.join("descriptors.bin"), served.encode_to_vec())?;
+    fs::write(out.join("descriptors.bin"), descriptors.encode_to_vec())?;
     // `Bytes` shares the buffer that the message arrived in instead of copying the volume out of it.
     let mut config = tonic_prost_build::configure();
     for field in [
         ".grasp.v1.Volume.data",
+        ".grasp.v1.DepthView.data",
+        ".grasp.v1.CloudView.points",
         ".inference.ModelInferRequest.raw_input_contents",
         ".inference.ModelInferResponse.raw_output_contents",
     ] {

@@ -4,17 +4,19 @@ use grasp::Volume;
 use grasp_proto::pb;
 use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::grasp_service_client::GraspServiceClient;
+use tokio::sync::mpsc;
 use tokio::time::{Instant, sleep, timeout_at};
+use tokio_stream::wrappers::ReceiverStream;
 use tokio_stream::{Stream, StreamExt};
-use tonic::Code;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
+use tonic::{Code, Status, Streaming};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
 use crate::access::{Bearer, may_pass};
-use crate::{Access, Detection, Error, Options, Retry};
+use crate::{Access, CloudView, DepthView, Detection, Error, Options, Retry, Workspace};
 
 /// Several replies in flight on one connection must not wait for HTTP/2's windows of 64 KiB.
 const WINDOW: u32 = 4 << 20;
@@ -100,24 +102,62 @@ impl Client {
     pub async fn detect(&self, volume: &Volume, options: Options) -> Result<Detection, Error> {
         let timeout = options.timeout;
         let message = options.request(volume);
-        let mut attempts = 0;
-        loop {
-            let mut request = tonic::Request::new(message.clone());
-            if let Some(timeout) = timeout {
-                request.set_timeout(timeout);
-            }
-            let status = match self.grasps().detect_grasps(request).await {
-                Ok(response) => return response.into_inner().try_into(),
-                Err(status) => status,
-            };
-            attempts += 1;
-            let may_pass = may_pass(&status);
-            let error = Error::from(status);
-            match self.retry.pause(attempts, error.retry_after()) {
-                Some(pause) if may_pass => sleep(pause).await,
-                _ => return Err(error),
-            }
-        }
+        self.ask(
+            timeout,
+            || (self.grasps(), message.clone()),
+            async |(mut grasps, request)| grasps.detect_grasps(request).await,
+        )
+        .await
+    }
+
+    /// Asks for the grasps in what depth cameras see.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] with the last status.
+    pub async fn detect_from_depth(
+        &self,
+        views: &[DepthView],
+        workspace: &Workspace,
+        options: Options,
+    ) -> Result<Detection, Error> {
+        let timeout = options.timeout;
+        let message = options.depth_request(views, workspace);
+        self.ask(
+            timeout,
+            || (self.grasps(), message.clone()),
+            async |(mut grasps, request)| grasps.detect_grasps_from_depth(request).await,
+        )
+        .await
+    }
+
+    /// Asks for the grasps in point clouds.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] with the last status.
+    pub async fn detect_from_cloud(
+        &self,
+        views: &[CloudView],
+        workspace: &Workspace,
+        options: Options,
+    ) -> Result<Detection, Error> {
+        let timeout = options.timeout;
+        let message = options.cloud_request(views, workspace);
+        self.ask(
+            timeout,
+            || (self.grasps(), message.clone()),
+            async |(mut grasps, request)| grasps.detect_grasps_from_cloud(request).await,
+        )
+        .await
+    }
+
+    /// Has the server keep a volume for a camera that moves.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] when it keeps enough already.
+    pub async fn track(&self, workspace: Workspace) -> Result<Tracking, Error> {
+        let (requests, waiting) = mpsc::channel(1);
+        let replies = self.grasps().track_grasps(ReceiverStream::new(waiting)).await?.into_inner();
+        Ok(Tracking { requests, replies, workspace: Some(workspace) })
     }
 
     /// Asks for the grasps in each of a stream of volumes; one answer comes for each, in their order. A volume that is
@@ -134,15 +174,7 @@ impl Client {
     {
         let requests = volumes.map(|(volume, options)| options.request(&volume));
         let responses = self.grasps().detect_grasps_stream(requests).await?.into_inner();
-        Ok(responses.map(|response| match response?.outcome {
-            Some(Outcome::Response(response)) => response.try_into(),
-            Some(Outcome::Error(error)) => Err(error.into()),
-            None => Err(Error::Refused {
-                code: Code::Internal,
-                message: "a reply with neither a response nor an error".to_owned(),
-                retry_after: None,
-            }),
-        }))
+        Ok(responses.map(|response| outcome(response?)))
     }
 
     /// The models that the server has loaded, the default first.
@@ -165,9 +197,74 @@ impl Client {
         })
     }
 
+    /// Asks as often as [`Retry`] has it.
+    async fn ask<S, M>(
+        &self,
+        timeout: Option<Duration>,
+        message: impl Fn() -> (S, M),
+        call: impl AsyncFn((S, tonic::Request<M>)) -> Result<tonic::Response<pb::DetectGraspsResponse>, Status>,
+    ) -> Result<Detection, Error> {
+        let mut attempts = 0;
+        loop {
+            let (service, message) = message();
+            let mut request = tonic::Request::new(message);
+            if let Some(timeout) = timeout {
+                request.set_timeout(timeout);
+            }
+            let status = match call((service, request)).await {
+                Ok(response) => return response.into_inner().try_into(),
+                Err(status) => status,
+            };
+            attempts += 1;
+            let may_pass = may_pass(&status);
+            let error = Error::from(status);
+            match self.retry.pause(attempts, error.retry_after()) {
+                Some(pause) if may_pass => sleep(pause).await,
+                _ => return Err(error),
+            }
+        }
+    }
+
     fn grasps(&self) -> GraspServiceClient<InterceptedService<Channel, Bearer>> {
         // A reply holds grasps, never volumes, but with a low threshold there may be thousands of them.
         let service = GraspServiceClient::with_interceptor(self.channel.clone(), self.bearer.clone());
         service.max_decoding_message_size(WINDOW as usize)
+    }
+}
+
+/// A volume that the server keeps for as long as this lives, and what it sees in it.
+#[derive(Debug)]
+pub struct Tracking {
+    requests: mpsc::Sender<pb::TrackGraspsRequest>,
+    replies: Streaming<pb::DetectGraspsStreamResponse>,
+    /// Until it has been sent.
+    workspace: Option<Workspace>,
+}
+
+impl Tracking {
+    /// Adds views to the volume, and asks for the grasps in all that was seen so far.
+    ///
+    /// # Errors
+    /// [`Error::Refused`]: what is wrong with a view does not end the tracking.
+    pub async fn add(&mut self, views: &[DepthView], options: Options) -> Result<Detection, Error> {
+        let request = options.track_request(views, self.workspace.as_ref());
+        // A server that hung up says why in its last reply.
+        let _ = self.requests.send(request).await;
+        let reply = self.replies.message().await?;
+        let detection = outcome(reply.ok_or_else(|| Status::unavailable("the server has ended the stream"))?)?;
+        self.workspace = None;
+        Ok(detection)
+    }
+}
+
+fn outcome(response: pb::DetectGraspsStreamResponse) -> Result<Detection, Error> {
+    match response.outcome {
+        Some(Outcome::Response(response)) => response.try_into(),
+        Some(Outcome::Error(error)) => Err(error.into()),
+        None => Err(Error::Refused {
+            code: Code::Internal,
+            message: "a reply with neither a response nor an error".to_owned(),
+            retry_after: None,
+        }),
     }
 }

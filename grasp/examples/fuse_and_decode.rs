@@ -18,7 +18,9 @@ fn main() {
     let camera_from_task = Isometry3::translation(-0.15, -0.15, 0.5);
 
     let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
-    report("fuse one 640×480 view into 40³", || fusion.integrate(black_box(&image), &camera_from_task));
+    report("fuse one 640×480 view into 40³", || {
+        fusion.integrate(black_box(&image), &camera_from_task);
+    });
     report("read the 40³ values out", || drop(black_box(fusion.values())));
 
     let volume = fusion.volume(Isometry3::identity()).expect("the wall is in the cube");

@@ -32,6 +32,17 @@ pub struct DepthImage<'a> {
     depth: &'a [f32],
 }
 
+/// The unit that a depth image is in, as far as its values tell.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Unit {
+    /// Metres, or nothing speaks against them.
+    Metres,
+    /// Its median is above 20: no such sensor looks so far.
+    Millimetres,
+    /// Its median is below 2 cm, nearer than any such sensor sees: metres, taken for millimetres.
+    Thousandths,
+}
+
 /// Why a depth image was refused.
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum CameraError {
@@ -90,6 +101,24 @@ impl<'a> DepthImage<'a> {
         self.depth
     }
 
+    /// In which unit it seems to be, by the median of what it measures.
+    #[must_use]
+    pub fn unit(&self) -> Unit {
+        /// Every pixel would tell no more.
+        const EVERY: usize = 61;
+        let mut sample: Vec<f32> =
+            self.depth.iter().step_by(EVERY).copied().filter(|depth| depth.is_finite() && *depth > 0.0).collect();
+        if sample.is_empty() {
+            return Unit::Metres;
+        }
+        let middle = sample.len() / 2;
+        match sample.select_nth_unstable_by(middle, f32::total_cmp).1 {
+            median if *median > 20.0 => Unit::Millimetres,
+            median if *median < 0.02 => Unit::Thousandths,
+            _ => Unit::Metres,
+        }
+    }
+
     /// Every pixel with a reading up to [`DEPTH_MAX`], back-projected: its point in the task frame, with the direction
     /// towards the camera for a normal. `camera_from_task` is `T_camera_task`.
     pub fn points(&self, camera_from_task: &Isometry3<f64>) -> impl Iterator<Item = SurfacePoint> {
@@ -111,6 +140,19 @@ mod tests {
     use nalgebra::Vector3;
 
     use super::*;
+
+    #[test]
+    fn a_wrong_unit_is_noticed() {
+        let intrinsics = Intrinsics::BENCHMARK;
+        let unit = |depth: f32| {
+            let pixels: Vec<f32> = (0..640 * 480).map(|i| if i % 3 == 0 { f32::NAN } else { depth }).collect();
+            DepthImage::new(intrinsics, &pixels).unwrap().unit()
+        };
+        assert_eq!([0.3, 2.0, 0.05].map(unit), [Unit::Metres; 3]);
+        assert_eq!([350.0, 1800.0].map(unit), [Unit::Millimetres; 2]);
+        assert_eq!([0.0006, 0.002].map(unit), [Unit::Thousandths; 2]);
+        assert_eq!(unit(0.0), Unit::Metres, "nothing measured, nothing said");
+    }
 
     #[test]
     fn a_pixel_is_projected_back_to_where_it_was_seen() {

@@ -2,8 +2,7 @@ use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use thiserror::Error;
 
 use crate::filter::{dilate, gaussian, is_window_maximum};
-use crate::obstacles::{Clearance, Obstacles};
-use crate::{Grasp, Volume};
+use crate::{Clearance, Constraints, FINGER_DEPTH, Grasp, Hand, Obstacles, Violation, Volume, before};
 
 /// A network's output over a volume of N³ voxels, each array indexed `[channel][x][y][z]`, z fastest.
 #[derive(Clone, Copy, Debug)]
@@ -67,6 +66,11 @@ pub struct DecodeParams {
     pub nms_size: usize,
     /// How the hand must keep clear of what was observed, if it must: none of the papers asks.
     pub clearance: Option<Clearance>,
+    /// What is asked of a grasp besides.
+    pub constraints: Constraints,
+    /// The hand, if it is another than the one that the network was trained with. It grasps where that one would: with its
+    /// fingertips in the same place, and no wider than it opens.
+    pub hand: Option<Hand>,
     /// Where in its voxel a grasp stands.
     pub origin: VoxelOrigin,
 }
@@ -95,6 +99,8 @@ impl Default for DecodeParams {
             force: None,
             nms_size: 4,
             clearance: None,
+            constraints: Constraints::default(),
+            hand: None,
             origin: VoxelOrigin::Corner,
         }
     }
@@ -121,6 +127,12 @@ pub struct Dropped {
     pub width: usize,
     /// At the border of the cube.
     pub border: usize,
+    /// Outside of the region that was asked for.
+    pub region: usize,
+    /// From where the hand was not asked to come.
+    pub approach: usize,
+    /// The hand would be too low.
+    pub height: usize,
     /// A better grasp is near.
     pub suppressed: usize,
     /// The open hand would meet what was observed.
@@ -173,13 +185,12 @@ pub fn decode(volume: &Volume, maps: &Maps, params: &DecodeParams) -> Result<Dec
     let near_surface = near_surface(volume, params);
 
     let select = |threshold| {
-        let (cells, mut dropped) = candidates(&smooth, maps.width, &near_surface, n, threshold, params);
-        let grasps = cells.iter().map(|&index| grasp_at(volume, maps, index, smooth[index], params.origin));
-        let mut grasps = grasps.collect::<Result<Vec<_>, _>>()?;
+        let (mut grasps, mut dropped) = candidates(volume, maps, &smooth, &near_surface, threshold, params)?;
         if let Some(clearance) = params.clearance {
             let obstacles = Obstacles::observed(volume, clearance);
+            let all = grasps.len();
             grasps.retain(|grasp| !obstacles.meet(&grasp.pose));
-            dropped.collision = cells.len() - grasps.len();
+            dropped.collision = all - grasps.len();
         }
         Ok(Decoded { grasps, dropped })
     };
@@ -194,37 +205,95 @@ pub fn decode(volume: &Volume, maps: &Maps, params: &DecodeParams) -> Result<Dec
     Ok(decoded)
 }
 
-/// The voxels that hold a grasp of at least `threshold`, best first, and why the others do not.
+/// Of grasps that a planner without a network found in the frame of `volume`'s pose, best first, those that are asked
+/// for. The hand is theirs already.
+#[must_use]
+pub fn select(grasps: &[Grasp], volume: &Volume, params: &DecodeParams) -> Decoded {
+    let hand = params.hand.unwrap_or(Hand::PANDA);
+    let obstacles = params.clearance.map(|clearance| Obstacles::observed(volume, clearance));
+    let above = |threshold: f32| {
+        let mut decoded = Decoded::default();
+        for grasp in grasps {
+            let count = match params.constraints.violation(&grasp.pose, &hand) {
+                _ if grasp.quality < threshold => &mut decoded.dropped.below_threshold,
+                Some(Violation::Region) => &mut decoded.dropped.region,
+                Some(Violation::Approach) => &mut decoded.dropped.approach,
+                Some(Violation::Height) => &mut decoded.dropped.height,
+                None if obstacles.as_ref().is_some_and(|obstacles| obstacles.meet(&grasp.pose)) => {
+                    &mut decoded.dropped.collision
+                }
+                None => {
+                    decoded.grasps.push(*grasp);
+                    continue;
+                }
+            };
+            *count += 1;
+        }
+        decoded
+    };
+    let decoded = above(params.threshold);
+    match params.force {
+        Some(floor) if decoded.grasps.is_empty() => {
+            let mut decoded = above(floor.min(params.threshold));
+            decoded.dropped.suppressed += decoded.grasps.len().saturating_sub(1);
+            decoded.grasps.truncate(1);
+            decoded
+        }
+        _ => decoded,
+    }
+}
+
+/// The grasps of at least `threshold`, best first, and why the other voxels hold none.
 fn candidates(
+    volume: &Volume,
+    maps: &Maps,
     smooth: &[f32],
-    width: &[f32],
     near_surface: &[bool],
-    n: usize,
     threshold: f32,
     params: &DecodeParams,
-) -> (Vec<usize>, Dropped) {
+) -> Result<(Vec<Grasp>, Dropped), DecodeError> {
+    let n = volume.resolution();
+    let hand = params.hand.unwrap_or(Hand::PANDA);
+    // Of the hand's own opening; the width that was learnt from is narrower than the hand by a margin of its own.
+    let opening = params.hand.map_or(f64::INFINITY, |hand| 2.0 * hand.half_opening());
     let mut dropped = Dropped::default();
     let mut quality = vec![0.0; smooth.len()];
     let mut passed = Vec::new();
     for (index, &q) in smooth.iter().enumerate() {
         if q < threshold || q <= 0.0 {
             dropped.below_threshold += 1;
-        } else if !near_surface[index] {
+            continue;
+        }
+        if !near_surface[index] {
             dropped.mask += 1;
-        } else if !(width[index] >= params.min_width && width[index] <= params.max_width) {
+            continue;
+        }
+        if !(maps.width[index] >= params.min_width && maps.width[index] <= params.max_width)
+            || f64::from(maps.width[index]) * volume.voxel_size() > opening
+        {
             dropped.width += 1;
-        } else if params.border.is_some_and(|border| border.holds(index, n)) {
+            continue;
+        }
+        if params.border.is_some_and(|border| border.holds(index, n)) {
             dropped.border += 1;
-        } else {
-            quality[index] = q;
-            passed.push(index);
+            continue;
+        }
+        let grasp = grasp_at(volume, maps, index, q, params)?;
+        match params.constraints.violation(&grasp.pose, &hand) {
+            Some(Violation::Region) => dropped.region += 1,
+            Some(Violation::Approach) => dropped.approach += 1,
+            Some(Violation::Height) => dropped.height += 1,
+            None => {
+                quality[index] = q;
+                passed.push((index, grasp));
+            }
         }
     }
     let all = passed.len();
-    passed.retain(|&index| is_window_maximum(&quality, n, index, params.nms_size));
+    passed.retain(|&(index, _)| is_window_maximum(&quality, n, index, params.nms_size));
     dropped.suppressed = all - passed.len();
-    passed.sort_by(|&a, &b| quality[b].total_cmp(&quality[a]).then(a.cmp(&b)));
-    (passed, dropped)
+    passed.sort_by(|(a, _), (b, _)| quality[*b].total_cmp(&quality[*a]).then(a.cmp(b)));
+    Ok((passed.into_iter().map(|(_, grasp)| grasp).collect(), dropped))
 }
 
 fn check(maps: &Maps, n: usize) -> Result<(), DecodeError> {
@@ -267,7 +336,7 @@ fn grasp_at(
     maps: &Maps,
     index: usize,
     quality: f32,
-    origin: VoxelOrigin,
+    params: &DecodeParams,
 ) -> Result<Grasp, DecodeError> {
     let n = volume.resolution();
     let voxels = n.pow(3);
@@ -276,9 +345,11 @@ fn grasp_at(
         .filter(|q| q.coords.iter().all(|c| c.is_finite()))
         .ok_or(DecodeError::NotFinite { map: "rotation", index, value: maps.rotation[index] })?;
     let cell = Vector3::new(index / (n * n), index / n % n, index % n);
-    let position = cell.map(|c| c as f64 + origin.offset()) * volume.voxel_size();
+    let position = cell.map(|c| c as f64 + params.origin.offset()) * volume.voxel_size();
+    let pose = volume.pose() * Isometry3::from_parts(Translation3::from(position), rotation);
     Ok(Grasp {
-        pose: volume.pose() * Isometry3::from_parts(Translation3::from(position), rotation),
+        // The fingertips stay where they are.
+        pose: params.hand.map_or(pose, |hand| before(&pose, hand.depth - FINGER_DEPTH)),
         width: f64::from(maps.width[index]) * volume.voxel_size(),
         quality,
     })
@@ -287,7 +358,7 @@ fn grasp_at(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Hand;
+    use crate::{Cone, Region};
 
     const N: usize = 16;
 
@@ -315,9 +386,9 @@ mod tests {
             let maps = Maps { quality: &self.quality, rotation: &self.rotation, width: &self.width };
             let decoded = decode(&slab(), &maps, params).unwrap();
             let d = decoded.dropped;
-            let all =
-                d.below_threshold + d.mask + d.width + d.border + d.suppressed + d.collision + decoded.grasps.len();
-            assert_eq!(all, N.pow(3), "every voxel is accounted for once");
+            let constrained = d.region + d.approach + d.height;
+            let all = d.below_threshold + d.mask + d.width + d.border + constrained + d.suppressed + d.collision;
+            assert_eq!(all + decoded.grasps.len(), N.pow(3), "every voxel is accounted for once");
             decoded
         }
     }
@@ -356,9 +427,52 @@ mod tests {
         arrays.quality[index(1, 8, 9)] = 0.99; // border
         let decoded = arrays.decode(&DecodeParams { border: Some(Border { sides: 2, bottom: 7 }), ..sharp() });
         assert_eq!(decoded.grasps.len(), 1);
-        let expected =
-            Dropped { below_threshold: N.pow(3) - 5, mask: 1, width: 1, border: 1, suppressed: 1, collision: 0 };
+        let expected = Dropped {
+            below_threshold: N.pow(3) - 5,
+            mask: 1,
+            width: 1,
+            border: 1,
+            suppressed: 1,
+            ..Dropped::default()
+        };
         assert_eq!(decoded.dropped, expected);
+    }
+
+    #[test]
+    fn what_is_not_asked_for_makes_way_for_its_neighbour() {
+        let mut arrays = Arrays::new();
+        arrays.quality[index(8, 8, 9)] = 0.99;
+        arrays.quality[index(9, 8, 9)] = 0.95;
+        assert_eq!(arrays.decode(&sharp()).dropped.suppressed, 1);
+        // The fingers point up: their tips are 0.05 m above the voxel, the volume's corner is at (1, 2, 3).
+        let region = Region {
+            frame: Isometry3::translation(1.0, 2.0, 3.0),
+            lower: [8.5 * 0.0075, 0.0, 9.0 * 0.0075 + 0.05],
+            upper: [1.0; 3],
+        };
+        let constraints = Constraints { region: Some(region), ..Constraints::default() };
+        let decoded = arrays.decode(&DecodeParams { constraints, ..sharp() });
+        assert_eq!(decoded.grasps.iter().map(|grasp| grasp.quality).collect::<Vec<_>>(), [0.95]);
+        assert_eq!((decoded.dropped.region, decoded.dropped.suppressed), (1, 0));
+        let approach = Some(Cone { axis: Vector3::x_axis(), angle: 0.5 });
+        let constraints = Constraints { approach, min_height: Some(9.0), ..Constraints::default() };
+        assert_eq!(arrays.decode(&DecodeParams { constraints, ..sharp() }).dropped.approach, 2);
+        let constraints = Constraints { min_height: Some(9.0), ..Constraints::default() };
+        assert_eq!(arrays.decode(&DecodeParams { constraints, ..sharp() }).dropped.height, 2);
+    }
+
+    #[test]
+    fn another_hand_grasps_with_its_fingertips_in_the_same_place() {
+        let mut arrays = Arrays::new();
+        arrays.quality[index(8, 8, 9)] = 0.99;
+        let [own] = arrays.decode(&sharp()).grasps[..] else { panic!() };
+        let hand = Hand::new(0.04, 0.12, 0.01, 0.02, [[0.0; 3]; 2]).unwrap();
+        let [other] = arrays.decode(&DecodeParams { hand: Some(hand), ..sharp() }).grasps[..] else { panic!() };
+        let tips = |grasp: Grasp, depth: f64| before(&grasp.pose, -depth).translation.vector;
+        assert!((tips(own, FINGER_DEPTH) - tips(other, 0.12)).norm() < 1e-12);
+        // 5 voxels are 0.0375 m.
+        let narrow = Hand::new(0.037, 0.12, 0.01, 0.02, [[0.0; 3]; 2]).unwrap();
+        assert_eq!(arrays.decode(&DecodeParams { hand: Some(narrow), ..sharp() }).dropped.width, 1);
     }
 
     #[test]

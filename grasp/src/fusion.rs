@@ -1,4 +1,5 @@
 use nalgebra::{Isometry3, Point3, Vector3};
+use thiserror::Error;
 
 use crate::{DepthImage, Volume, VolumeError};
 
@@ -33,6 +34,38 @@ struct Voxel {
     weight: f32,
 }
 
+/// Why a view measures nothing of a cube.
+#[derive(Clone, Copy, Debug, Error, PartialEq)]
+pub enum Blind {
+    /// All of the cube has negative depth.
+    #[error("the workspace lies behind the camera; is the pose inverted?")]
+    Behind,
+    /// None of it is projected onto the image.
+    #[error("the workspace is outside of the image: its centre would be at pixel ({u:.0}, {v:.0})")]
+    Outside {
+        /// Column of its centre.
+        u: f64,
+        /// Row of its centre.
+        v: f64,
+    },
+    /// There is no valid depth where the cube is.
+    #[error("no pixel on the workspace has a depth from 0 to {DEPTH_MAX} m; it is {distance:.3} m away")]
+    NoReading {
+        /// Depth of the cube's centre, metres.
+        distance: f64,
+    },
+    /// Something stands before all of it.
+    #[error(
+        "all that is seen is before the workspace, at most {depth:.4} m away; the workspace's centre is {distance:.3} m away"
+    )]
+    Hidden {
+        /// Largest depth that was measured on the cube, metres.
+        depth: f32,
+        /// Depth of the cube's centre, metres.
+        distance: f64,
+    },
+}
+
 impl Fusion {
     /// An empty field of `resolution`³ voxels over a cube with an edge of `size` metres.
     #[must_use]
@@ -46,8 +79,25 @@ impl Fusion {
         }
     }
 
+    /// The field that a volume was read from, seen once.
+    #[must_use]
+    pub fn of(volume: &Volume) -> Self {
+        let seen = |&value: &f32| {
+            if value > 0.0 { Voxel { distance: 2.0 * value - 1.0, weight: 1.0 } } else { Voxel::default() }
+        };
+        Self {
+            resolution: volume.resolution(),
+            voxel_size: volume.voxel_size(),
+            truncation: (TRUNCATION_VOXELS * volume.voxel_size()) as f32,
+            voxels: volume.values().iter().map(seen).collect(),
+        }
+    }
+
     /// Adds one view. `camera_from_task` (`T_camera_task`) maps points of the cube's frame into the camera.
-    pub fn integrate(&mut self, image: &DepthImage, camera_from_task: &Isometry3<f64>) {
+    ///
+    /// Returns how many voxels it measured; [`blind`](Self::blind) says why if there are none.
+    pub fn integrate(&mut self, image: &DepthImage, camera_from_task: &Isometry3<f64>) -> usize {
+        let mut measured = 0;
         let camera = image.intrinsics();
         let (fx, fy) = (camera.fx as f32, camera.fy as f32);
         // The half pixel turns truncation into rounding.
@@ -104,9 +154,43 @@ impl Fusion {
                     };
                     voxel.distance = (voxel.distance * voxel.weight + sample) / (voxel.weight + 1.0);
                     voxel.weight += 1.0;
+                    measured += 1;
                 }
             }
         }
+        measured
+    }
+
+    /// Why a view that [measured](Self::integrate) no voxel did not.
+    #[must_use]
+    pub fn blind(&self, image: &DepthImage, camera_from_task: &Isometry3<f64>) -> Blind {
+        const STEPS: usize = 16;
+        let camera = image.intrinsics();
+        let size = self.voxel_size * self.resolution as f64;
+        let project = |point: Point3<f64>| {
+            let Point3 { coords, .. } = camera_from_task * point;
+            let [u, v] = [coords.x / coords.z * camera.fx + camera.cx, coords.y / coords.z * camera.fy + camera.cy];
+            (coords.z, u, v)
+        };
+        let (distance, centre_u, centre_v) = project(Point3::from([size / 2.0; 3]));
+        let grid = |step: usize| (step as f64 + 0.5) / STEPS as f64 * size;
+        let points =
+            (0..STEPS.pow(3)).map(|i| Point3::from([i / (STEPS * STEPS), i / STEPS % STEPS, i % STEPS].map(grid)));
+        let before: Vec<_> = points.map(project).filter(|&(z, ..)| z > 0.0).collect();
+        if before.is_empty() {
+            return Blind::Behind;
+        }
+        let inside = |u: f64, v: f64| {
+            let pixel = (u.round() >= 0.0 && v.round() >= 0.0).then_some((u.round() as usize, v.round() as usize));
+            pixel.filter(|&(u, v)| u < camera.width && v < camera.height)
+        };
+        let pixels: Vec<_> = before.iter().filter_map(|&(_, u, v)| inside(u, v)).collect();
+        if pixels.is_empty() {
+            return Blind::Outside { u: centre_u, v: centre_v };
+        }
+        let depth = pixels.iter().map(|&(u, v)| image.depth()[v * camera.width + u]);
+        let depth = depth.filter(|depth| *depth > 0.0 && *depth <= DEPTH_MAX).fold(0.0, f32::max);
+        if depth > 0.0 { Blind::Hidden { depth, distance } } else { Blind::NoReading { distance } }
     }
 
     /// The values a network reads: `(tsdf + 1) / 2` near a surface that was seen, else 0. Indexed `[x][y][z]`.
@@ -190,6 +274,41 @@ mod tests {
         assert!((at(20) - (0.5 - 0.5 / 8.0)).abs() < 1e-3, "{}", at(20));
         assert_eq!(at(5), 0.0, "free space past the truncation reads 0");
         assert_eq!(at(35), 0.0, "what is hidden reads 0");
+    }
+
+    #[test]
+    fn a_view_that_sees_nothing_says_why() {
+        let camera = Intrinsics::BENCHMARK;
+        let blind = |depth: f32, pose: Isometry3<f64>| {
+            let depth = vec![depth; camera.width * camera.height];
+            let image = DepthImage::new(camera, &depth).unwrap();
+            let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
+            (fusion.integrate(&image, &pose), fusion.blind(&image, &pose).to_string())
+        };
+        let measured = blind(0.65, facing()).0;
+        assert!((20_000..=64_000).contains(&measured), "{measured}");
+        let nothing = |depth, pose, says: &str| {
+            let (measured, reason) = blind(depth, pose);
+            assert!(measured == 0 && reason.contains(says), "{measured}: {reason}");
+        };
+        nothing(0.65, facing().inverse(), "behind the camera; is the pose inverted?");
+        nothing(0.65, Isometry3::translation(2.0, -0.15, 0.5), "its centre would be at pixel (2106, 240)");
+        nothing(f32::NAN, facing(), "no pixel on the workspace has a depth from 0 to 2 m; it is 0.650 m away");
+        nothing(0.000_65, facing(), "before the workspace, at most 0.0007 m away");
+    }
+
+    #[test]
+    fn a_volume_is_a_field_again() {
+        let camera = Intrinsics::BENCHMARK;
+        let depth = vec![0.65; camera.width * camera.height];
+        let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
+        fusion.integrate(&DepthImage::new(camera, &depth).unwrap(), &facing());
+        let again = Fusion::of(&fusion.volume(Isometry3::identity()).unwrap());
+        assert!(again.values().iter().zip(fusion.values()).all(|(a, b)| (a - b).abs() < 1e-6));
+        let (surface, wanted) = (again.surface(), fusion.surface());
+        assert!(surface.len() == wanted.len() && surface.len() > 500, "{} points", surface.len());
+        let worst = surface.iter().zip(&wanted).map(|(a, b)| (a.position - b.position).norm()).fold(0.0, f64::max);
+        assert!(worst < 1e-6 && surface.iter().all(|point| point.normal.z < -0.99), "{worst}");
     }
 
     #[test]

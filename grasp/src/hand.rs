@@ -1,4 +1,5 @@
 use nalgebra::{Isometry3, Point3, Vector3};
+use thiserror::Error;
 
 use crate::{FINGER_DEPTH, MAX_OPENING};
 
@@ -18,7 +19,53 @@ pub struct Hand {
     pub palm: [[f64; 3]; 2],
 }
 
+/// A measure that no hand has.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[error("{field} is {value} m, must be {needed}")]
+pub struct HandError {
+    /// Which: `max_opening`, `finger_depth`, `finger_width`, `finger_breadth` or `palm`.
+    pub field: &'static str,
+    /// Its value, metres.
+    pub value: f64,
+    /// What it must be.
+    pub needed: &'static str,
+}
+
 impl Hand {
+    /// A hand whose fingers open to `max_opening`, are `depth` long, `width` thick along the closing axis and `breadth`
+    /// broad across it; `palm` is the box behind them, smallest and largest coordinates in the grasp frame.
+    ///
+    /// # Errors
+    /// [`HandError`] names the first measure that cannot be.
+    pub fn new(max_opening: f64, depth: f64, width: f64, breadth: f64, palm: [[f64; 3]; 2]) -> Result<Self, HandError> {
+        const LENGTH: &str = "above 0 and at most 0.5";
+        let named = [
+            ("max_opening", max_opening),
+            ("finger_depth", depth),
+            ("finger_width", width),
+            ("finger_breadth", breadth),
+        ];
+        for (field, value) in named {
+            // Written so that NaN fails.
+            if !(value > 0.0 && value <= 0.5) {
+                return Err(HandError { field, value, needed: LENGTH });
+            }
+        }
+        for (lower, upper) in palm[0].into_iter().zip(palm[1]) {
+            if !(lower.abs() <= 1.0 && upper.abs() <= 1.0) {
+                let value = if lower.abs() <= 1.0 { upper } else { lower };
+                return Err(HandError { field: "palm", value, needed: "within 1 of the finger base" });
+            }
+            if lower > upper {
+                return Err(HandError { field: "palm", value: lower, needed: "no larger than its other corner" });
+            }
+        }
+        if palm[1][2] >= depth {
+            return Err(HandError { field: "palm", value: palm[1][2], needed: "behind the fingertips" });
+        }
+        Ok(Self { finger_width: width, outer_diameter: max_opening + 2.0 * width, depth, height: breadth, palm })
+    }
+
     /// The Panda hand, its boxes those of VGN's URDF.
     pub const PANDA: Self = Self {
         finger_width: 0.0264,
@@ -110,6 +157,23 @@ mod tests {
         assert!(hand.palm_meets(&Point3::new(0.03, 0.09, -0.05)));
         assert!(hand.meets(&Point3::new(0.005, 0.045, -0.05), 0.05) && !hand.meets(&Point3::new(0.0, 0.0, 0.03), 0.05));
         assert!(hand.meets(&Point3::new(0.0, 0.0, -0.13), 0.05) && !hand.meets(&Point3::new(0.0, 0.0, -0.13), 0.04));
+    }
+
+    #[test]
+    fn a_hand_has_measures_that_can_be() {
+        let Hand { finger_width, depth, height, palm, .. } = Hand::PANDA;
+        assert_eq!(Hand::new(MAX_OPENING, depth, finger_width, height, palm), Ok(Hand::PANDA));
+        let message = |hand: Result<Hand, HandError>| hand.unwrap_err().to_string();
+        assert_eq!(
+            message(Hand::new(-0.08, depth, finger_width, height, palm)),
+            "max_opening is -0.08 m, must be above 0 and at most 0.5"
+        );
+        assert!(message(Hand::new(80.0, depth, finger_width, height, palm)).starts_with("max_opening is 80 m"));
+        assert!(message(Hand::new(0.08, f64::NAN, finger_width, height, palm)).starts_with("finger_depth is NaN m"));
+        let turned = [palm[1], palm[0]];
+        assert!(message(Hand::new(0.08, depth, finger_width, height, turned)).starts_with("palm is 0.0316 m"));
+        let long = [palm[0], [0.03, 0.1, 0.06]];
+        assert!(message(Hand::new(0.08, depth, finger_width, height, long)).ends_with("behind the fingertips"));
     }
 
     #[test]

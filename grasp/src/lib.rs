@@ -8,6 +8,9 @@
 //! `T_a_b` maps points of frame b into frame a; voxel arrays are indexed `[x][y][z]` with z running fastest.
 
 mod camera;
+mod cloud;
+mod constraints;
+mod convention;
 mod decode;
 mod filter;
 mod fusion;
@@ -18,12 +21,15 @@ mod obstacles;
 mod surface;
 mod volume;
 
-pub use camera::{CameraError, DepthImage, Intrinsics};
-pub use decode::{Border, DecodeError, DecodeParams, Decoded, Dropped, Maps, VoxelOrigin, decode};
-pub use fusion::{DEPTH_MAX, Fusion, TRUNCATION_VOXELS};
+pub use camera::{CameraError, DepthImage, Intrinsics, Unit};
+pub use cloud::{View, seen_from};
+pub use constraints::{Cone, Constraints, Region, Violation};
+pub use convention::{ClosingAxis, Convention, Origin, Retreat, before};
+pub use decode::{Border, DecodeError, DecodeParams, Decoded, Dropped, Maps, VoxelOrigin, decode, select};
+pub use fusion::{Blind, DEPTH_MAX, Fusion, TRUNCATION_VOXELS};
 pub use grasp::{FINGER_DEPTH, Grasp, MAX_OPENING};
-pub use hand::Hand;
-pub use obstacles::Clearance;
+pub use hand::{Hand, HandError};
+pub use obstacles::{Clearance, Obstacles};
 pub use surface::SurfacePoint;
 pub use volume::{Volume, VolumeError};
 

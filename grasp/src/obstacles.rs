@@ -1,6 +1,6 @@
 use nalgebra::{Isometry3, Point3};
 
-use crate::{Hand, Volume};
+use crate::{Hand, Volume, before};
 
 /// How a hand must keep clear of what was observed.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -12,24 +12,30 @@ pub struct Clearance {
     /// How far behind a surface something is in the way, as a share of the distance at which the field is truncated: a
     /// noisy surface is not everywhere where it was seen.
     pub behind: f32,
+    /// Height of a table that the hand must not touch either, metres above the volume's bottom.
+    pub table: Option<f64>,
 }
 
 impl Default for Clearance {
     /// The Panda hand from the benchmark's pre-grasp on.
     fn default() -> Self {
-        Self { hand: Hand::PANDA, from: 0.05, behind: 0.25 }
+        Self { hand: Hand::PANDA, from: 0.05, behind: 0.25, table: None }
     }
 }
 
-/// What was observed and a hand must not touch: points at or behind the surfaces of a volume. Space that nothing observed
-/// is taken to be free.
-pub(crate) struct Obstacles {
+/// What was observed and a hand must not touch: points at or behind the surfaces of a volume, and the table. Space that
+/// nothing observed is taken to be free.
+#[derive(Clone, Debug)]
+pub struct Obstacles {
     clearance: Clearance,
     points: Vec<Point3<f64>>,
+    /// The volume's.
+    pose: Isometry3<f64>,
 }
 
 impl Obstacles {
     /// The voxels of `volume` that are in the way.
+    #[must_use]
     pub fn observed(volume: &Volume, clearance: Clearance) -> Self {
         let (n, size) = (volume.resolution(), volume.voxel_size());
         let behind = 0.5 - clearance.behind / 2.0;
@@ -38,12 +44,19 @@ impl Obstacles {
             let cell = [index / (n * n), index / n % n, index % n];
             volume.pose() * Point3::from(cell.map(|c| (c as f64 + 0.5) * size))
         };
-        Self { clearance, points: solid.map(|(index, _)| point(index)).collect() }
+        Self { clearance, points: solid.map(|(index, _)| point(index)).collect(), pose: *volume.pose() }
     }
 
     /// Whether the hand meets one of them on its way to `pose`.
+    #[must_use]
     pub fn meet(&self, pose: &Isometry3<f64>) -> bool {
-        let Clearance { hand, from, .. } = self.clearance;
+        let Clearance { hand, from, table, .. } = self.clearance;
+        // It moves straight: nowhere on its way is it lower than at both ends.
+        let low =
+            |pose: &Isometry3<f64>| table.is_some_and(|table| hand.lowest_point(&(self.pose.inverse() * pose)) < table);
+        if low(pose) || low(&before(pose, from)) {
+            return true;
+        }
         self.points.iter().any(|point| hand.meets(&pose.inverse_transform_point(point), from))
     }
 }
@@ -85,6 +98,19 @@ mod tests {
         // Past the wall's top by the hand's height, but for the way.
         assert!(!meet(clearance, 0.06, 0.36) && !meet(Clearance { from: 0.0, ..clearance }, 0.06, 0.31));
         assert!(meet(Clearance { from: 0.1, ..clearance }, 0.06, 0.15));
+    }
+
+    #[test]
+    fn a_hand_meets_the_table_at_the_grasp_and_before_it() {
+        let meet = |table, pose: &Isometry3<f64>| {
+            Obstacles::observed(&wall(), Clearance { table, behind: 1.0, ..Clearance::default() }).meet(pose)
+        };
+        // Fingertips at 0.1 - 0.0502 above the volume's bottom.
+        let pose = down(0.04, 0.1);
+        assert!(!meet(None, &pose) && !meet(Some(0.049), &pose) && meet(Some(0.051), &pose));
+        // From below: on its way it is lower than in the end.
+        let up = Isometry3::translation(1.04, 2.15, 3.2);
+        assert!(!meet(Some(0.06), &up) && meet(Some(0.07), &up), "the palm's back, 0.088 below, and 0.05 further back");
     }
 
     #[test]

@@ -22,6 +22,9 @@ pub struct Metadata {
     pub value_convention: ValueConvention,
     /// Where in its voxel a grasp stands.
     pub voxel_origin: VoxelOrigin,
+    /// Where the camera stood in training, where it always stood on the same side: degrees about the vertical axis
+    /// through the middle of the volume, from x towards y. `None` for a network that takes any view.
+    pub camera_azimuth: Option<f64>,
     /// Where the weights come from: data, seeds, steps, date and whatever else was noted (`graspd.provenance.…`).
     pub provenance: BTreeMap<String, String>,
 }
@@ -72,6 +75,7 @@ impl Metadata {
             voxel_size: WORKSPACE_SIZE / resolution as f64,
             value_convention: ValueConvention::Vgn,
             voxel_origin: VoxelOrigin::Corner,
+            camera_azimuth: None,
             provenance: BTreeMap::new(),
         }
     }
@@ -121,6 +125,11 @@ impl Metadata {
                         }
                     }
                 }
+                "camera_azimuth" => {
+                    let azimuth =
+                        parse("camera_azimuth", &value, "a number of degrees", |angle: &f64| angle.is_finite())?;
+                    metadata.camera_azimuth = Some(azimuth);
+                }
                 _ => {
                     if let Some(key) = key.strip_prefix(PROVENANCE) {
                         metadata.provenance.insert(key.to_owned(), value);
@@ -149,6 +158,9 @@ impl Metadata {
         put("voxel_size", self.voxel_size.to_string());
         put("value_convention", "vgn".to_owned());
         put("voxel_origin", origin.to_owned());
+        if let Some(azimuth) = self.camera_azimuth {
+            put("camera_azimuth", azimuth.to_string());
+        }
         for (key, value) in &self.provenance {
             put(&format!("{PROVENANCE}{key}"), value.clone());
         }

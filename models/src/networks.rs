@@ -92,6 +92,7 @@ impl Architecture {
             voxel_size: grasp::WORKSPACE_SIZE / resolution as f64,
             value_convention: ValueConvention::Vgn,
             voxel_origin: VoxelOrigin::Corner,
+            camera_azimuth: None,
             provenance: BTreeMap::from(provenance.map(|(key, value)| (key.to_owned(), value))),
         };
         metadata.write_to(&mut model);

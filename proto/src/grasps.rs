@@ -7,7 +7,8 @@ const POSE: PoseFields = PoseFields { position: "grasps.pose.position", orientat
 
 impl From<&Grasp> for pb::Grasp {
     fn from(grasp: &Grasp) -> Self {
-        Self { pose: Some((&grasp.pose).into()), width: grasp.width, quality: grasp.quality }
+        let pose = Some((&grasp.pose).into());
+        Self { pose, width: grasp.width, quality: grasp.quality, ..Self::default() }
     }
 }
 
@@ -29,6 +30,9 @@ impl From<&Dropped> for pb::Dropped {
             mask: count(dropped.mask),
             width: count(dropped.width),
             border: count(dropped.border),
+            region: count(dropped.region),
+            approach: count(dropped.approach),
+            height: count(dropped.height),
             suppressed: count(dropped.suppressed),
             collision: count(dropped.collision),
             over_limit: 0,

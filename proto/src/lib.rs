@@ -5,7 +5,9 @@
 
 mod error;
 mod grasps;
+mod options;
 mod pose;
+mod views;
 mod volume;
 
 /// The generated types, the client and the server of `grasp.v1`.
@@ -21,6 +23,9 @@ pub mod oip {
 }
 
 pub use error::FieldError;
+pub use options::{Asked, Collision, TABLE_HEIGHT};
+pub use pose::pose;
+pub use views::{MAX_VIEWS, Points, Workspace, check_count, cloud_view, depth_view};
 pub use volume::{encode, resolution};
 
 /// The descriptors of everything in `grasp.v1`, encoded: what reflection serves.

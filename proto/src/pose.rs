@@ -5,6 +5,15 @@ use crate::{FieldError, pb};
 /// How far from 1 the length of an orientation may be: what single precision and four printed digits leave.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
+/// A pose of a message, checked; errors name it by `field`.
+///
+/// # Errors
+/// [`FieldError`] when it is not whole, not finite, or its orientation not of unit length.
+pub fn pose(pose: &pb::Pose, field: &'static str) -> Result<Isometry3<f64>, FieldError> {
+    const FIELDS: PoseFields = PoseFields { position: "position", orientation: "orientation" };
+    decode(pose, &FIELDS).map_err(|error| error.inside(field))
+}
+
 /// The fields of one pose, as a request names them.
 pub(crate) struct PoseFields {
     pub position: &'static str,

@@ -108,7 +108,7 @@ impl From<VolumeError> for FieldError {
             "voxel_size" => "volume.voxel_size",
             _ => "volume.data",
         };
-        Self { field, message: format!("volume.{error}") }
+        Self { field: field.into(), message: format!("volume.{error}") }
     }
 }
 

@@ -47,6 +47,10 @@ pub(crate) struct Config {
     pub tokens: Option<Arc<Tokens>>,
     pub max_connections: usize,
     pub limits: Limits,
+    /// Volumes that are kept from view to view.
+    pub max_tracked: usize,
+    /// For how long, without a view.
+    pub track_timeout: Duration,
     pub drain_timeout: Duration,
     pub log: String,
     pub log_format: LogFormat,
@@ -140,6 +144,20 @@ struct Flags {
     #[arg(long, env = "GRASPD_MAX_CONNECTIONS", value_name = "N", default_value = "16384")]
     max_connections: String,
 
+    /// Volumes that are kept from view to view, one for each call of TrackGrasps. Further calls are refused.
+    #[arg(long, env = "GRASPD_MAX_TRACKED", value_name = "N", default_value = "64")]
+    max_tracked: String,
+
+    /// How long a volume is kept without a view, seconds. Then the call ends.
+    #[arg(
+        long,
+        env = "GRASPD_TRACK_TIMEOUT",
+        value_name = "SECONDS",
+        default_value = "60",
+        allow_negative_numbers = true
+    )]
+    track_timeout: String,
+
     /// How long a message may stand still in the middle, seconds.
     #[arg(
         long,
@@ -209,6 +227,10 @@ impl Config {
         let max_message_bytes = errors.parse("max-message-bytes", &flags.max_message_bytes, BYTES);
         let max_connections =
             errors.parse::<NonZeroUsize>("max-connections", &flags.max_connections, "a whole number above 0");
+        let max_tracked = errors.parse("max-tracked", &flags.max_tracked, COUNT).map(|Count(volumes)| volumes);
+        let track_timeout = errors
+            .parse("track-timeout", &flags.track_timeout, "a number of seconds, 0 or more")
+            .map(|Seconds(duration)| duration);
         let stall = errors
             .parse("stall-timeout", &flags.stall_timeout, "a number of seconds, 0 or more")
             .map(|Seconds(duration)| duration);
@@ -256,6 +278,8 @@ impl Config {
                 tokens: tokens?.map(Arc::new),
                 max_connections: max_connections.map(NonZeroUsize::get)?,
                 limits: Limits { message_bytes: max_message_bytes.map(NonZeroUsize::get)?, stall: stall? },
+                max_tracked: max_tracked?,
+                track_timeout: track_timeout?,
                 drain_timeout: drain_timeout?,
                 log: flags.log,
                 log_format: log_format?,

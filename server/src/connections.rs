@@ -2,21 +2,30 @@ use std::io;
 use std::pin::Pin;
 use std::task::{Context, Poll};
 
-use prometheus::IntGauge;
+use prometheus::{IntCounter, IntGauge};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio_stream::{Stream, StreamExt};
 use tonic::transport::server::{Connected, TcpConnectInfo, TcpIncoming};
 use tracing::warn;
 
+/// How many connections may be open, and what is counted of them.
+pub(crate) struct Doors {
+    pub most: usize,
+    pub open: IntGauge,
+    pub refused: IntCounter,
+}
+
 /// The connections of a listener, of which no more than `most` are open at a time: a further one is closed at once, which
 /// clients see as the server being unavailable.
-pub(crate) fn accept(listener: TcpListener, most: usize, open: IntGauge) -> impl Stream<Item = io::Result<Connection>> {
+pub(crate) fn accept(listener: TcpListener, doors: Doors) -> impl Stream<Item = io::Result<Connection>> {
+    let Doors { most, open, refused } = doors;
     // `Server::tcp_nodelay` does nothing for a listener that was bound before; without TCP_NODELAY a reply of several
     // packets waits 40 ms for the client to acknowledge the first.
     TcpIncoming::from(listener).with_nodelay(Some(true)).filter_map(move |accepted| match accepted {
         Ok(stream) if open.get() < i64::try_from(most).unwrap_or(i64::MAX) => Some(Ok(Connection::new(stream, &open))),
         Ok(_) => {
+            refused.inc();
             warn!(open = open.get(), "too many connections, a further one was closed (--max-connections)");
             None
         }
@@ -100,7 +109,9 @@ mod tests {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
         let open = IntGauge::new("open", "How many are open.").unwrap();
-        let mut incoming = pin!(accept(listener, 1, open.clone()));
+        let refused = IntCounter::new("refused", "How many were closed at once.").unwrap();
+        let doors = Doors { most: 1, open: open.clone(), refused: refused.clone() };
+        let mut incoming = pin!(accept(listener, doors));
 
         let _first = TcpStream::connect(address).await.unwrap();
         let connection = incoming.next().await.unwrap().unwrap();
@@ -110,7 +121,7 @@ mod tests {
         let mut second = TcpStream::connect(address).await.unwrap();
         let closed = async { second.read(&mut [0]).await.unwrap_or(0) };
         let read = tokio::select! { read = closed => read, _ = incoming.next() => panic!("it was taken") };
-        assert_eq!(read, 0);
+        assert_eq!((read, refused.get()), (0, 1));
 
         drop(connection);
         assert_eq!(open.get(), 0);

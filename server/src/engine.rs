@@ -6,8 +6,9 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use grasp::{DecodeError, DecodeParams, Decoded, Volume, decode};
-use grasp_models::{Backend, Entry, Network, Options, RuntimeError};
+use grasp::{DecodeError, Decoded, Dropped, Grasp, Obstacles, Volume, decode};
+use grasp_models::{Backend, Network, Options, Output, RuntimeError};
+use grasp_proto::{Asked, Collision};
 use nalgebra::Isometry3;
 use prometheus::{Histogram, IntGauge};
 use thiserror::Error;
@@ -16,11 +17,12 @@ use tracing::{Span, error, info};
 
 use crate::deadline::Deadline;
 use crate::metrics::Metrics;
+use crate::planner::{Classical, Planner, Scene, Source};
 use crate::queue::{Batching, Full, Place, Queue};
 
-/// One model: its queue, and what is said of it. The sessions that take from the queue end when the engine is dropped.
+/// One planner: its queue, and what is said of it. The sessions that take from the queue end when the engine is dropped.
 pub(crate) struct Engine {
-    pub entry: Entry,
+    pub source: Source,
     /// `name version`, as the log and the metrics have it.
     pub label: String,
     /// What runs it.
@@ -64,12 +66,31 @@ pub(crate) struct Overloaded {
     pub retry_after: Duration,
 }
 
-/// What a session made of a volume.
-pub(crate) struct Answer {
-    pub decoded: Decoded,
+/// What a session made of a scene.
+pub(crate) struct Answer<T> {
+    pub made: T,
     pub queue: Duration,
     pub inference: Duration,
     pub postprocessing: Duration,
+}
+
+/// The grasps in a scene.
+pub(crate) struct Found {
+    /// Best first, as many as were asked for.
+    pub grasps: Vec<Grasp>,
+    /// Whether the hand would meet something at each of them, where that was asked.
+    pub collides: Option<Vec<bool>>,
+    /// Why there are no others.
+    pub dropped: Dropped,
+    /// How many more there are.
+    pub over_limit: usize,
+}
+
+/// A network's maps, as bytes: f32, little-endian.
+pub(crate) struct Tensors {
+    pub quality: Vec<u8>,
+    pub rotation: Vec<u8>,
+    pub width: Vec<u8>,
 }
 
 /// Why a session could not answer.
@@ -88,15 +109,18 @@ pub(crate) enum EngineError {
 }
 
 /// What a session's answer comes by. Who drops it has gone, and the volume is not looked at any more.
-pub(crate) struct Reply {
-    answer: oneshot::Receiver<Result<Answer, EngineError>>,
+pub(crate) struct Reply<T> {
+    answer: Receiver<T>,
     /// None if there is no session to wait for.
     _place: Option<Place<Job>>,
 }
 
-impl Reply {
+type Sender<T> = oneshot::Sender<Result<Answer<T>, EngineError>>;
+type Receiver<T> = oneshot::Receiver<Result<Answer<T>, EngineError>>;
+
+impl<T> Reply<T> {
     /// Waits for it, but no longer than anybody waits for the reply.
-    pub async fn wait(self, deadline: Option<Deadline>) -> Result<Answer, EngineError> {
+    pub async fn wait(self, deadline: Option<Deadline>) -> Result<Answer<T>, EngineError> {
         let Self { answer, _place } = self;
         let answer = match deadline {
             None => answer.await,
@@ -111,62 +135,111 @@ impl Reply {
 }
 
 struct Job {
-    volume: Volume,
-    params: DecodeParams,
+    scene: Scene,
+    task: Task,
     deadline: Option<Deadline>,
     span: Span,
     submitted: Instant,
-    reply: oneshot::Sender<Result<Answer, EngineError>>,
+}
+
+/// What is to be made of a scene.
+enum Task {
+    Grasps(Box<Asked>, Sender<Found>),
+    /// The network's own output.
+    Maps(Sender<Tensors>),
+}
+
+impl Task {
+    fn is_closed(&self) -> bool {
+        match self {
+            Self::Grasps(_, reply) => reply.is_closed(),
+            Self::Maps(reply) => reply.is_closed(),
+        }
+    }
+
+    /// Whoever asked may have gone meanwhile, which is counted on their side.
+    fn fail(self, error: EngineError) {
+        match self {
+            Self::Grasps(_, reply) => drop(reply.send(Err(error))),
+            Self::Maps(reply) => drop(reply.send(Err(error))),
+        }
+    }
 }
 
 /// How long the last answer took: when the next place in the queue will be free.
 struct Pace(AtomicU64);
 
 impl Engine {
-    /// Loads the model's sessions, has each of them answer once, and starts them behind its queue.
-    pub fn start(entry: Entry, serving: &Serving, metrics: &Metrics, sessions: &Sessions) -> anyhow::Result<Self> {
+    /// Loads the planner's sessions, has each of them answer once, and starts them behind its queue.
+    pub fn start(source: Source, serving: &Serving, metrics: &Metrics, sessions: &Sessions) -> anyhow::Result<Self> {
         let Serving { workers, options, capacity, batching } = *serving;
-        let label = format!("{} {}", entry.metadata.name, entry.metadata.version);
+        let label = format!("{} {}", source.name(), source.version());
         let started = Instant::now();
-        let mut networks = Network::load_several(&entry, &options, workers)?;
+        let (mut planners, backend) = source.load(&options, workers)?;
         let mut pace = Duration::ZERO;
-        for network in &mut networks {
-            pace = warm_up(network).with_context(|| format!("the model {label} cannot answer"))?;
+        for planner in &mut planners {
+            if let Planner::Network(network) = planner {
+                pace = warm_up(network).with_context(|| format!("the model {label} cannot answer"))?;
+            }
         }
-        let backend = networks[0].backend();
         let Gauges { waiting, batch } = metrics.gauges(&label);
         let queue = Arc::new(Queue::new(workers, capacity, waiting));
         // From here on it closes its queue when it goes, which is what ends the sessions that have been started.
-        let engine = Self { entry, label, backend, queue, pace: Arc::new(Pace::new(pace)) };
-        for (worker, network) in networks.into_iter().enumerate() {
+        let engine = Self { source, label, backend, queue, pace: Arc::new(Pace::new(pace)) };
+        for (worker, planner) in planners.into_iter().enumerate() {
             let (queue, pace) = (Arc::clone(&engine.queue), Arc::clone(&engine.pace));
-            let session = Session { network, queue, batching, batch: batch.clone(), pace };
-            sessions.spawn(format!("{} {worker}", engine.entry.metadata.name), session).with_context(|| {
+            let session = Session { planner, queue, batching, batch: batch.clone(), pace };
+            sessions.spawn(format!("{} {worker}", engine.source.name()), session).with_context(|| {
                 format!("cannot start thread {worker} of {workers} for the model {}; lower --workers", engine.label)
             })?;
         }
         let (Backend { provider, precision }, threads, took) = (backend, options.threads, started.elapsed());
-        info!(model = engine.label, sha256 = engine.entry.sha256, %provider, %precision, workers, threads, ?took, "loaded");
+        info!(model = engine.label, sha256 = engine.source.sha256(), %provider, %precision, workers, threads, ?took, "loaded");
         Ok(engine)
     }
 
-    /// Queues a volume, or refuses at once.
-    pub fn submit(
+    /// Queues a scene to look for grasps in it, or refuses at once.
+    pub fn detect(
         &self,
-        volume: Volume,
-        params: DecodeParams,
+        scene: Scene,
+        asked: Asked,
         deadline: Option<Deadline>,
         span: Span,
-    ) -> Result<Reply, Overloaded> {
+    ) -> Result<Reply<Found>, Overloaded> {
         let (reply, answer) = oneshot::channel();
-        match self.queue.push(Job { volume, params, deadline, span, submitted: Instant::now(), reply }) {
-            Ok(place) => Ok(Reply { answer, _place: Some(place) }),
+        let place = self.push(scene, Task::Grasps(Box::new(asked), reply), deadline, span)?;
+        Ok(Reply { answer, _place: place })
+    }
+
+    /// Queues a volume to have a network's own output, or refuses at once.
+    pub fn maps(&self, volume: Volume, deadline: Option<Deadline>, span: Span) -> Result<Reply<Tensors>, Overloaded> {
+        let (reply, answer) = oneshot::channel();
+        let place = self.push(Scene { volume, sights: None }, Task::Maps(reply), deadline, span)?;
+        Ok(Reply { answer, _place: place })
+    }
+
+    /// Refuses where there is no place at this moment, so that nothing is prepared in vain.
+    pub fn check_place(&self) -> Result<(), Overloaded> {
+        self.queue.is_full().map_or(Ok(()), |waiting| Err(self.overloaded(waiting)))
+    }
+
+    fn push(
+        &self,
+        scene: Scene,
+        task: Task,
+        deadline: Option<Deadline>,
+        span: Span,
+    ) -> Result<Option<Place<Job>>, Overloaded> {
+        match self.queue.push(Job { scene, task, deadline, span, submitted: Instant::now() }) {
+            Ok(place) => Ok(Some(place)),
             // The job has been dropped, which the reply says.
-            Err(Full::Closed) => Ok(Reply { answer, _place: None }),
-            Err(Full::Waiting(waiting)) => {
-                Err(Overloaded { model: self.entry.metadata.name.clone(), waiting, retry_after: self.pace.get() })
-            }
+            Err(Full::Closed) => Ok(None),
+            Err(Full::Waiting(waiting)) => Err(self.overloaded(waiting)),
         }
+    }
+
+    fn overloaded(&self, waiting: usize) -> Overloaded {
+        Overloaded { model: self.source.name().to_owned(), waiting, retry_after: self.pace.get() }
     }
 }
 
@@ -195,13 +268,20 @@ impl Sessions {
     }
 }
 
-/// A thread's own network and its end of the queue.
+/// A thread's own planner and its end of the queue.
 struct Session {
-    network: Network,
+    planner: Planner,
     queue: Arc<Queue<Job>>,
     batching: Batching,
     batch: Histogram,
     pace: Arc<Pace>,
+}
+
+/// When a session took its jobs, and how long the work on all of them took.
+#[derive(Clone, Copy)]
+struct Taken {
+    at: Instant,
+    inference: Duration,
 }
 
 impl Session {
@@ -211,43 +291,115 @@ impl Session {
             let expired = |job: &mut Job| job.deadline.is_some_and(|Deadline(deadline)| deadline <= now);
             for job in jobs.extract_if(.., expired) {
                 // The caller's own timer may have been faster.
-                let _ = job.reply.send(Err(EngineError::Expired));
+                job.task.fail(EngineError::Expired);
             }
             // Whoever has gone has left the queue, but for those who went this very moment.
-            jobs.retain(|job| !job.reply.is_closed());
+            jobs.retain(|job| !job.task.is_closed());
             if jobs.is_empty() {
                 self.queue.free();
-            } else {
-                self.answer(jobs, now);
+                continue;
             }
-        }
-    }
-
-    /// Runs the network over the batch, then decodes and answers one after the other.
-    fn answer(&mut self, jobs: Vec<Job>, taken: Instant) {
-        self.batch.observe(jobs.len() as f64);
-        let volumes: Vec<&Volume> = jobs.iter().map(|job| &job.volume).collect();
-        let network = &mut self.network;
-        let output = caught(|| Ok(network.infer(&volumes)?));
-        let inference = taken.elapsed();
-        // A place in the queue is free as often as a volume is done.
-        self.pace.set(inference / u32::try_from(jobs.len()).unwrap_or(u32::MAX));
-        self.queue.free();
-        for (index, Job { volume, params, span, submitted, reply, .. }) in jobs.into_iter().enumerate() {
-            let started = Instant::now();
-            let decoded = match &output {
-                Ok(output) => caught(|| Ok(decode(&volume, &output.maps(index), &params)?)),
-                Err(error) => Err(error.clone()),
+            self.batch.observe(jobs.len() as f64);
+            let Self { planner, queue, pace, .. } = &mut self;
+            let done = |inference: Duration, jobs: usize| {
+                // A place in the queue is free as often as a scene is done.
+                pace.set(inference / u32::try_from(jobs).unwrap_or(u32::MAX));
+                queue.free();
+                Taken { at: now, inference }
             };
-            if let Err(error) = &decoded {
-                span.in_scope(|| error!(%error, "the session failed"));
+            match planner {
+                Planner::Network(network) => infer(network, jobs, done),
+                Planner::Classical(classical) => plan(classical, jobs, done),
             }
-            let queue = taken.duration_since(submitted);
-            let postprocessing = started.elapsed();
-            // The caller may have gone meanwhile, which is counted on their side.
-            let _ = reply.send(decoded.map(|decoded| Answer { decoded, queue, inference, postprocessing }));
         }
     }
+}
+
+/// Runs the network over the batch, then makes of each output what is asked for.
+fn infer(network: &mut Network, jobs: Vec<Job>, done: impl FnOnce(Duration, usize) -> Taken) {
+    let started = Instant::now();
+    let own = network.metadata().decode_params();
+    let volumes: Vec<&Volume> = jobs.iter().map(|job| &job.scene.volume).collect();
+    let output = caught(|| Ok(network.infer(&volumes)?));
+    let taken = done(started.elapsed(), jobs.len());
+    for (index, Job { scene, task, span, submitted, .. }) in jobs.into_iter().enumerate() {
+        let _entered = span.enter();
+        let output = match &output {
+            Ok(output) => output,
+            Err(error) => {
+                error!(%error, "the session failed");
+                task.fail(error.clone());
+                continue;
+            }
+        };
+        match task {
+            Task::Grasps(asked, reply) => answer(reply, submitted, taken, || {
+                let decoded = decode(&scene.volume, &output.maps(index), &asked.decode_params(own))?;
+                Ok(found(decoded, &scene.volume, &asked))
+            }),
+            Task::Maps(reply) => answer(reply, submitted, taken, || Ok(tensors(output, index))),
+        }
+    }
+}
+
+/// Has a planner without a network look at one scene after the other.
+fn plan(classical: &mut Classical, jobs: Vec<Job>, done: impl FnOnce(Duration, usize) -> Taken) {
+    let started = Instant::now();
+    let own = classical.decode_params();
+    let count = jobs.len();
+    let decoded: Vec<_> = jobs
+        .iter()
+        .map(|Job { scene, task, .. }| match task {
+            Task::Grasps(asked, _) => caught(|| classical.plan(scene, asked, &asked.decode_params(own))),
+            // Only networks are asked for theirs.
+            Task::Maps(_) => Err(EngineError::Gone),
+        })
+        .collect();
+    let taken = done(started.elapsed(), count);
+    for (Job { scene, task, span, submitted, .. }, decoded) in jobs.into_iter().zip(decoded) {
+        let _entered = span.enter();
+        match (task, decoded) {
+            (Task::Grasps(asked, reply), Ok(decoded)) => {
+                answer(reply, submitted, taken, || Ok(found(decoded, &scene.volume, &asked)));
+            }
+            (task, Err(error)) => {
+                error!(%error, "the session failed");
+                task.fail(error);
+            }
+            (task @ Task::Maps(_), Ok(_)) => task.fail(EngineError::Gone),
+        }
+    }
+}
+
+/// Makes something and sends it to who asked for it.
+fn answer<T>(reply: Sender<T>, submitted: Instant, taken: Taken, make: impl FnOnce() -> Result<T, EngineError>) {
+    let started = Instant::now();
+    let made = caught(make);
+    if let Err(error) = &made {
+        error!(%error, "the session failed");
+    }
+    let Taken { at, inference } = taken;
+    let (queue, postprocessing) = (at.duration_since(submitted), started.elapsed());
+    // The caller may have gone meanwhile, which is counted on their side.
+    let _ = reply.send(made.map(|made| Answer { made, queue, inference, postprocessing }));
+}
+
+/// As many of the grasps as were asked for, and whether the hand would meet something there.
+fn found(decoded: Decoded, volume: &Volume, asked: &Asked) -> Found {
+    let Decoded { mut grasps, dropped } = decoded;
+    let over_limit = grasps.len().saturating_sub(asked.max_grasps);
+    grasps.truncate(asked.max_grasps);
+    let collides = (asked.collision == Collision::Flag).then(|| {
+        let obstacles = Obstacles::observed(volume, asked.clearance());
+        grasps.iter().map(|grasp| obstacles.meet(&grasp.pose)).collect()
+    });
+    Found { grasps, collides, dropped, over_limit }
+}
+
+fn tensors(output: &Output, index: usize) -> Tensors {
+    let maps = output.maps(index);
+    let bytes = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect();
+    Tensors { quality: bytes(maps.quality), rotation: bytes(maps.rotation), width: bytes(maps.width) }
 }
 
 /// Has a network answer once, and says how long that took: the first inference allocates and tunes, no caller should

@@ -3,7 +3,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use grasp_models::{Entry, Options, Scan};
+use grasp_models::{Entry, Options, Scan, StoreError};
 use tokio::signal::unix::Signal;
 use tokio::sync::watch;
 use tracing::{error, info, warn};
@@ -13,6 +13,10 @@ use crate::engine::{Engine, Serving, Sessions};
 use crate::health::State;
 use crate::metrics::Metrics;
 use crate::models::Models;
+use crate::planner::Source;
+
+/// In the folder of models.
+const CLASSIFIERS: &str = "classifiers";
 
 /// Brings the models of a folder into service, and keeps them as the folder has them.
 pub(crate) struct Folder {
@@ -36,14 +40,18 @@ impl Folder {
         Self { directory, stamps, default_model, serving, models, sessions, metrics }
     }
 
-    /// Serves all of these, or says which cannot be served; or gives up where the process is to stop meanwhile.
+    /// Serves all of these and what needs no network, or says which cannot be served; or gives up where the process is to stop meanwhile.
     pub fn load(&self, entries: &[Entry], state: &watch::Receiver<State>) -> anyhow::Result<()> {
         let mut engines = Vec::new();
-        for entry in entries {
+        let classifiers = classifiers(&self.directory)?;
+        if let Some(error) = classifiers.rejected.into_iter().next() {
+            return Err(error.into());
+        }
+        for source in sources(entries.to_vec(), classifiers.entries) {
             if *state.borrow() == State::Draining {
                 return Ok(());
             }
-            engines.push(self.start(entry.clone())?);
+            engines.push(self.start(source)?);
         }
         self.replace(engines);
         Ok(())
@@ -76,8 +84,9 @@ impl Folder {
     /// Loads what is new and warms it up beside what is served, then serves it instead. A file that cannot be served
     /// changes nothing: what it held before goes on being served.
     fn reload(&self) {
-        let Scan { entries, rejected } = match Scan::read(&self.directory) {
-            Ok(scan) => scan,
+        let scans = Scan::read(&self.directory).and_then(|networks| Ok((networks, classifiers(&self.directory)?)));
+        let (networks, classifiers) = match scans {
+            Ok(scans) => scans,
             Err(error) => {
                 error!(%error, "the models stay as they are");
                 return self.metrics.reloaded(Err(()));
@@ -85,32 +94,33 @@ impl Folder {
         };
         let served = self.models.now();
         let mut refused: Vec<PathBuf> = Vec::new();
-        for error in rejected {
+        for error in networks.rejected.into_iter().chain(classifiers.rejected) {
             error!(%error, "cannot be served, what it held before is kept");
             refused.push(error.path().to_owned());
         }
         let mut engines = Vec::new();
-        for entry in entries {
-            if let Some(engine) = served.iter().find(|engine| engine.entry == entry) {
+        for source in sources(networks.entries, classifiers.entries) {
+            if let Some(engine) = served.iter().find(|engine| engine.source == source) {
                 engines.push(Arc::clone(engine));
                 continue;
             }
-            let path = entry.path.clone();
-            match self.start(entry) {
+            let path = source.path().map(Path::to_owned);
+            match self.start(source) {
                 Ok(engine) => engines.push(engine),
                 Err(error) => {
                     error!(error = format!("{error:#}"), "cannot be served, what it held before is kept");
-                    refused.push(path);
+                    refused.extend(path);
                 }
             }
         }
-        let kept = served.iter().filter(|engine| refused.contains(&engine.entry.path));
+        let is_refused = |path: &Path| refused.iter().any(|refused| refused == path);
+        let kept = served.iter().filter(|engine| engine.source.path().is_some_and(is_refused));
         for kept in kept.cloned().collect::<Vec<_>>() {
             if !engines.iter().any(|engine| engine.label == kept.label) {
                 engines.push(kept);
             }
         }
-        if engines.is_empty() {
+        if engines.iter().all(|engine| engine.source.network().is_none()) {
             warn!("nothing in the folder can be served, the models stay as they are");
         } else {
             self.replace(engines);
@@ -119,8 +129,8 @@ impl Folder {
         self.metrics.reloaded(Ok(refused.len()));
     }
 
-    fn start(&self, entry: Entry) -> anyhow::Result<Arc<Engine>> {
-        Engine::start(entry, &self.serving, &self.metrics, &self.sessions).map(Arc::new)
+    fn start(&self, source: Source) -> anyhow::Result<Arc<Engine>> {
+        Engine::start(source, &self.serving, &self.metrics, &self.sessions).map(Arc::new)
     }
 
     fn replace(&self, engines: Vec<Arc<Engine>>) {
@@ -129,9 +139,28 @@ impl Folder {
         let now = self.models.now();
         self.metrics.replaced(&before, &now);
         for gone in before.iter().filter(|engine| !now.iter().any(|other| Arc::ptr_eq(engine, other))) {
-            info!(model = gone.label, sha256 = gone.entry.sha256, "no longer served");
+            info!(model = gone.label, sha256 = gone.source.sha256(), "no longer served");
         }
     }
+}
+
+/// The folder's own folder of GPD's classifiers, which need not be there.
+fn classifiers(directory: &Path) -> Result<Scan, StoreError> {
+    let none = || Scan { entries: Vec::new(), rejected: Vec::new() };
+    let directory = directory.join(CLASSIFIERS);
+    if !directory.is_dir() {
+        return Ok(none());
+    }
+    match Scan::read(&directory) {
+        Err(StoreError::Empty(_)) => Ok(none()),
+        scan => scan,
+    }
+}
+
+/// What is served of a folder: its networks, its classifiers, and what needs neither.
+fn sources(networks: Vec<Entry>, classifiers: Vec<Entry>) -> Vec<Source> {
+    let networks = networks.into_iter().map(Source::Network);
+    networks.chain(classifiers.into_iter().map(Source::Gpd)).chain([Source::Shaf]).collect()
 }
 
 /// What tells a folder's model files from other ones without reading them: name, time of the last change, size.
@@ -143,7 +172,8 @@ pub(crate) fn stamps(directory: &Path) -> Stamps {
         let metadata = fs::metadata(&path).ok()?;
         Some((path, metadata.modified().ok(), metadata.len()))
     };
-    let files = fs::read_dir(directory).into_iter().flatten().flatten().map(|file| file.path());
+    let folders = [directory.to_owned(), directory.join(CLASSIFIERS)];
+    let files = folders.iter().flat_map(fs::read_dir).flatten().flatten().map(|file| file.path());
     let models = files.filter(|path| path.extension().is_some_and(|extension| extension == "onnx"));
     let mut stamps: Vec<_> = models.filter_map(stamp).collect();
     stamps.sort();

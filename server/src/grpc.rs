@@ -3,6 +3,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use grasp_proto::FILE_DESCRIPTOR_SET;
+use grasp_proto::oip::grpc_inference_service_server::GrpcInferenceServiceServer;
 use grasp_proto::pb::grasp_service_server::GraspServiceServer;
 use tokio::net::TcpListener;
 use tokio::sync::watch;
@@ -16,6 +17,7 @@ use crate::auth::Tokens;
 use crate::health::{Health, State, draining};
 use crate::intake::{Intake, Limits};
 use crate::metrics::Metrics;
+use crate::oip::Inference;
 use crate::service::Grasps;
 use crate::{auth, connections, deadline};
 
@@ -47,6 +49,7 @@ pub(crate) async fn serve(
     listener: TcpListener,
     entrance: Entrance,
     service: Grasps,
+    inference: Inference,
     metrics: Arc<Metrics>,
     state: watch::Receiver<State>,
 ) -> anyhow::Result<()> {
@@ -58,8 +61,9 @@ pub(crate) async fn serve(
     };
     // The limit is kept by the intake, which counts what it refuses.
     let grasps = GraspServiceServer::new(service).max_decoding_message_size(usize::MAX);
+    let inference = GrpcInferenceServiceServer::new(inference).max_decoding_message_size(usize::MAX);
     let guard = auth::guard(tokens, Arc::clone(&metrics));
-    let incoming = connections::accept(listener, connections, metrics.connections());
+    let incoming = connections::accept(listener, metrics.connections(connections));
     let intake = MapRequestLayer::new(move |request: http::Request<Body>| {
         request.map(|body| Body::new(Intake::new(body, limits, Arc::clone(&metrics))))
     });
@@ -75,6 +79,7 @@ pub(crate) async fn serve(
         .max_concurrent_streams(MAX_STREAMS)
         .http2_keepalive_interval(Some(KEEPALIVE))
         .add_service(InterceptedService::new(InterceptedService::new(grasps, deadline::note), guard.clone()))
+        .add_service(InterceptedService::new(InterceptedService::new(inference, deadline::note), guard.clone()))
         // Whoever watches over this process has no token.
         .add_service(HealthServer::new(Health(state.clone())))
         .add_service(InterceptedService::new(reflection().build_v1()?, guard.clone()))

@@ -1,3 +1,4 @@
+use grasp_proto::oip::grpc_inference_service_server::SERVICE_NAME as INFERENCE;
 use grasp_proto::pb::grasp_service_server::SERVICE_NAME;
 use tokio::sync::watch;
 use tokio_stream::StreamExt;
@@ -47,7 +48,7 @@ pub(crate) async fn draining(mut state: watch::Receiver<State>) {
     let _ = state.wait_for(|&state| state == State::Draining).await;
 }
 
-/// grpc.health.v1 for the server as a whole (``) and for the one service it has.
+/// grpc.health.v1 for the server as a whole (``) and for the services it has.
 pub(crate) struct Health(pub watch::Receiver<State>);
 
 #[tonic::async_trait]
@@ -71,7 +72,7 @@ impl health_server::Health for Health {
 }
 
 fn is_known(service: &str) -> bool {
-    service.is_empty() || service == SERVICE_NAME
+    ["", SERVICE_NAME, INFERENCE].contains(&service)
 }
 
 fn serving_status(state: State) -> ServingStatus {

@@ -18,8 +18,9 @@ pub(crate) async fn serve(
     metrics: Arc<Metrics>,
     state: watch::Receiver<State>,
 ) -> io::Result<()> {
+    let now = state.clone();
     let app = Router::new()
-        .route("/metrics", get(async move || ([(CONTENT_TYPE, Metrics::CONTENT_TYPE)], metrics.render())))
+        .route("/metrics", get(async move || ([(CONTENT_TYPE, Metrics::CONTENT_TYPE)], metrics.render(*now.borrow()))))
         .route("/healthz", get("ok\n"))
         .route("/readyz", get(async move || readiness(*state.borrow())));
     axum::serve(listener, app).await

@@ -1,6 +1,7 @@
-//! graspd: volumes in, grasps out, over gRPC.
+//! graspd: what a robot sees in, grasps out, over gRPC.
 
 mod auth;
+mod call;
 mod config;
 mod connections;
 mod deadline;
@@ -12,12 +13,16 @@ mod http;
 mod intake;
 mod metrics;
 mod models;
+mod oip;
+mod perceive;
+mod planner;
 mod queue;
 mod refusal;
 mod service;
 mod shutdown;
 mod telemetry;
 mod timings;
+mod track;
 
 use std::io::Write;
 use std::net::SocketAddr;
@@ -29,6 +34,7 @@ use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::net::TcpListener;
 use tracing::{error, info, warn};
 
+use crate::call::Calls;
 use crate::config::Config;
 use crate::engine::Sessions;
 use crate::folder::Folder;
@@ -36,8 +42,10 @@ use crate::grpc::Entrance;
 use crate::health::Readiness;
 use crate::metrics::Metrics;
 use crate::models::Models;
+use crate::oip::Inference;
 use crate::service::Grasps;
 use crate::shutdown::{Signals, hangup};
+use crate::track::Kept;
 
 fn main() -> ExitCode {
     let config = match Config::from_args() {
@@ -95,13 +103,16 @@ async fn serve(config: &Config, metrics: &Arc<Metrics>, sessions: &Arc<Sessions>
     let state = readiness.subscribe();
     let models = Arc::new(Models::default());
     let http = tokio::spawn(http::serve(http, Arc::clone(metrics), state.clone()));
-    let service = Grasps::new(Arc::clone(&models), Arc::clone(metrics), state.clone());
-    let Config { tls, tokens, max_connections: connections, limits, .. } = config;
+    let Config { tls, tokens, max_connections: connections, limits, max_tracked, track_timeout, .. } = config;
+    let calls = Calls::new(Arc::clone(metrics), state.clone());
+    let inference = Inference::new(Arc::clone(&models), calls.clone());
+    let kept = Kept::new(*max_tracked, *track_timeout, metrics.tracked());
+    let service = Grasps::new(Arc::clone(&models), calls, kept);
     if let Some(tokens) = tokens {
         tokio::spawn(Arc::clone(tokens).watch(self::hangup().context("cannot handle signals")?));
     }
     let entrance = Entrance { tls: tls.clone(), tokens: tokens.clone(), connections: *connections, limits: *limits };
-    let mut grpc = tokio::spawn(grpc::serve(grpc, entrance, service, Arc::clone(metrics), state.clone()));
+    let mut grpc = tokio::spawn(grpc::serve(grpc, entrance, service, inference, Arc::clone(metrics), state.clone()));
 
     let folder = Folder::new(config, models, Arc::clone(sessions), Arc::clone(metrics));
     let entries = config.store.entries().to_vec();

@@ -1,18 +1,23 @@
 use std::sync::Arc;
 
 use grasp_models::Backend;
+#[cfg(target_os = "linux")]
+use prometheus::process_collector::ProcessCollector;
 use prometheus::{
-    HistogramOpts, HistogramVec, IntCounterVec, IntGauge, IntGaugeVec, Opts, Registry, TEXT_FORMAT, TextEncoder,
+    HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, IntGaugeVec, Opts, Registry, TEXT_FORMAT,
+    TextEncoder,
 };
 use tonic::Code;
 
+use crate::connections::Doors;
 use crate::engine::{Engine, Gauges};
+use crate::health::State;
 use crate::timings::Timings;
 
-/// Seconds. Dense from a cached wake-up to a large network on a slow CPU.
-const BUCKETS: [f64; 27] = [
+/// Seconds. Dense from a cached wake-up to a large network on a slow CPU, whose queue is full.
+const BUCKETS: [f64; 33] = [
     50e-6, 75e-6, 100e-6, 150e-6, 200e-6, 300e-6, 500e-6, 750e-6, 1e-3, 1.5e-3, 2e-3, 3e-3, 5e-3, 7.5e-3, 10e-3, 15e-3,
-    20e-3, 30e-3, 50e-3, 75e-3, 100e-3, 150e-3, 200e-3, 300e-3, 500e-3, 750e-3, 1.0,
+    20e-3, 30e-3, 50e-3, 75e-3, 100e-3, 150e-3, 200e-3, 300e-3, 500e-3, 750e-3, 1.0, 1.5, 2.0, 3.0, 5.0, 7.5, 10.0,
 ];
 
 /// Volumes.
@@ -30,6 +35,10 @@ pub(crate) struct Metrics {
     reloads: IntCounterVec,
     rejected: IntGauge,
     connections: IntGauge,
+    connections_limit: IntGauge,
+    connections_refused: IntCounter,
+    ready: IntGauge,
+    tracked: IntGauge,
 }
 
 impl Metrics {
@@ -79,9 +88,19 @@ impl Metrics {
             .expect(VALID),
             connections: IntGauge::new("graspd_connections", "Connections to the gRPC listener that are open.")
                 .expect(VALID),
+            connections_limit: IntGauge::new("graspd_connections_limit", "Connections that may be open.").expect(VALID),
+            connections_refused: IntCounter::new(
+                "graspd_connections_refused_total",
+                "Connections that were closed at once, for too many were open.",
+            )
+            .expect(VALID),
+            ready: IntGauge::new("graspd_ready", "1 while requests are taken, 0 while it warms up or shuts down.")
+                .expect(VALID),
+            tracked: IntGauge::new("graspd_tracked_volumes", "Volumes that are kept for calls of TrackGrasps.")
+                .expect(VALID),
         };
-        let Self { registry, stages, requests, grasps, waiting, batches, models, reloads, rejected, connections } =
-            &metrics;
+        let Self { registry, stages, requests, grasps, waiting, batches, models, reloads, rejected, .. } = &metrics;
+        let Self { connections, connections_limit, connections_refused, ready, tracked, .. } = &metrics;
         registry.register(Box::new(stages.clone())).expect(VALID);
         registry.register(Box::new(requests.clone())).expect(VALID);
         registry.register(Box::new(grasps.clone())).expect(VALID);
@@ -91,6 +110,17 @@ impl Metrics {
         registry.register(Box::new(reloads.clone())).expect(VALID);
         registry.register(Box::new(rejected.clone())).expect(VALID);
         registry.register(Box::new(connections.clone())).expect(VALID);
+        registry.register(Box::new(connections_limit.clone())).expect(VALID);
+        registry.register(Box::new(connections_refused.clone())).expect(VALID);
+        registry.register(Box::new(ready.clone())).expect(VALID);
+        registry.register(Box::new(tracked.clone())).expect(VALID);
+        // What has not happened yet is 0, lest its first time goes unseen by who looks at increases.
+        for outcome in ["ok", "failed"] {
+            metrics.reloads.with_label_values(&[outcome]);
+        }
+        // Of the process: CPU time, memory, open files.
+        #[cfg(target_os = "linux")]
+        registry.register(Box::new(ProcessCollector::for_self())).expect(VALID);
         metrics
     }
 
@@ -112,7 +142,7 @@ impl Metrics {
     pub fn replaced(&self, before: &[Arc<Engine>], now: &[Arc<Engine>]) {
         let labels = |engine: &Engine| {
             let Backend { provider, precision } = engine.backend;
-            [engine.label.clone(), provider.to_string(), precision.to_string(), engine.entry.sha256.clone()]
+            [engine.label.clone(), provider.to_string(), precision.to_string(), engine.source.sha256().to_owned()]
         };
         let now: Vec<_> = now.iter().map(|engine| labels(engine)).collect();
         for labels in &now {
@@ -135,16 +165,29 @@ impl Metrics {
 
     /// What is measured of a model's queue.
     pub fn gauges(&self, model: &str) -> Gauges {
+        for (stage, _) in Timings::default().stages() {
+            self.stages.with_label_values(&[model, stage]);
+        }
+        for code in [Code::Ok, Code::Internal, Code::ResourceExhausted, Code::DeadlineExceeded, Code::Cancelled] {
+            self.requests.with_label_values(&[model, code_name(code)]);
+        }
         Gauges { waiting: self.waiting.with_label_values(&[model]), batch: self.batches.with_label_values(&[model]) }
     }
 
-    /// How many connections are open.
-    pub fn connections(&self) -> IntGauge {
-        self.connections.clone()
+    /// Of connections, of which so many may be open.
+    pub fn connections(&self, most: usize) -> Doors {
+        self.connections_limit.set(i64::try_from(most).unwrap_or(i64::MAX));
+        Doors { most, open: self.connections.clone(), refused: self.connections_refused.clone() }
+    }
+
+    /// How many volumes are kept from one view to the next.
+    pub fn tracked(&self) -> IntGauge {
+        self.tracked.clone()
     }
 
     /// In Prometheus' text format.
-    pub fn render(&self) -> String {
+    pub fn render(&self, state: State) -> String {
+        self.ready.set((state == State::Ready).into());
         TextEncoder::new().encode_to_string(&self.registry.gather()).expect("the encoder writes to memory")
     }
 }
@@ -157,6 +200,7 @@ fn code_name(code: Code) -> &'static str {
         Code::InvalidArgument => "INVALID_ARGUMENT",
         Code::NotFound => "NOT_FOUND",
         Code::ResourceExhausted => "RESOURCE_EXHAUSTED",
+        Code::Aborted => "ABORTED",
         Code::Unauthenticated => "UNAUTHENTICATED",
         Code::Unavailable => "UNAVAILABLE",
         Code::DeadlineExceeded => "DEADLINE_EXCEEDED",

@@ -21,58 +21,64 @@ impl Models {
 
     /// From now on serves these.
     pub fn replace(&self, mut engines: Vec<Arc<Engine>>, default: Option<&str>) {
-        // From the newest version to the oldest, as the sort by name is stable.
-        engines.sort_by(|a, b| b.entry.by_version(&a.entry));
+        // From the newest version to the oldest, as the sort by name is stable; what is no network answers only by name.
+        engines.sort_by(|a, b| b.source.by_version(&a.source));
         engines.sort_by_key(|engine| {
-            let name = engine.entry.metadata.name.clone();
-            (default != Some(&name), name)
+            let name = engine.source.name().to_owned();
+            (engine.source.network().is_none(), default != Some(&name), name)
         });
         *self.0.write().unwrap_or_else(PoisonError::into_inner) = engines.into();
     }
 
-    /// The model that a request asks for, if it takes volumes of that resolution.
-    pub fn select(&self, name: &str, version: &str, resolution: usize) -> Result<Arc<Engine>, Refusal> {
+    /// The planner that a request asks for, if it takes volumes of that resolution, where the request has one already.
+    pub fn select(&self, name: &str, version: &str, resolution: Option<usize>) -> Result<Arc<Engine>, Refusal> {
         let served = self.now();
-        let fits = |engine: &&Arc<Engine>| engine.entry.metadata.resolution == resolution;
+        let fits = |engine: &Arc<Engine>| match (engine.source.network(), resolution) {
+            (Some(network), Some(resolution)) => network.metadata.resolution == resolution,
+            _ => true,
+        };
+        let taken = |engine: &Engine| match engine.source.network() {
+            Some(network) => format!("{} ({})", network.metadata.resolution, engine.label),
+            None => format!("any ({})", engine.label),
+        };
+        let wrong = |taken: &str| {
+            let needed = format_args!("the models that could answer take {taken}");
+            Refusal::from(FieldError::new("volume.resolution", resolution.unwrap_or_default(), needed))
+        };
         if name.is_empty() {
             if !version.is_empty() {
                 let needed = "which needs a `model` that it is a version of";
-                return Err(FieldError::new("version", format_args!("`{version}`"), needed).into());
+                return Err(FieldError::new("options.version", format_args!("`{version}`"), needed).into());
             }
-            let taken =
-                || describe(&served, |engine| format!("{} ({})", engine.entry.metadata.resolution, engine.label));
-            let engine = served.iter().find(fits).cloned();
-            return engine.ok_or_else(|| wrong_resolution(resolution, &taken()));
+            let networks: Vec<_> = served.iter().filter(|engine| engine.source.network().is_some()).collect();
+            let engine = networks.iter().find(|engine| fits(engine)).map(|&engine| Arc::clone(engine));
+            return engine.ok_or_else(|| wrong(&describe(&networks, taken)));
         }
         let is_named = |engine: &&Arc<Engine>| {
-            let metadata = &engine.entry.metadata;
-            metadata.name == name && (version.is_empty() || metadata.version == version)
+            engine.source.name() == name && (version.is_empty() || engine.source.version() == version)
         };
         let engine = served.iter().find(is_named).ok_or_else(|| Refusal::UnknownModel {
+            field: "options.model",
             wanted: format!("{name} {version}").trim_end().to_owned(),
-            available: describe(&served, |engine| engine.label.clone()),
+            available: describe(&served.iter().collect::<Vec<_>>(), |engine| engine.label.clone()),
         })?;
-        let taken = format!("{} ({})", engine.entry.metadata.resolution, engine.label);
-        Some(engine).filter(fits).cloned().ok_or_else(|| wrong_resolution(resolution, &taken))
+        if fits(engine) { Ok(Arc::clone(engine)) } else { Err(wrong(&taken(engine))) }
     }
 }
 
-fn describe(served: &[Arc<Engine>], engine: impl Fn(&Engine) -> String) -> String {
+fn describe(served: &[&Arc<Engine>], engine: impl Fn(&Engine) -> String) -> String {
     served.iter().map(|served| engine(served)).collect::<Vec<_>>().join(", ")
 }
 
 /// A network trained for voxels of one size sees the world scaled when they have another.
 pub(crate) fn check_voxel_size(volume: &Volume, engine: &Engine) -> Result<(), FieldError> {
-    let (got, trained) = (volume.voxel_size(), engine.entry.metadata.voxel_size);
+    let Some(network) = engine.source.network() else { return Ok(()) };
+    let (got, trained) = (volume.voxel_size(), network.metadata.voxel_size);
     if (got - trained).abs() <= 1e-3 * trained {
         return Ok(());
     }
     let needed = format_args!("the model {} takes {trained} m, to one in a thousand", engine.label);
     Err(FieldError::new("volume.voxel_size", got, needed))
-}
-
-fn wrong_resolution(resolution: usize, taken: &str) -> Refusal {
-    FieldError::new("volume.resolution", resolution, format_args!("the models that could answer take {taken}")).into()
 }
 
 impl From<&Models> for pb::ListModelsResponse {
@@ -83,18 +89,19 @@ impl From<&Models> for pb::ListModelsResponse {
 
 impl From<&Engine> for pb::Model {
     fn from(engine: &Engine) -> Self {
-        let metadata = &engine.entry.metadata;
+        let source = &engine.source;
+        let network = source.network().map(|entry| &entry.metadata);
         Self {
-            name: metadata.name.clone(),
-            version: metadata.version.clone(),
+            name: source.name().to_owned(),
+            version: source.version().to_owned(),
             // A network larger than `Volume::MAX_RESOLUTION` could not have been warmed up.
-            resolution: metadata.resolution as u32,
-            voxel_size: metadata.voxel_size,
-            threshold: metadata.decode_params().threshold,
-            sha256: engine.entry.sha256.clone(),
+            resolution: network.map_or(0, |metadata| metadata.resolution as u32),
+            voxel_size: network.map_or(0.0, |metadata| metadata.voxel_size),
+            threshold: source.decode_params().threshold,
+            sha256: source.sha256().to_owned(),
             provider: engine.backend.provider.to_string(),
             precision: engine.backend.precision.to_string(),
-            provenance: metadata.provenance.clone().into_iter().collect(),
+            provenance: source.provenance().into_iter().collect(),
         }
     }
 }

@@ -79,6 +79,12 @@ impl<T> Queue<T> {
         Ok(Place { queue: Arc::clone(self), number })
     }
 
+    /// How many wait, if no more can: what [`push`](Self::push) would say at this moment.
+    pub fn is_full(&self) -> Option<usize> {
+        let state = self.lock();
+        (!state.closed && state.waiting.len() >= self.capacity + state.free).then_some(self.capacity)
+    }
+
     /// Waits for jobs and takes them, the oldest first; none when the queue is closed and empty. The session is busy then,
     /// until it is [`free`](Self::free).
     pub fn take(&self, batching: Batching) -> Option<Vec<T>> {

@@ -13,8 +13,8 @@ use crate::engine::{EngineError, Overloaded};
 pub(crate) enum Refusal {
     #[error(transparent)]
     Field(#[from] FieldError),
-    #[error("model is `{wanted}`, there is no such; there are {available}")]
-    UnknownModel { wanted: String, available: String },
+    #[error("{field} is `{wanted}`, there is no such; there are {available}")]
+    UnknownModel { field: &'static str, wanted: String, available: String },
     #[error(transparent)]
     Overloaded(#[from] Overloaded),
     #[error("the server is warming up; come back in {0:?}")]
@@ -56,7 +56,7 @@ impl Refusal {
         let mut details = ErrorDetails::new();
         details.set_request_info(request_id, "");
         if let Self::Field(error) = &self {
-            details.add_bad_request_violation(error.field, &error.message);
+            details.add_bad_request_violation(&*error.field, &error.message);
         }
         let mut metadata = MetadataMap::new();
         if let Some(after) = self.retry_after() {

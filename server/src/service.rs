@@ -1,132 +1,36 @@
-use std::collections::hash_map::RandomState;
-use std::hash::BuildHasher;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-use grasp::{DecodeParams, Volume};
+use grasp::Volume;
 use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::grasp_service_server::GraspService;
-use grasp_proto::{FieldError, pb, resolution};
-use tokio::sync::{mpsc, watch};
+use grasp_proto::{Asked, FieldError, Workspace, check_count, cloud_view, depth_view, pb, resolution};
+use tokio::sync::mpsc;
 use tokio_stream::StreamExt;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::codegen::BoxStream;
-use tonic::{Code, Request, Response, Status, Streaming};
-use tracing::field::Empty;
-use tracing::{Span, debug, info, info_span};
+use tonic::{Request, Response, Status, Streaming};
 
+use crate::call::{Call, Calls, Origin, Work};
 use crate::deadline::Deadline;
-use crate::engine::{Answer, Reply};
-use crate::health::{State, draining};
-use crate::metrics::Metrics;
+use crate::engine::{Engine, EngineError};
+use crate::health::draining;
 use crate::models::{Models, check_voxel_size};
+use crate::perceive::{Grid, eyes, rendered, size};
+use crate::planner::Scene;
 use crate::refusal::Refusal;
-use crate::timings::Timings;
+use crate::track::{Kept, Track};
 
 /// Requests of one stream that wait behind the one being answered: enough that no session waits for the next volume,
 /// and few enough that a stream alone never fills a queue.
 const READ_AHEAD: usize = 1;
 
-/// Longest request id and frame id, bytes: they are echoed, and the first is logged.
-const MAX_ID: usize = 256;
-
-/// When to ask again while the sessions warm up.
-const WARM_UP: Duration = Duration::from_secs(1);
-
 /// grasp.v1.GraspService.
 #[derive(Clone)]
 pub(crate) struct Grasps {
     models: Arc<Models>,
-    metrics: Arc<Metrics>,
-    state: watch::Receiver<State>,
-    ids: Arc<RequestIds>,
-}
-
-impl Grasps {
-    pub fn new(models: Arc<Models>, metrics: Arc<Metrics>, state: watch::Receiver<State>) -> Self {
-        Self { models, metrics, state, ids: Arc::new(RequestIds::new()) }
-    }
-
-    /// Checks a request and queues its volume. What is wrong with it comes out of [`Begun::finish`], like the answer.
-    fn begin(&self, mut request: pb::DetectGraspsRequest, deadline: Option<Deadline>) -> Begun {
-        let started = Instant::now();
-        let mut id = std::mem::take(&mut request.request_id);
-        let checked = check_id("request_id", &id);
-        if id.is_empty() || checked.is_err() {
-            id = self.ids.next();
-        }
-        let span = info_span!(
-            "detect",
-            request_id = id,
-            model = Empty,
-            queue = Empty,
-            preprocessing = Empty,
-            inference = Empty,
-            postprocessing = Empty,
-            total = Empty,
-        );
-        let mut call = Call {
-            id,
-            started,
-            deadline,
-            span,
-            metrics: Arc::clone(&self.metrics),
-            model: String::new(),
-            version: String::new(),
-            label: String::new(),
-            ended: false,
-        };
-        let work = checked.map_err(Refusal::from).and_then(|()| self.submit(request, &mut call));
-        Begun { call, work }
-    }
-
-    fn submit(&self, request: pb::DetectGraspsRequest, call: &mut Call) -> Result<Work, Refusal> {
-        match *self.state.borrow() {
-            State::Starting => return Err(Refusal::Starting(WARM_UP)),
-            // What arrives on a connection that is already open is still answered; streams stop reading by themselves.
-            State::Ready | State::Draining => {}
-        }
-        let volume = request.volume.as_ref().ok_or_else(|| FieldError::new("volume", "absent", "must be given"))?;
-        check_id("volume.frame_id", &volume.frame_id)?;
-        // The model before the data: nothing is converted that no model takes.
-        let engine = self.models.select(&request.model, &request.version, resolution(volume)?)?;
-        call.label.clone_from(&engine.label);
-        call.model.clone_from(&engine.entry.metadata.name);
-        call.version.clone_from(&engine.entry.metadata.version);
-        call.span.record("model", &engine.label);
-
-        let params = decode_params(&request, engine.entry.metadata.decode_params())?;
-        let checked = Volume::try_from(volume)?;
-        check_voxel_size(&checked, &engine)?;
-        let preprocessing = call.started.elapsed();
-        let reply = engine.submit(checked, params, call.deadline, call.span.clone())?;
-
-        let pb::Volume { frame_id, stamp, .. } = request.volume.unwrap_or_default();
-        let max_grasps = if request.max_grasps == 0 { usize::MAX } else { request.max_grasps as usize };
-        Ok(Work { reply, preprocessing, max_grasps, explain: request.explain, frame_id, stamp })
-    }
-}
-
-fn check_id(field: &'static str, id: &str) -> Result<(), FieldError> {
-    if id.len() <= MAX_ID {
-        return Ok(());
-    }
-    Err(FieldError::new(field, format_args!("{} bytes long", id.len()), format_args!("at most {MAX_ID} are taken")))
-}
-
-/// The model's own parameters, with what the request overrides.
-fn decode_params(request: &pb::DetectGraspsRequest, own: DecodeParams) -> Result<DecodeParams, FieldError> {
-    let probability = |field: &'static str, value: Option<f32>| match value {
-        // Written so that NaN fails.
-        Some(value) if !(value > 0.0 && value <= 1.0) => {
-            Err(FieldError::new(field, value, "must be above 0 and at most 1"))
-        }
-        value => Ok(value),
-    };
-    let threshold = probability("threshold", request.threshold)?.unwrap_or(own.threshold);
-    let force = probability("force", request.force)?.or(own.force);
-    Ok(DecodeParams { threshold, force, ..own })
+    calls: Calls,
+    kept: Arc<Kept>,
 }
 
 /// A request that was taken, or refused without anyone having been told yet.
@@ -135,88 +39,134 @@ struct Begun {
     work: Result<Work, Refusal>,
 }
 
-/// A request on its way. Dropped before its end, it counts as cancelled by its caller, unless that one's time was up.
-struct Call {
-    id: String,
-    started: Instant,
-    deadline: Option<Deadline>,
-    span: Span,
-    metrics: Arc<Metrics>,
-    model: String,
-    version: String,
-    /// The model's, empty as long as none is chosen.
-    label: String,
-    ended: bool,
-}
-
-/// What a request that was taken needs for its reply.
-struct Work {
-    reply: Reply,
-    preprocessing: Duration,
-    max_grasps: usize,
-    explain: bool,
-    frame_id: String,
-    stamp: Option<prost_types::Timestamp>,
-}
-
 impl Begun {
-    /// Waits for the session, and says in the log and the metrics how it went.
     async fn finish(self) -> Result<pb::DetectGraspsResponse, Refusal> {
-        let Self { mut call, work } = self;
-        let outcome = match work {
-            Ok(work) => call.reply(work).await,
-            Err(refusal) => Err(refusal),
-        };
-        call.ended = true;
-        if let Err(refusal) = &outcome {
-            call.metrics.ended(&call.label, refusal.code());
-            call.span.in_scope(|| info!(code = ?refusal.code(), %refusal, "refused"));
-        }
-        outcome
+        self.call.finish(self.work).await
+    }
+
+    async fn respond(self) -> Result<Response<pb::DetectGraspsResponse>, Status> {
+        let id = self.call.id.clone();
+        self.finish().await.map(Response::new).map_err(|refusal| refusal.status(&id))
     }
 }
 
-impl Call {
-    async fn reply(&mut self, work: Work) -> Result<pb::DetectGraspsResponse, Refusal> {
-        let answer = work.reply.wait(self.deadline).await?;
-        let Answer { decoded, queue, inference, postprocessing } = answer;
+impl Grasps {
+    pub fn new(models: Arc<Models>, calls: Calls, kept: Kept) -> Self {
+        Self { models, calls, kept: Arc::new(kept) }
+    }
 
-        let sent = decoded.grasps.len().min(work.max_grasps);
-        let grasps: Vec<_> = decoded.grasps[..sent].iter().map(pb::Grasp::from).collect();
-        let explained = work.explain || grasps.is_empty();
-        let dropped = explained.then(|| pb::Dropped {
-            // At most one per voxel.
-            over_limit: (decoded.grasps.len() - sent) as u32,
-            ..(&decoded.dropped).into()
+    /// Checks a request and queues its volume. What is wrong with it comes out of [`Begun::finish`], like the answer.
+    fn begin(&self, mut request: pb::DetectGraspsRequest, deadline: Option<Deadline>) -> Begun {
+        let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), deadline);
+        let work = checked.and_then(|()| self.submit(request, &mut call));
+        Begun { call, work }
+    }
+
+    fn submit(&self, request: pb::DetectGraspsRequest, call: &mut Call) -> Result<Work, Refusal> {
+        let pb::DetectGraspsRequest { volume, options, .. } = request;
+        let mut volume = volume.ok_or_else(|| FieldError::new("volume", "absent", "must be given"))?;
+        let origin = Origin::checked("volume.frame_id", std::mem::take(&mut volume.frame_id), volume.stamp)?;
+        let asked = Asked::try_from(&options.unwrap_or_default())?;
+        // The model before the data: nothing is converted that no model takes.
+        let engine = self.models.select(&asked.model, &asked.version, Some(resolution(&volume)?))?;
+        call.by(&engine);
+        let checked = Volume::try_from(&volume)?;
+        check_voxel_size(&checked, &engine)?;
+        call.submit(&engine, Scene { volume: checked, sights: None }, asked, origin, None)
+    }
+
+    async fn submit_depth(&self, request: pb::DetectGraspsFromDepthRequest, call: &mut Call) -> Result<Work, Refusal> {
+        let pb::DetectGraspsFromDepthRequest { views, workspace, options, .. } = request;
+        let (asked, workspace, origin, engine) = self.prepare(views.len(), workspace, options, call)?;
+        let from = Arc::clone(&engine);
+        let fused = blocking(move || {
+            let frame_from_task = &workspace.frame_from_task;
+            let views = views.iter().enumerate().map(|(index, view)| depth_view(view, index, frame_from_task));
+            let views = views.collect::<Result<Vec<_>, _>>()?;
+            fuse(&from, asked, &workspace, &views)
         });
+        let (scene, asked, fusion) = fused.await?;
+        call.submit(&engine, scene, asked, origin, Some(fusion))
+    }
 
-        let total = self.started.elapsed();
-        let timings = Timings { queue, preprocessing: work.preprocessing, inference, postprocessing, total };
-        timings.record(&self.span);
-        self.metrics.answered(&self.label, &timings, sent);
-        self.span.in_scope(|| debug!(grasps = sent, "answered"));
-        Ok(pb::DetectGraspsResponse {
-            request_id: self.id.clone(),
-            frame_id: work.frame_id,
-            stamp: work.stamp,
-            grasps,
-            model: std::mem::take(&mut self.model),
-            version: std::mem::take(&mut self.version),
-            latency: Some((&timings).into()),
-            dropped,
-        })
+    async fn submit_cloud(&self, request: pb::DetectGraspsFromCloudRequest, call: &mut Call) -> Result<Work, Refusal> {
+        let pb::DetectGraspsFromCloudRequest { views, workspace, options, .. } = request;
+        let (asked, workspace, origin, engine) = self.prepare(views.len(), workspace, options, call)?;
+        let from = Arc::clone(&engine);
+        let fused = blocking(move || {
+            let frame_from_task = &workspace.frame_from_task;
+            let clouds = views.iter().enumerate().map(|(index, view)| cloud_view(view, index, frame_from_task));
+            let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
+            let views = rendered(&clouds, size(&from.source, &workspace))?;
+            fuse(&from, asked, &workspace, &views)
+        });
+        let (scene, asked, fusion) = fused.await?;
+        call.submit(&engine, scene, asked, origin, Some(fusion))
+    }
+
+    /// What can be checked before anything is converted.
+    fn prepare(
+        &self,
+        views: usize,
+        workspace: Option<pb::Workspace>,
+        options: Option<pb::Options>,
+        call: &mut Call,
+    ) -> Result<(Asked, Workspace, Origin, Arc<Engine>), Refusal> {
+        check_count(views)?;
+        let asked = Asked::try_from(&options.unwrap_or_default())?;
+        let mut workspace = Workspace::try_from(workspace.unwrap_or_default())?;
+        let origin = Origin::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
+        let engine = self.models.select(&asked.model, &asked.version, None)?;
+        call.by(&engine);
+        // Before the work, not after it.
+        engine.check_place()?;
+        Ok((asked, workspace, origin, engine))
+    }
+
+    /// Integrates what came into the volume that is kept, and queues that.
+    async fn submit_track(
+        &self,
+        request: pb::TrackGraspsRequest,
+        track: &mut Option<Track>,
+        call: &mut Call,
+    ) -> Result<Work, Refusal> {
+        let pb::TrackGraspsRequest { views, workspace, options, .. } = request;
+        let before = track.as_ref().map(|track| track.asked.clone());
+        let asked = match (options, before) {
+            (None, Some(before)) => before,
+            (options, _) => Asked::try_from(&options.unwrap_or_default())?,
+        };
+        let engine = self.models.select(&asked.model, &asked.version, None)?;
+        call.by(&engine);
+        engine.check_place()?;
+        let (from, old) = (Arc::clone(&engine), track.take());
+        // It comes back in any case: what is wrong with a view does not cost the volume.
+        let (kept, fused) = blocking(move || Ok(Track::integrate(old, &from, asked, workspace, &views))).await?;
+        *track = kept;
+        let (scene, asked, origin, fusion) = fused?;
+        call.submit(&engine, scene, asked, origin, Some(fusion))
     }
 }
 
-impl Drop for Call {
-    fn drop(&mut self) {
-        if !self.ended {
-            let expired = self.deadline.is_some_and(|Deadline(deadline)| deadline <= Instant::now());
-            let code = if expired { Code::DeadlineExceeded } else { Code::Cancelled };
-            self.metrics.ended(&self.label, code);
-            self.span.in_scope(|| info!(?code, "the caller has gone"));
-        }
-    }
+/// Views into a volume, and how long that took.
+fn fuse(
+    engine: &Engine,
+    mut asked: Asked,
+    workspace: &Workspace,
+    views: &[grasp::View],
+) -> Result<(Scene, Asked, std::time::Duration), Refusal> {
+    let started = Instant::now();
+    let grid = Grid::of(&engine.source, workspace, &eyes(views))?;
+    let mut fusion = grid.fusion();
+    let sights = grid.integrate(&mut fusion, views)?;
+    asked.constraints = grid.within(asked.constraints);
+    Ok((grid.scene(&fusion, Some(sights))?, asked, started.elapsed()))
+}
+
+/// On a thread that may take its time; those that move messages must not.
+async fn blocking<T: Send + 'static>(work: impl FnOnce() -> Result<T, Refusal> + Send + 'static) -> Result<T, Refusal> {
+    let done = tokio::task::spawn_blocking(work).await;
+    done.unwrap_or_else(|panic| Err(EngineError::Panic(panic.to_string()).into()))
 }
 
 #[tonic::async_trait]
@@ -226,9 +176,35 @@ impl GraspService for Grasps {
         request: Request<pb::DetectGraspsRequest>,
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
         let deadline = request.extensions().get().copied();
-        let begun = self.begin(request.into_inner(), deadline);
-        let id = begun.call.id.clone();
-        begun.finish().await.map(Response::new).map_err(|refusal| refusal.status(&id))
+        self.begin(request.into_inner(), deadline).respond().await
+    }
+
+    async fn detect_grasps_from_depth(
+        &self,
+        request: Request<pb::DetectGraspsFromDepthRequest>,
+    ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
+        let deadline = request.extensions().get().copied();
+        let mut request = request.into_inner();
+        let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), deadline);
+        let work = match checked {
+            Ok(()) => self.submit_depth(request, &mut call).await,
+            Err(refusal) => Err(refusal),
+        };
+        Begun { call, work }.respond().await
+    }
+
+    async fn detect_grasps_from_cloud(
+        &self,
+        request: Request<pb::DetectGraspsFromCloudRequest>,
+    ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
+        let deadline = request.extensions().get().copied();
+        let mut request = request.into_inner();
+        let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), deadline);
+        let work = match checked {
+            Ok(()) => self.submit_cloud(request, &mut call).await,
+            Err(refusal) => Err(refusal),
+        };
+        Begun { call, work }.respond().await
     }
 
     type DetectGraspsStreamStream = BoxStream<pb::DetectGraspsStreamResponse>;
@@ -247,7 +223,7 @@ impl GraspService for Grasps {
             while let Ok(place) = begun.reserve().await {
                 let message = tokio::select! {
                     message = requests.message() => message,
-                    () = draining(service.state.clone()) => return,
+                    () = draining(service.calls.state()) => return,
                 };
                 match message {
                     Ok(Some(request)) => place.send(Ok(service.begin(request, deadline))),
@@ -259,14 +235,48 @@ impl GraspService for Grasps {
         });
         let replies = ReceiverStream::new(calls).then(async |begun: Result<Begun, Status>| {
             let begun = begun?;
-            let request_id = begun.call.id.clone();
-            let outcome = match begun.finish().await {
-                Ok(response) => Outcome::Response(response),
-                Err(refusal) => Outcome::Error(refusal.into()),
-            };
-            Ok(pb::DetectGraspsStreamResponse { request_id, outcome: Some(outcome) })
+            let id = begun.call.id.clone();
+            Ok(response(id, begun.finish().await))
         });
         Ok(Response::new(Box::pin(replies)))
+    }
+
+    type TrackGraspsStream = BoxStream<pb::DetectGraspsStreamResponse>;
+
+    async fn track_grasps(
+        &self,
+        request: Request<Streaming<pb::TrackGraspsRequest>>,
+    ) -> Result<Response<Self::TrackGraspsStream>, Status> {
+        let deadline = request.extensions().get().copied();
+        let mut requests = request.into_inner();
+        let service = self.clone();
+        let place = self.kept.place()?;
+        let (replies, sent) = mpsc::channel(1);
+        tokio::spawn(async move {
+            // Given back when the stream ends, with the volume.
+            let _place = place;
+            let mut track = None;
+            while let Ok(reply) = replies.reserve().await {
+                let message = tokio::select! {
+                    message = requests.message() => message,
+                    () = draining(service.calls.state()) => return,
+                    status = service.kept.expired() => return reply.send(Err(status)),
+                };
+                let mut request = match message {
+                    Ok(Some(request)) => request,
+                    Ok(None) => return,
+                    Err(status) => return reply.send(Err(status)),
+                };
+                let (mut call, checked) = service.calls.open(std::mem::take(&mut request.request_id), deadline);
+                let work = match checked {
+                    Ok(()) => service.submit_track(request, &mut track, &mut call).await,
+                    Err(refusal) => Err(refusal),
+                };
+                let id = call.id.clone();
+                reply.send(Ok(response(id, Begun { call, work }.finish().await)));
+            }
+        });
+        Ok(Response::new(Box::pin(ReceiverStream::new(sent))))
     }
 
     async fn list_models(&self, _: Request<pb::ListModelsRequest>) -> Result<Response<pb::ListModelsResponse>, Status> {
@@ -274,19 +284,11 @@ impl GraspService for Grasps {
     }
 }
 
-/// Ids for requests that bring none: the process's own number, then a counter.
-struct RequestIds {
-    process: u32,
-    next: AtomicU64,
-}
-
-impl RequestIds {
-    fn new() -> Self {
-        // The standard library's hashers are seeded by the system: randomness without another dependency.
-        Self { process: RandomState::new().hash_one(0) as u32, next: AtomicU64::new(1) }
-    }
-
-    fn next(&self) -> String {
-        format!("{:08x}-{}", self.process, self.next.fetch_add(1, Ordering::Relaxed))
-    }
+/// An answer of a stream, which goes on after a refusal.
+fn response(request_id: String, outcome: Result<pb::DetectGraspsResponse, Refusal>) -> pb::DetectGraspsStreamResponse {
+    let outcome = match outcome {
+        Ok(response) => Outcome::Response(response),
+        Err(refusal) => Outcome::Error(refusal.into()),
+    };
+    pb::DetectGraspsStreamResponse { request_id, outcome: Some(outcome) }
 }

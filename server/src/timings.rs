@@ -8,22 +8,25 @@ use tracing::Span;
 pub(crate) struct Timings {
     pub queue: Duration,
     pub preprocessing: Duration,
+    /// Of depth images and points.
+    pub fusion: Option<Duration>,
     pub inference: Duration,
     pub postprocessing: Duration,
     pub total: Duration,
 }
 
 impl Timings {
-    /// Each stage with its name, seconds.
-    pub fn stages(&self) -> [(&'static str, f64); 5] {
-        [
-            ("queue", self.queue),
-            ("preprocessing", self.preprocessing),
-            ("inference", self.inference),
-            ("postprocessing", self.postprocessing),
-            ("total", self.total),
-        ]
-        .map(|(stage, duration)| (stage, duration.as_secs_f64()))
+    /// Each stage that there was with its name, seconds.
+    pub fn stages(&self) -> impl Iterator<Item = (&'static str, f64)> {
+        let stages = [
+            ("queue", Some(self.queue)),
+            ("preprocessing", Some(self.preprocessing)),
+            ("fusion", self.fusion),
+            ("inference", Some(self.inference)),
+            ("postprocessing", Some(self.postprocessing)),
+            ("total", Some(self.total)),
+        ];
+        stages.into_iter().filter_map(|(stage, duration)| Some((stage, duration?.as_secs_f64())))
     }
 
     /// Fills the fields that the request's span was created with.
@@ -39,6 +42,7 @@ impl From<&Timings> for pb::Latency {
         Self {
             queue: timings.queue.as_secs_f64(),
             preprocessing: timings.preprocessing.as_secs_f64(),
+            fusion: timings.fusion.unwrap_or_default().as_secs_f64(),
             inference: timings.inference.as_secs_f64(),
             postprocessing: timings.postprocessing.as_secs_f64(),
             total: timings.total.as_secs_f64(),

@@ -127,13 +127,14 @@ class GraspService:
             taken = perf_counter()
             quality, rotation, width = self.infer(volume)
             inferred = perf_counter()
-        threshold = request.threshold if request.HasField("threshold") else THRESHOLD
-        force = request.force if request.HasField("force") else None
+        options = request.options
+        threshold = options.threshold if options.HasField("threshold") else THRESHOLD
+        force = options.force if options.HasField("force") else None
         smooth = gaussian_filter(quality, SIGMA, mode="nearest")
         cells, dropped = decode(volume, smooth, width, threshold, force)
-        if request.max_grasps:
-            dropped["over_limit"] = max(0, len(cells) - request.max_grasps)
-            cells = cells[: request.max_grasps]
+        if options.max_grasps:
+            dropped["over_limit"] = max(0, len(cells) - options.max_grasps)
+            cells = cells[: options.max_grasps]
         grasps = self.grasps(cells, smooth, rotation, width, request.volume.pose)
         decoded = perf_counter()
 
@@ -144,7 +145,7 @@ class GraspService:
             grasps=grasps,
             model=self.name,
             version=self.version,
-            dropped=self.pb.Dropped(**dropped) if request.explain or not grasps else None,
+            dropped=self.pb.Dropped(**dropped) if options.explain or not grasps else None,
         )
         latency = response.latency
         latency.preprocessing, latency.queue = checked - started, taken - checked

@@ -23,6 +23,7 @@ SERVICES = {
     "grpc.health.v1.Health",
     "grpc.reflection.v1.ServerReflection",
     "grpc.reflection.v1alpha.ServerReflection",
+    "inference.GRPCInferenceService",
 }
 RESOLUTION = 16
 VOXEL_SIZE = 0.3 / RESOLUTION
@@ -94,12 +95,12 @@ class ClientTest(unittest.TestCase):
         self.assertEqual(response.frame_id, "base")
 
     def test_explain_accounts_for_every_voxel(self):
-        response = self.grasps.DetectGrasps(self.request(explain=True))
+        response = self.grasps.DetectGrasps(self.request(options=self.pb.Options(explain=True)))
         dropped = sum(value for _, value in response.dropped.ListFields())
         self.assertEqual(dropped + len(response.grasps), RESOLUTION**3)
 
     def test_a_stream_answers_in_order(self):
-        requests = [self.request(request_id=str(i), model="nobody" if i == 3 else "") for i in range(8)]
+        requests = [self.request(request_id=str(i), options=self.pb.Options(model="nobody" if i == 3 else "")) for i in range(8)]
         replies = list(self.grasps.DetectGraspsStream(iter(requests)))
         self.assertEqual([reply.request_id for reply in replies], [str(i) for i in range(8)])
         for index, reply in enumerate(replies):
@@ -112,7 +113,7 @@ class ClientTest(unittest.TestCase):
         index = np.ravel_multi_index((1, 2, 3), values.shape)
         for request, code, message in [
             (self.request(self.volume(values)), grpc.StatusCode.INVALID_ARGUMENT, f"volume.data[{index}] is NaN"),
-            (self.request(model="nobody"), grpc.StatusCode.NOT_FOUND, "there are mirror 1"),
+            (self.request(options=self.pb.Options(model="nobody")), grpc.StatusCode.NOT_FOUND, "there are mirror 1"),
         ]:
             with self.assertRaises(grpc.RpcError) as caught:
                 self.grasps.DetectGrasps(request)
@@ -120,12 +121,13 @@ class ClientTest(unittest.TestCase):
             self.assertIn(message, caught.exception.details())
 
     def test_the_models_are_listed(self):
-        (model,) = self.grasps.ListModels(self.pb.ListModelsRequest()).models
+        model, shaf = self.grasps.ListModels(self.pb.ListModelsRequest()).models
+        self.assertEqual((shaf.name, shaf.resolution), ("shaf", 0))
         self.assertEqual((model.name, model.version, model.resolution), ("mirror", "1", RESOLUTION))
 
     def test_health(self):
         health = health_pb2_grpc.HealthStub(self.channel)
-        for service in ["", "grasp.v1.GraspService"]:
+        for service in ["", "grasp.v1.GraspService", "inference.GRPCInferenceService"]:
             response = health.Check(health_pb2.HealthCheckRequest(service=service))
             self.assertEqual(response.status, health_pb2.HealthCheckResponse.SERVING)
 
@@ -133,7 +135,7 @@ class ClientTest(unittest.TestCase):
         database = ProtoReflectionDescriptorDatabase(self.channel)
         self.assertEqual(set(database.get_services()), SERVICES - {"grpc.reflection.v1.ServerReflection"})
         service = DescriptorPool(database).FindServiceByName("grasp.v1.GraspService")
-        self.assertEqual(set(service.methods_by_name), {"DetectGrasps", "DetectGraspsStream", "ListModels"})
+        self.assertLessEqual({"DetectGrasps", "DetectGraspsFromDepth", "TrackGrasps"}, set(service.methods_by_name))
 
     def test_reflection_v1(self):
         # grpcio-reflection speaks v1alpha; the messages of v1 are the same.

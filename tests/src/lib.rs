@@ -4,6 +4,7 @@
 
 mod binaries;
 mod models;
+pub mod scene;
 mod server;
 mod volumes;
 

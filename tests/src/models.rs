@@ -69,6 +69,12 @@ impl TestModel {
         Self { rotation: [0.0; 4], ..self }
     }
 
+    /// Every grasp has this orientation, a unit quaternion x, y, z, w.
+    #[must_use]
+    pub fn rotation(self, rotation: [f32; 4]) -> Self {
+        Self { rotation, ..self }
+    }
+
     /// ONNX Runtime fails in the middle of a batch in which any voxel is 0.
     #[must_use]
     pub fn fails_at_zero(self) -> Self {
@@ -137,6 +143,7 @@ impl TestModel {
             voxel_size: grasp::WORKSPACE_SIZE / self.resolution as f64,
             value_convention: ValueConvention::Vgn,
             voxel_origin: grasp::VoxelOrigin::Corner,
+            camera_azimuth: None,
             provenance: BTreeMap::from([("data".to_owned(), "none".to_owned())]),
         };
         metadata.write_to(&mut model);

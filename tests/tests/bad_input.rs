@@ -16,6 +16,10 @@ fn request() -> pb::DetectGraspsRequest {
     pb::DetectGraspsRequest { volume: Some(encode(&volume(), DataType::F32, "base")), ..Default::default() }
 }
 
+fn asking(options: pb::Options) -> pb::DetectGraspsRequest {
+    pb::DetectGraspsRequest { options: Some(options), ..request() }
+}
+
 fn with_data(values: &[f32]) -> impl Fn(&mut pb::Volume) + use<> {
     let data: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
     move |volume| volume.data = data.clone().into()
@@ -95,7 +99,7 @@ async fn the_resolution_must_be_one_that_a_model_takes() {
     other.volume = Some(encode(&blobs(20, Isometry3::identity(), &[[5, 5, 5]]), DataType::F32, ""));
     let taken = "the models that could answer take 16 (mirror 1), 24 (second 1)";
     case.refused(other.clone(), Code::InvalidArgument, &format!("volume.resolution is 20, {taken}")).await;
-    other.model = "mirror".to_owned();
+    other.options = Some(pb::Options { model: "mirror".to_owned(), ..Default::default() });
     let taken = "the models that could answer take 16 (mirror 1)";
     case.refused(other, Code::InvalidArgument, &format!("volume.resolution is 20, {taken}")).await;
     for resolution in [0, 257, u32::MAX] {
@@ -195,15 +199,13 @@ async fn the_pose_must_be_finite_with_a_unit_quaternion() {
 #[tokio::test]
 async fn the_model_and_its_version_must_be_loaded() {
     let mut case = Case::new().await;
-    let there = "there is no such; there are mirror 1, second 1";
-    let ask = |model: &str, version: &str| pb::DetectGraspsRequest {
-        model: model.to_owned(),
-        version: version.to_owned(),
-        ..request()
+    let there = "there is no such; there are mirror 1, second 1, shaf 1";
+    let ask = |model: &str, version: &str| {
+        asking(pb::Options { model: model.to_owned(), version: version.to_owned(), ..Default::default() })
     };
-    case.refused(ask("vgn", ""), Code::NotFound, &format!("model is `vgn`, {there}")).await;
-    case.refused(ask("mirror", "2"), Code::NotFound, &format!("model is `mirror 2`, {there}")).await;
-    let message = "version is `1`, which needs a `model` that it is a version of";
+    case.refused(ask("vgn", ""), Code::NotFound, &format!("options.model is `vgn`, {there}")).await;
+    case.refused(ask("mirror", "2"), Code::NotFound, &format!("options.model is `mirror 2`, {there}")).await;
+    let message = "options.version is `1`, which needs a `model` that it is a version of";
     case.refused(ask("", "1"), Code::InvalidArgument, message).await;
 }
 
@@ -213,10 +215,10 @@ async fn the_parameters_must_be_in_range() {
     case.refused(Default::default(), Code::InvalidArgument, "volume is absent, must be given").await;
     for value in [0.0, -0.5, 1.5, f32::NAN] {
         let needed = format!("is {value}, must be above 0 and at most 1");
-        let bad = pb::DetectGraspsRequest { threshold: Some(value), ..request() };
-        case.refused(bad, Code::InvalidArgument, &format!("threshold {needed}")).await;
-        let bad = pb::DetectGraspsRequest { force: Some(value), ..request() };
-        case.refused(bad, Code::InvalidArgument, &format!("force {needed}")).await;
+        let bad = asking(pb::Options { threshold: Some(value), ..Default::default() });
+        case.refused(bad, Code::InvalidArgument, &format!("options.threshold {needed}")).await;
+        let bad = asking(pb::Options { force: Some(value), ..Default::default() });
+        case.refused(bad, Code::InvalidArgument, &format!("options.force {needed}")).await;
     }
     let bad = pb::DetectGraspsRequest { request_id: "x".repeat(257), ..request() };
     case.refused(bad, Code::InvalidArgument, "request_id is 257 bytes long, at most 256 are taken").await;
@@ -233,7 +235,7 @@ async fn a_model_that_fails_on_a_volume_fails_that_request_alone() {
         assert_eq!(status.code(), Code::Internal);
         assert!(status.message().contains("`rotation`"), "{}", status.message());
         // Nothing reaches this threshold, so no quaternion is looked at.
-        let empty = pb::DetectGraspsRequest { threshold: Some(1.0), ..request() };
+        let empty = asking(pb::Options { threshold: Some(1.0), ..Default::default() });
         assert!(client.detect_grasps(empty).await.unwrap().into_inner().grasps.is_empty());
     }
     assert_eq!(server.get("/readyz").0, 200);
@@ -243,7 +245,7 @@ async fn a_model_that_fails_on_a_volume_fails_that_request_alone() {
 async fn refusals_are_counted_by_their_code() {
     let mut case = Case::new().await;
     case.refused_volume(|v| v.voxel_size = 0.0, "volume.voxel_size is 0, must be a positive number of metres").await;
-    let unknown = pb::DetectGraspsRequest { model: "vgn".to_owned(), ..request() };
+    let unknown = asking(pb::Options { model: "vgn".to_owned(), ..Default::default() });
     case.client.detect_grasps(unknown).await.unwrap_err();
     let count =
         |code, model| case.server.metric(&format!("graspd_requests_total{{code=\"{code}\",model=\"{model}\"}}"));

@@ -121,7 +121,7 @@ fn mistakes_are_explained() {
     let file = files[0].to_str().unwrap();
     assert!(refused(&["detect", "nowhere.npy"]).contains("nowhere.npy: No such file"));
     let error = refused(&["detect", file, "--model", "vgn"]);
-    assert!(error.contains("NotFound: model is `vgn`, there is no such; there are mirror 1"), "{error}");
+    assert!(error.contains("NotFound: options.model is `vgn`, there is no such; there are mirror 1"), "{error}");
     let error = refused(&["detect", file, "--server", "127.0.0.1:1"]);
     assert!(error.contains("cannot reach graspd at 127.0.0.1:1"), "{error}");
     let whole = folder.path().join("i64.npy");

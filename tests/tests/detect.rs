@@ -3,7 +3,7 @@
 use std::time::{Duration, SystemTime};
 
 use grasp::{DecodeParams, Grasp, Volume};
-use grasp_client::{DataType, Dropped, Options};
+use grasp_client::{Asked, DataType, Dropped, Options, Proposal};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs, expected};
 use nalgebra::{Isometry3, Vector3};
 use tokio_stream::StreamExt;
@@ -15,11 +15,11 @@ fn volume() -> Volume {
 }
 
 fn voxels(dropped: &Dropped) -> usize {
-    let Dropped { below_threshold, mask, width, border, suppressed, collision, over_limit } = *dropped;
-    (below_threshold + mask + width + border + suppressed + collision + over_limit) as usize
+    let Dropped { below_threshold, mask, width, border, suppressed, over_limit, .. } = *dropped;
+    (below_threshold + mask + width + border + suppressed + over_limit) as usize
 }
 
-fn assert_same(got: &[Grasp], wanted: &[Grasp]) {
+fn assert_same(got: &[Proposal], wanted: &[Grasp]) {
     assert_eq!(got.len(), wanted.len());
     for (got, wanted) in got.iter().zip(wanted) {
         assert!((got.pose.translation.vector - wanted.pose.translation.vector).norm() < 1e-12, "{got:?} {wanted:?}");
@@ -47,7 +47,8 @@ async fn every_dtype_gives_the_same_grasps() {
     let f32 = detect(DataType::F32).await.unwrap().grasps;
     let f16 = detect(DataType::F16).await.unwrap().grasps;
     let u8 = detect(DataType::U8).await.unwrap().grasps;
-    assert_same(&f32, &u8);
+    let plain: Vec<Grasp> = f32.iter().map(Into::into).collect();
+    assert_same(&u8, &plain);
     assert_eq!(f32.len(), f16.len());
     for (wide, half) in f32.iter().zip(&f16) {
         assert_eq!((wide.pose, wide.width), (half.pose, half.width));
@@ -64,7 +65,7 @@ async fn grasps_are_in_the_frame_of_the_volumes_pose() {
     let at_origin = client.detect(&volume(), Options::default()).await.unwrap().grasps;
     let options = Options { frame_id: "panda_link0".to_owned(), ..Options::default() };
     let detection = client.detect(&placed, options).await.unwrap();
-    let moved: Vec<_> = at_origin.iter().map(|grasp| Grasp { pose: pose * grasp.pose, ..*grasp }).collect();
+    let moved: Vec<_> = at_origin.iter().map(|grasp| Grasp { pose: pose * grasp.pose, ..grasp.into() }).collect();
     assert_same(&detection.grasps, &moved);
     assert_eq!(detection.frame_id, "panda_link0");
 }
@@ -75,7 +76,8 @@ async fn every_voxel_is_explained_once() {
     let client = server.client().await;
     for threshold in [0.3, 0.7, 0.9, 1.0] {
         for max_grasps in [0, 1] {
-            let options = Options { threshold: Some(threshold), max_grasps, explain: true, ..Options::default() };
+            let asked = Asked { threshold: Some(threshold), max_grasps, explain: true, ..Asked::default() };
+            let options = Options { asked, ..Options::default() };
             let detection = client.detect(&volume(), options).await.unwrap();
             let dropped = detection.dropped.expect("it was asked for");
             assert_eq!(voxels(&dropped) + detection.grasps.len(), RESOLUTION.pow(3), "{dropped:?}");
@@ -91,7 +93,8 @@ async fn every_voxel_is_explained_once() {
 #[tokio::test]
 async fn an_empty_answer_is_always_explained() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
-    let options = Options { threshold: Some(1.0), ..Options::default() };
+    let asked = Asked { threshold: Some(1.0), ..Asked::default() };
+    let options = Options { asked, ..Options::default() };
     let detection = server.client().await.detect(&volume(), options).await.unwrap();
     assert!(detection.grasps.is_empty());
     assert_eq!(voxels(&detection.dropped.expect("no grasp needs a reason")), RESOLUTION.pow(3));
@@ -100,7 +103,8 @@ async fn an_empty_answer_is_always_explained() {
 #[tokio::test]
 async fn force_gives_the_best_grasp_alone() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
-    let options = Options { threshold: Some(1.0), force: Some(0.5), ..Options::default() };
+    let asked = Asked { threshold: Some(1.0), force: Some(0.5), ..Asked::default() };
+    let options = Options { asked, ..Options::default() };
     let detection = server.client().await.detect(&volume(), options).await.unwrap();
     let best = expected(&volume(), &DecodeParams::default()).grasps[0];
     assert_same(&detection.grasps, &[best]);
@@ -137,7 +141,8 @@ async fn a_stream_answers_in_order_and_survives_bad_volumes() {
     let requests: Vec<_> = (0..50)
         .map(|index| {
             let model = if index % 5 == 3 { "nobody" } else { "" }.to_owned();
-            (volume(), Options { request_id: format!("volume {index}"), model, ..Options::default() })
+            let asked = Asked { model, ..Asked::default() };
+            (volume(), Options { request_id: format!("volume {index}"), asked, ..Options::default() })
         })
         .collect();
     let replies = server.client().await.detect_stream(tokio_stream::iter(requests)).await.unwrap();
@@ -169,7 +174,7 @@ async fn the_model_is_the_one_asked_for_or_the_first_that_fits() {
     let client = server.client().await;
     let listed = client.list_models().await.unwrap();
     let listed: Vec<_> = listed.iter().map(|model| format!("{} {}", model.name, model.version)).collect();
-    assert_eq!(listed, ["small 1", "large 1", "mirror 1.10", "mirror 1.9"]);
+    assert_eq!(listed, ["small 1", "large 1", "mirror 1.10", "mirror 1.9", "shaf 1"]);
 
     let large = blobs(24, Isometry3::identity(), &CENTRES);
     for (volume, model, version, wanted) in [
@@ -178,7 +183,8 @@ async fn the_model_is_the_one_asked_for_or_the_first_that_fits() {
         (&volume(), "mirror", "", "mirror 1.10"),
         (&volume(), "mirror", "1.9", "mirror 1.9"),
     ] {
-        let options = Options { model: model.to_owned(), version: version.to_owned(), ..Options::default() };
+        let asked = Asked { model: model.to_owned(), version: version.to_owned(), ..Asked::default() };
+        let options = Options { asked, ..Options::default() };
         let detection = client.detect(volume, options).await.unwrap();
         assert_eq!(format!("{} {}", detection.model, detection.version), wanted);
     }

@@ -39,7 +39,8 @@ fn request() -> impl Strategy<Value = pb::DetectGraspsRequest> {
     )
         .prop_map(|(request_id, volume, model, version, threshold, force, max_grasps, explain)| {
             let (model, version) = (model.to_owned(), version.to_owned());
-            pb::DetectGraspsRequest { request_id, volume, model, version, threshold, force, max_grasps, explain }
+            let options = pb::Options { model, version, threshold, force, max_grasps, explain, ..Default::default() };
+            pb::DetectGraspsRequest { request_id, volume, options: Some(options) }
         })
 }
 
@@ -118,13 +119,14 @@ fn check(request: &pb::DetectGraspsRequest, response: &pb::DetectGraspsResponse)
         let pb::Quaternion { x, y, z, w } = orientation;
         assert!((x * x + y * y + z * z + w * w - 1.0).abs() < 1e-6, "{pose:?}");
     }
-    if request.max_grasps > 0 {
-        assert!(response.grasps.len() <= request.max_grasps as usize);
+    let options = request.options.as_ref().expect("every request has them");
+    if options.max_grasps > 0 {
+        assert!(response.grasps.len() <= options.max_grasps as usize);
     }
-    assert_eq!(response.dropped.is_some(), request.explain || response.grasps.is_empty());
+    assert_eq!(response.dropped.is_some(), options.explain || response.grasps.is_empty());
     if let Some(dropped) = &response.dropped {
-        let pb::Dropped { below_threshold, mask, width, border, suppressed, collision, over_limit } = *dropped;
-        let voxels = below_threshold + mask + width + border + suppressed + collision + over_limit;
+        let pb::Dropped { below_threshold, mask, width, border, suppressed, over_limit, .. } = *dropped;
+        let voxels = below_threshold + mask + width + border + suppressed + over_limit;
         assert_eq!(voxels as usize + response.grasps.len(), VALUES, "{dropped:?}");
     }
 }

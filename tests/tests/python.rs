@@ -4,7 +4,7 @@ use std::ffi::OsStr;
 use std::path::Path;
 use std::process::Command;
 
-use grasp_tests::{Server, TestModel, grasp_sim};
+use grasp_tests::{Server, TestModel, grasp_sim, graspd};
 
 /// Runs the tests of a file; `expected` is one of them, for unittest is content when it finds none at all.
 fn run(file: &str, environment: &[(&str, &OsStr)], expected: &str) {
@@ -28,6 +28,19 @@ fn a_python_client_gets_along_with_the_server() {
     let proto = Path::new(env!("CARGO_MANIFEST_DIR")).join("../proto/proto");
     let environment = [("GRASPD_SERVER", address.as_ref()), ("GRASPD_PROTO", proto.as_os_str())];
     run("test_client.py", &environment, "test_the_grasps_are_where_the_blobs_are");
+}
+
+#[test]
+fn the_deployment_fits_the_server_seen_from_python() {
+    run("test_deploy.py", &[("GRASPD", graspd().as_os_str())], "test_the_manifests_are_valid");
+}
+
+#[test]
+fn prometheus_sees_what_the_dashboard_shows_seen_from_python() {
+    // GRASPD_PROMETHEUS and GRASPD_PROMTOOL are the environment's.
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo");
+    let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.as_os_str())];
+    run("test_monitoring.py", &environment, "test_panels_show_data");
 }
 
 #[test]

@@ -3,10 +3,11 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 use comfy_table::{CellAlignment, Table, presets};
-use grasp::Grasp;
-use grasp_client::{Client, Detection, LocalServer, Options};
+use grasp::Intrinsics;
+use grasp_client::{Asked, Client, Depth, DepthView, Detection, Extrinsics, LocalServer, Options, Workspace};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
+use grasp_sim::camera::View;
 use grasp_sim::physics::World;
 use grasp_sim::picture::{Picture, quality_color};
 use grasp_sim::trial::{Outcome, execute};
@@ -52,7 +53,7 @@ impl Demo {
             .observe(&world, &mut rng)
             .context("the cameras see nothing of this scene; another --seed makes another one")?;
         println!("a {:?} scene of {} objects, seed {}", self.scene.kind(), world.objects().len(), self.scene.seed);
-        println!("seen in {} depth image(s), fused into 40×40×40 voxels of 7.5 mm", observation.views.len());
+        println!("seen in {} depth image(s) of 640×480 pixels", observation.views.len());
 
         let arguments = ["--log".as_ref(), "warn".as_ref(), "--models".as_ref(), self.models.as_os_str()];
         let server = LocalServer::spawn(&self.graspd, arguments)?;
@@ -61,8 +62,10 @@ impl Demo {
         let detection = runtime.block_on(async {
             let client = Client::connect(server.grpc().to_string()).await?;
             // Lower than anyone would execute: a picture should show what is weighed up, too.
-            let options = Options { threshold: Some(0.5), ..Options::default() };
-            client.detect(&observation.volume, options).await
+            let asked = Asked { threshold: Some(0.5), ..Asked::default() };
+            let options = Options { asked, ..Options::default() };
+            let views: Vec<DepthView> = observation.views.iter().map(view).collect();
+            client.detect_from_depth(&views, &Workspace::default(), options).await
         })?;
         // With its runtime the client's connection closes, which the server would wait for when it is told to stop.
         drop(runtime);
@@ -77,13 +80,26 @@ impl Demo {
             None => println!("nothing to execute: {:?}; another --seed makes another scene", detection.dropped),
         }
 
-        draw(&world, &detection.grasps).save(&self.picture)?;
+        draw(&world, &detection).save(&self.picture)?;
         println!("drawn in {}", self.picture.display());
 
         let status = server.stop()?;
         anyhow::ensure!(status.success(), "graspd did not stop cleanly: {status}");
         println!("graspd stopped cleanly");
         Ok(())
+    }
+}
+
+/// What the camera of the benchmark sends.
+fn view(view: &View) -> DepthView {
+    let Intrinsics { width, height, fx, fy, cx, cy } = Intrinsics::BENCHMARK;
+    DepthView {
+        depth: Depth::Metres(view.depth.clone()),
+        // 640 × 480.
+        width: width as u32,
+        height: height as u32,
+        k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+        extrinsics: Extrinsics::CameraFromTask(view.camera_from_task),
     }
 }
 
@@ -111,9 +127,10 @@ fn print_detection(detection: &Detection) {
     let ms = |seconds: f64| format!("{:.2} ms", seconds * 1e3);
     let latency = &detection.latency;
     println!(
-        "latency: queue {}, pre-processing {}, inference {}, post-processing {}, total {}",
+        "latency: queue {}, pre-processing {}, fusion {}, inference {}, post-processing {}, total {}",
         ms(latency.queue),
         ms(latency.preprocessing),
+        ms(latency.fusion),
         ms(latency.inference),
         ms(latency.postprocessing),
         ms(latency.total)
@@ -125,10 +142,10 @@ fn angle_off_vertical(rotation: &UnitQuaternion<f64>) -> f64 {
 }
 
 /// The scene, every proposal coloured by its quality, and the one that was executed as a solid hand.
-fn draw(world: &World, grasps: &[Grasp]) -> Picture {
+fn draw(world: &World, detection: &Detection) -> Picture {
     let mut picture = Picture::of_workspace(1200, 900, TABLE_HEIGHT);
     picture.scene(world);
-    for (index, grasp) in grasps.iter().enumerate() {
+    for (index, grasp) in detection.grasps.iter().enumerate() {
         let color = quality_color(f64::from(grasp.quality));
         if index == 0 {
             picture.hand(&grasp.pose, grasp.width, color);

@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use grasp::Grasp;
-use grasp::gpd::{Cloud, Image, candidates};
+use grasp::gpd::{Cloud, Image, candidates, scored};
 use grasp_models::{Classifier, Options};
 use rand_chacha::ChaCha8Rng;
 
@@ -25,18 +25,6 @@ impl Planner for Gpd {
         let found = candidates(&cloud, &params(), rng);
         let images: Vec<Image> = found.iter().map(|candidate| Image::of(&cloud, candidate)).collect();
         let scores = self.classifier.score(&images)?;
-        let mut grasps: Vec<Grasp> = found
-            .iter()
-            .zip(scores)
-            .filter(|(_, score)| *score >= 0.0)
-            .map(|(candidate, score)| Grasp { pose: candidate.pose, width: candidate.width, quality: sigmoid(score) })
-            .collect();
-        grasps.sort_by(|a, b| b.quality.total_cmp(&a.quality));
-        Ok(grasps)
+        Ok(scored(&found, &scores))
     }
-}
-
-/// The probability of a success, for the score is the difference of the two classes' logits.
-fn sigmoid(score: f32) -> f32 {
-    1.0 / (1.0 + (-score).exp())
 }

@@ -1,6 +1,6 @@
 use anyhow::Context;
 use grasp::{DecodeParams, Grasp};
-use grasp_client::Client;
+use grasp_client::{Asked, Client, Options};
 use rand_chacha::ChaCha8Rng;
 use tokio::runtime::Runtime;
 
@@ -24,7 +24,9 @@ impl Server {
 impl Planner for Server {
     fn plan(&mut self, observation: &Observation, _: &mut ChaCha8Rng) -> anyhow::Result<Vec<Grasp>> {
         let DecodeParams { threshold, force, .. } = self.params;
-        let options = grasp_client::Options { threshold: Some(threshold), force, ..Default::default() };
-        Ok(self.runtime.block_on(self.client.detect(&observation.volume, options))?.grasps)
+        let asked = Asked { threshold: Some(threshold), force, ..Asked::default() };
+        let options = Options { asked, ..Options::default() };
+        let detection = self.runtime.block_on(self.client.detect(&observation.volume, options))?;
+        Ok(detection.grasps.iter().map(Into::into).collect())
     }
 }

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use grasp::gpd::{Cloud, candidates, highest_first};
+use grasp::gpd::{Cloud, candidates, ranked};
 use grasp::{DecodeParams, Grasp};
 use grasp_models::Options;
 use rand_chacha::ChaCha8Rng;
@@ -11,17 +11,12 @@ use super::network::Onnx;
 use super::{Observation, Planner};
 use crate::candidates::{params, sights};
 
-/// A candidate has no quality of its own.
-const UNKNOWN: f32 = 0.5;
-
 /// The pure geometric form: the highest of the places where the hand fits.
 pub(super) struct Geometric;
 
 impl Planner for Geometric {
     fn plan(&mut self, observation: &Observation, rng: &mut ChaCha8Rng) -> anyhow::Result<Vec<Grasp>> {
-        let mut found = candidates(&Cloud::new(sights(&observation.views)), &params(), rng);
-        highest_first(&mut found);
-        Ok(found.iter().map(|c| Grasp { pose: c.pose, width: c.width, quality: UNKNOWN }).collect())
+        Ok(ranked(candidates(&Cloud::new(sights(&observation.views)), &params(), rng)))
     }
 }
 

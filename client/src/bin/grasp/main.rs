@@ -11,7 +11,9 @@ use std::time::Duration;
 
 use anyhow::{Context, anyhow};
 use clap::{Args, Parser, Subcommand};
-use grasp_client::{Access, Arrivals, Certificate, Client, Health, Identity, Options, Retry, Token, Until, load};
+use grasp_client::{
+    Access, Arrivals, Asked, Certificate, Client, Health, Identity, Options, Retry, Token, Until, load,
+};
 use tonic::Code;
 
 /// Asks a graspd for grasps.
@@ -158,20 +160,16 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             // The file first: a mistake in it needs no server to be found.
             let Detect { volume: Volume { file, voxel_size, model, version }, .. } = args;
             let volume = file::read(&file, voxel_size)?;
-            let options = Options {
-                model,
-                version,
-                threshold: args.threshold,
-                max_grasps: args.max_grasps,
-                explain: args.explain,
-                ..Options::default()
-            };
+            let (threshold, max_grasps, explain) = (args.threshold, args.max_grasps, args.explain);
+            let asked = Asked { model, version, threshold, max_grasps, explain, ..Asked::default() };
+            let options = Options { asked, ..Options::default() };
             let detection = Client::connect_with(server, access.read()?).await?.detect(&volume, options).await?;
             println!("{}", if json { show::detection_json(&detection) } else { show::detection(&detection) });
         }
         Command::Bench(Bench { volume: Volume { file, voxel_size, model, version }, callers, rate, seconds }) => {
             let volume = Arc::new(file::read(&file, voxel_size)?);
-            let options = Options { model, version, ..Options::default() };
+            let asked = Asked { model, version, ..Asked::default() };
+            let options = Options { asked, ..Options::default() };
             // What is refused is to be seen, not to be tried again.
             let access = Access { retry: Retry::NONE, ..access.read()? };
             let client = Client::connect_with(server, access).await?;

@@ -92,8 +92,9 @@ pub(crate) fn models(models: &[Model]) -> String {
     for model in models {
         let Model { name, version, resolution, voxel_size, threshold, sha256, provider, precision, .. } = model;
         let sha256 = sha256.get(..12).unwrap_or(sha256).to_owned();
-        let [resolution, voxel_size, threshold] =
-            [resolution.to_string(), voxel_size.to_string(), threshold.to_string()];
+        let any = |number: String| if number == "0" { "any".to_owned() } else { number };
+        let [resolution, voxel_size] = [resolution.to_string(), voxel_size.to_string()].map(any);
+        let threshold = threshold.to_string();
         table.add_row(right([
             name.clone(),
             version.clone(),
@@ -133,22 +134,26 @@ pub(crate) fn health_json(serving: bool) -> String {
     format!("{:#}", json!({ "serving": serving }))
 }
 
-fn stages(latency: &Latency) -> [(&'static str, f64); 5] {
+fn stages(latency: &Latency) -> [(&'static str, f64); 6] {
     [
         ("queue", latency.queue),
         ("preprocessing", latency.preprocessing),
+        ("fusion", latency.fusion),
         ("inference", latency.inference),
         ("postprocessing", latency.postprocessing),
         ("total", latency.total),
     ]
 }
 
-fn reasons(dropped: &Dropped) -> [(&'static str, u32); 7] {
+fn reasons(dropped: &Dropped) -> [(&'static str, u32); 10] {
     [
         ("below_threshold", dropped.below_threshold),
         ("mask", dropped.mask),
         ("width", dropped.width),
         ("border", dropped.border),
+        ("region", dropped.region),
+        ("approach", dropped.approach),
+        ("height", dropped.height),
         ("suppressed", dropped.suppressed),
         ("collision", dropped.collision),
         ("over_limit", dropped.over_limit),

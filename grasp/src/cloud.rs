@@ -1,0 +1,165 @@
+use nalgebra::{Isometry3, Point3, Rotation3, Vector3};
+
+use crate::Intrinsics;
+
+/// A depth image with its camera's pose: what a point cloud would have looked like.
+#[derive(Clone, Debug)]
+pub struct View {
+    /// The camera.
+    pub intrinsics: Intrinsics,
+    /// Metres along the optical axis, row by row; 0 where there is no point.
+    pub depth: Vec<f32>,
+    /// `T_camera_task`.
+    pub camera_from_task: Isometry3<f64>,
+}
+
+/// Pixels along the edge of the image, of the fewest and the most points.
+const SIZES: [usize; 2] = [48, 320];
+
+/// Points of one pixel whose depths differ by more than this, metres, are of different surfaces.
+const LAYER: f32 = 0.01;
+
+/// Neighbours, of eight, that fill a pixel without a point.
+const FILLED_BY: usize = 5;
+
+/// What a camera at `eye` sees of the cube with an edge of `size` metres at the origin of the task frame, if what there is
+/// to see are these points of the task frame.
+///
+/// The image is as fine as the points are dense; the nearest points of a pixel make its depth, and pixels between points
+/// are filled. `None` if the eye is inside of the cube, or no point is in sight.
+#[must_use]
+pub fn seen_from(points: &[Point3<f64>], eye: &Point3<f64>, size: f64) -> Option<View> {
+    let centre = Point3::from([size / 2.0; 3]);
+    let radius = 3.0_f64.sqrt() / 2.0 * size;
+    let distance = (centre - eye).norm();
+    if !distance.is_finite() || distance <= radius {
+        return None;
+    }
+    let camera_from_task = look_at(eye, &centre);
+    // A frustum about the ball around the cube; a sphere is seen under a larger angle than its radius suggests.
+    let tangent = radius / (distance * distance - radius * radius).sqrt();
+
+    let projected = points.iter().filter_map(|point| {
+        let p = camera_from_task * point;
+        let (x, y) = (p.x / p.z / tangent, p.y / p.z / tangent);
+        (p.z > 0.0 && x.abs() < 1.0 && y.abs() < 1.0).then_some((x, y, p.z as f32))
+    });
+    let projected: Vec<(f64, f64, f32)> = projected.collect();
+    if projected.is_empty() {
+        return None;
+    }
+    // About one point a pixel, if they cover the image.
+    let edge = ((projected.len() as f64).sqrt() as usize).clamp(SIZES[0], SIZES[1]);
+    let half = edge as f64 / 2.0;
+    // Pixel centres are at whole numbers: the image reaches from -0.5 to edge - 0.5.
+    let middle = half - 0.5;
+    let intrinsics =
+        Intrinsics { width: edge, height: edge, fx: half / tangent, fy: half / tangent, cx: middle, cy: middle };
+    let pixel = |coordinate: f64| ((coordinate + 1.0) * half) as usize;
+
+    let mut nearest = vec![f32::INFINITY; edge * edge];
+    let index = |x: f64, y: f64| pixel(y).min(edge - 1) * edge + pixel(x).min(edge - 1);
+    for &(x, y, z) in &projected {
+        let nearest = &mut nearest[index(x, y)];
+        *nearest = nearest.min(z);
+    }
+    // Of a slanted surface the nearest point alone would stand half a pixel before it.
+    let mut sums = vec![(0.0_f32, 0.0_f32); edge * edge];
+    for &(x, y, z) in &projected {
+        let index = index(x, y);
+        if z <= nearest[index] + LAYER {
+            sums[index].0 += z;
+            sums[index].1 += 1.0;
+        }
+    }
+    let depth: Vec<f32> = sums.iter().map(|&(sum, count)| if count > 0.0 { sum / count } else { 0.0 }).collect();
+    Some(View { intrinsics, depth: filled(&depth, edge), camera_from_task })
+}
+
+/// Gives pixels without depth the median of their neighbours, where enough of those have one.
+fn filled(depth: &[f32], edge: usize) -> Vec<f32> {
+    let fill = |index: usize| {
+        if depth[index] > 0.0 {
+            return depth[index];
+        }
+        let (row, column) = (index / edge, index % edge);
+        let rows = row.saturating_sub(1)..(row + 2).min(edge);
+        let around = rows.flat_map(|row| {
+            (column.saturating_sub(1)..(column + 2).min(edge)).map(move |column| depth[row * edge + column])
+        });
+        let mut around: Vec<f32> = around.filter(|&depth| depth > 0.0).collect();
+        if around.len() < FILLED_BY {
+            return 0.0;
+        }
+        let middle = around.len() / 2;
+        *around.select_nth_unstable_by(middle, f32::total_cmp).1
+    };
+    (0..depth.len()).map(fill).collect()
+}
+
+/// `T_camera_task` of a camera at `eye` that looks at `target`; optical axes: z forward, x right, y down.
+fn look_at(eye: &Point3<f64>, target: &Point3<f64>) -> Isometry3<f64> {
+    let forward = target - eye;
+    let up = if forward.normalize().z.abs() > 0.99 { Vector3::x() } else { Vector3::z() };
+    // Its rows are the camera's axes in the task frame.
+    let rotation = Rotation3::look_at_lh(&forward, &-up);
+    let rotation = nalgebra::UnitQuaternion::from_rotation_matrix(&rotation);
+    Isometry3::from_parts((rotation * -eye.coords).into(), rotation)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{DepthImage, Fusion, RESOLUTION, WORKSPACE_SIZE};
+
+    /// A plane at z = 0.1 and a block of 0.1 m on it, a point every `step` metres, as seen from above.
+    fn scene(step: f64) -> Vec<Point3<f64>> {
+        let n = (0.3 / step) as usize;
+        let height = |x: f64, y: f64| if (0.1..0.2).contains(&x) && (0.1..0.2).contains(&y) { 0.2 } else { 0.1 };
+        (0..n * n)
+            .map(|i| {
+                let (x, y) = ((i / n) as f64 * step, (i % n) as f64 * step);
+                Point3::new(x, y, height(x, y))
+            })
+            .collect()
+    }
+
+    #[test]
+    fn the_camera_looks_where_it_should() {
+        for eye in [Point3::new(0.15, -0.5, 0.4), Point3::new(0.15, 0.15, 0.9), Point3::new(-0.4, 0.6, 0.15)] {
+            let pose = look_at(&eye, &Point3::new(0.15, 0.15, 0.15));
+            assert!((pose * eye).coords.norm() < 1e-12);
+            let target = pose * Point3::new(0.15, 0.15, 0.15);
+            assert!(target.x.abs() < 1e-9 && target.y.abs() < 1e-9 && target.z > 0.4, "{target}");
+            let above = pose * Point3::new(0.15, 0.15, 0.2);
+            assert!(above.y <= 1e-9, "what is higher is higher in the image, whose y points down");
+        }
+    }
+
+    #[test]
+    fn a_cloud_gives_the_volume_of_its_surface() {
+        for step in [0.001, 0.004] {
+            let view = seen_from(&scene(step), &Point3::new(0.15, -0.2, 0.7), WORKSPACE_SIZE).unwrap();
+            let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
+            fusion.integrate(&DepthImage::new(view.intrinsics, &view.depth).unwrap(), &view.camera_from_task);
+            let surface = fusion.surface();
+            let on = |height: f64| surface.iter().filter(|point| (point.position.z - height).abs() < 0.002).count();
+            assert!(on(0.1) > 500 && on(0.2) > 80, "{} and {} points with {step} m between", on(0.1), on(0.2));
+            // Between the two heights there are the sides of the block, seen or not, and nothing else.
+            let astray = surface.iter().filter(|point| {
+                let (p, side) = (point.position, |c: f64| (c - 0.1).abs() < 0.012 || (c - 0.2).abs() < 0.012);
+                (0.104..0.196).contains(&p.z) && !side(p.x) && !side(p.y)
+            });
+            assert_eq!(astray.count(), 0);
+        }
+    }
+
+    #[test]
+    fn there_may_be_nothing_to_see() {
+        let eye = Point3::new(0.15, -0.5, 0.4);
+        assert!(seen_from(&[], &eye, WORKSPACE_SIZE).is_none());
+        assert!(seen_from(&[Point3::new(0.15, -5.0, 0.4)], &eye, WORKSPACE_SIZE).is_none(), "behind the camera");
+        assert!(seen_from(&scene(0.01), &Point3::new(0.15, 0.15, 0.25), WORKSPACE_SIZE).is_none(), "too near");
+        assert!(seen_from(&scene(0.01), &Point3::new(f64::NAN, 0.0, 0.0), WORKSPACE_SIZE).is_none());
+    }
+}

@@ -1,0 +1,347 @@
+use grasp::{
+    Clearance, ClosingAxis, Cone, Constraints, Convention, DecodeParams, Hand, HandError, Origin, Region, Retreat,
+    before,
+};
+use nalgebra::{Isometry3, Unit, Vector3};
+
+use crate::pose::{self, PoseFields};
+use crate::{FieldError, pb};
+
+/// Where the table was in training, metres above the volume's bottom.
+pub const TABLE_HEIGHT: f64 = 0.05;
+
+/// From the pre-grasp to the grasp, metres: VGN's trials.
+const PREGRASP: f64 = 0.05;
+
+/// From the grasp upwards, metres: VGN's trials.
+const RETREAT: f64 = 0.1;
+
+/// Farthest that a hand is sent, metres.
+const REACH: f64 = 10.0;
+
+const PARENT: PoseFields = PoseFields {
+    position: "options.convention.parent_from_grasp.position",
+    orientation: "options.convention.parent_from_grasp.orientation",
+};
+
+/// What is asked of the grasps, checked.
+#[derive(Clone, Debug)]
+pub struct Asked {
+    /// Which planner; empty if any.
+    pub model: String,
+    /// Which version of it; empty for the newest.
+    pub version: String,
+    /// The smallest quality, where it is not the model's own.
+    pub threshold: Option<f32>,
+    /// That of the best grasp when nothing reaches the threshold.
+    pub force: Option<f32>,
+    /// The most grasps.
+    pub max_grasps: usize,
+    /// Whether to say why there are no others.
+    pub explain: bool,
+    /// Where and how.
+    pub constraints: Constraints,
+    /// The hand, where it is not the Panda's.
+    pub hand: Option<Hand>,
+    /// What is done about collisions.
+    pub collision: Collision,
+    /// Height of the table above the volume's bottom, if there is one.
+    pub table: Option<f64>,
+    /// Which frame of the hand is told.
+    pub convention: Convention,
+    /// From the pre-grasp to the grasp, metres.
+    pub pregrasp: f64,
+    /// Where the hand goes then.
+    pub retreat: Retreat,
+}
+
+/// What is done about grasps whose open hand would meet something.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Collision {
+    /// Nobody looks.
+    Off,
+    /// They are marked.
+    Flag,
+    /// They are dropped.
+    Filter,
+}
+
+impl Asked {
+    /// A planner's own parameters, with what is asked instead.
+    #[must_use]
+    pub fn decode_params(&self, own: DecodeParams) -> DecodeParams {
+        DecodeParams {
+            threshold: self.threshold.unwrap_or(own.threshold),
+            force: self.force.or(own.force),
+            constraints: self.constraints,
+            hand: self.hand,
+            clearance: (self.collision == Collision::Filter).then(|| self.clearance()),
+            ..own
+        }
+    }
+
+    /// What the hand must keep clear of.
+    #[must_use]
+    pub fn clearance(&self) -> Clearance {
+        let hand = self.hand.unwrap_or(Hand::PANDA);
+        Clearance { hand, from: self.pregrasp, table: self.table, ..Clearance::default() }
+    }
+
+    /// The poses of a grasp as they are told: itself, the pre-grasp, the retreat.
+    #[must_use]
+    pub fn poses(&self, grasp: &Isometry3<f64>) -> [Isometry3<f64>; 3] {
+        let depth = self.hand.map_or(grasp::FINGER_DEPTH, |hand| hand.depth);
+        [*grasp, before(grasp, self.pregrasp), self.retreat.from(grasp)].map(|pose| self.convention.pose(&pose, depth))
+    }
+}
+
+impl TryFrom<&pb::Options> for Asked {
+    type Error = FieldError;
+
+    fn try_from(options: &pb::Options) -> Result<Self, FieldError> {
+        let collision = options.collision.unwrap_or_default();
+        let table = number("options.collision.table_height", collision.table_height)?.unwrap_or(TABLE_HEIGHT);
+        Ok(Self {
+            model: options.model.clone(),
+            version: options.version.clone(),
+            threshold: probability("options.threshold", options.threshold)?,
+            force: probability("options.force", options.force)?,
+            max_grasps: if options.max_grasps == 0 { usize::MAX } else { options.max_grasps as usize },
+            explain: options.explain,
+            constraints: Constraints {
+                workspace: None,
+                region: options.region.as_ref().map(region).transpose()?,
+                approach: options.approach.as_ref().map(cone).transpose()?,
+                min_height: number("options.min_height", options.min_height)?,
+            },
+            hand: options.gripper.as_ref().map(hand).transpose()?,
+            collision: mode(&collision)?,
+            table: Some(table).filter(|height| *height >= 0.0),
+            convention: options.convention.as_ref().map(convention).transpose()?.unwrap_or_default(),
+            pregrasp: distance("options.pregrasp_distance", options.pregrasp_distance)?.unwrap_or(PREGRASP),
+            retreat: options
+                .retreat
+                .as_ref()
+                .map(retreat)
+                .transpose()?
+                .unwrap_or(Retreat { distance: RETREAT, direction: None }),
+        })
+    }
+}
+
+fn probability(field: &'static str, value: Option<f32>) -> Result<Option<f32>, FieldError> {
+    match value {
+        // Written so that NaN fails.
+        Some(value) if !(value > 0.0 && value <= 1.0) => {
+            Err(FieldError::new(field, value, "must be above 0 and at most 1"))
+        }
+        value => Ok(value),
+    }
+}
+
+fn number(field: &'static str, value: Option<f64>) -> Result<Option<f64>, FieldError> {
+    match value {
+        Some(value) if !value.is_finite() => Err(FieldError::new(field, value, "must be a finite number of metres")),
+        value => Ok(value),
+    }
+}
+
+fn distance(field: &'static str, value: Option<f64>) -> Result<Option<f64>, FieldError> {
+    match value {
+        Some(value) if !(0.0..=REACH).contains(&value) => {
+            Err(FieldError::new(field, value, format_args!("must be from 0 to {REACH} m")))
+        }
+        value => Ok(value),
+    }
+}
+
+fn corners(bounds: &pb::Box, field: &'static str) -> Result<[[f64; 3]; 2], FieldError> {
+    let corner = |corner: Option<pb::Vector3>, name: &str| {
+        let field = format!("{field}.{name}");
+        let corner = corner.ok_or_else(|| FieldError::new(field.clone(), "absent", "must be given"))?;
+        let [x, y, z] = [corner.x, corner.y, corner.z];
+        if [x, y, z].iter().all(|c| c.is_finite()) {
+            return Ok([x, y, z]);
+        }
+        Err(FieldError::new(field, format_args!("({x}, {y}, {z})"), "must be finite"))
+    };
+    Ok([corner(bounds.min, "min")?, corner(bounds.max, "max")?])
+}
+
+fn region(bounds: &pb::Box) -> Result<Region, FieldError> {
+    const FIELD: &str = "options.region";
+    let [lower, upper] = corners(bounds, FIELD)?;
+    for (axis, name) in ["x", "y", "z"].into_iter().enumerate() {
+        if lower[axis] > upper[axis] {
+            let needed = format_args!("must be at least that of `min`, {}", lower[axis]);
+            return Err(FieldError::new(format!("{FIELD}.max.{name}"), upper[axis], needed));
+        }
+    }
+    Ok(Region { frame: Isometry3::identity(), lower, upper })
+}
+
+fn direction(vector: Option<pb::Vector3>, field: &'static str) -> Result<Unit<Vector3<f64>>, FieldError> {
+    let pb::Vector3 { x, y, z } = vector.ok_or_else(|| FieldError::new(field, "absent", "must be given"))?;
+    let direction = Unit::try_new(Vector3::new(x, y, z), 1e-9).filter(|unit| unit.iter().all(|c| c.is_finite()));
+    direction.ok_or_else(|| {
+        FieldError::new(field, format_args!("({x}, {y}, {z})"), "must be finite and of a length above 0")
+    })
+}
+
+fn cone(cone: &pb::Cone) -> Result<Cone, FieldError> {
+    let axis = direction(cone.axis, "options.approach.axis")?;
+    if !(cone.angle > 0.0 && cone.angle <= std::f64::consts::PI) {
+        let needed = "must be above 0 and at most π (radians)";
+        return Err(FieldError::new("options.approach.angle", cone.angle, needed));
+    }
+    Ok(Cone { axis, angle: cone.angle })
+}
+
+fn hand(gripper: &pb::Gripper) -> Result<Hand, FieldError> {
+    let palm = gripper.palm.as_ref().map(|palm| corners(palm, "options.gripper.palm")).transpose()?;
+    let pb::Gripper { max_opening, finger_depth, finger_width, finger_breadth, .. } = *gripper;
+    let hand = Hand::new(max_opening, finger_depth, finger_width, finger_breadth, palm.unwrap_or_default());
+    hand.map_err(|HandError { field, value, needed }| {
+        FieldError::new(format!("options.gripper.{field}"), format_args!("{value} m"), format_args!("must be {needed}"))
+    })
+}
+
+fn mode(collision: &pb::CollisionCheck) -> Result<Collision, FieldError> {
+    use pb::collision_check::Mode;
+    match Mode::try_from(collision.mode) {
+        Ok(Mode::Off) => Ok(Collision::Off),
+        Ok(Mode::Flag) => Ok(Collision::Flag),
+        Ok(Mode::Filter) => Ok(Collision::Filter),
+        Err(_) => {
+            let needed = "must be 0 (off), 1 (flag) or 2 (filter)";
+            Err(FieldError::new("options.collision.mode", collision.mode, needed))
+        }
+    }
+}
+
+fn convention(convention: &pb::Convention) -> Result<Convention, FieldError> {
+    use pb::convention::{ClosingAxis as Axis, Origin as From};
+    let parent = convention.parent_from_grasp.as_ref();
+    const ORIGIN: &str = "options.convention.origin";
+    let origin = match (From::try_from(convention.origin), parent) {
+        (Ok(From::FingerBase), None) => Origin::FingerBase,
+        (Ok(From::Tcp), None) => Origin::Fingertips,
+        (Ok(From::Parent), Some(pose)) => Origin::Parent(pose::decode(pose, &PARENT)?),
+        (Ok(From::Parent), None) => {
+            let needed = "must be given for ORIGIN_PARENT";
+            return Err(FieldError::new("options.convention.parent_from_grasp", "absent", needed));
+        }
+        (Ok(origin), Some(_)) => {
+            let needed = "must be ORIGIN_PARENT where parent_from_grasp is given";
+            return Err(FieldError::new(ORIGIN, origin.as_str_name(), needed));
+        }
+        (Err(_), _) => {
+            let needed = "must be 0 (finger base), 1 (TCP) or 2 (parent)";
+            return Err(FieldError::new(ORIGIN, convention.origin, needed));
+        }
+    };
+    let closing = match Axis::try_from(convention.closing_axis) {
+        Ok(Axis::Y) => ClosingAxis::Y,
+        Ok(Axis::X) => ClosingAxis::X,
+        Err(_) => {
+            let needed = "must be 0 (y) or 1 (x)";
+            return Err(FieldError::new("options.convention.closing_axis", convention.closing_axis, needed));
+        }
+    };
+    Ok(Convention { origin, closing })
+}
+
+fn retreat(retreat: &pb::Retreat) -> Result<Retreat, FieldError> {
+    let length = distance("options.retreat.distance", Some(retreat.distance))?.filter(|distance| *distance > 0.0);
+    let towards = retreat.direction.map(|vector| direction(Some(vector), "options.retreat.direction")).transpose()?;
+    Ok(Retreat { distance: length.unwrap_or(RETREAT), direction: towards })
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Translation3;
+
+    use super::*;
+
+    fn refused(options: pb::Options) -> String {
+        Asked::try_from(&options).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn nothing_asked_is_what_the_papers_do() {
+        let asked = Asked::try_from(&pb::Options::default()).unwrap();
+        let own = DecodeParams { threshold: 0.8, force: Some(0.5), ..DecodeParams::default() };
+        assert_eq!(asked.decode_params(own), own);
+        let grasp = Isometry3::new(Vector3::new(0.1, 0.2, 0.3), Vector3::new(3.0, 0.0, 0.0));
+        let [pose, pregrasp, retreat] = asked.poses(&grasp);
+        assert_eq!(pose, grasp);
+        let z = |pose: Isometry3<f64>| (grasp.inverse() * pose).translation.vector.z;
+        assert!((z(pregrasp) + 0.05).abs() < 1e-12 && (z(retreat) + 0.1).abs() < 1e-12);
+        assert_eq!((asked.collision, asked.table, asked.max_grasps), (Collision::Off, Some(0.05), usize::MAX));
+    }
+
+    #[test]
+    fn a_retreat_may_be_straight_up_and_a_pose_the_parents() {
+        let up = pb::Vector3 { x: 0.0, y: 0.0, z: 2.0 };
+        let parent = (&Isometry3::translation(0.0, 0.0, 0.0584)).into();
+        let options = pb::Options {
+            retreat: Some(pb::Retreat { distance: 0.2, direction: Some(up) }),
+            convention: Some(pb::Convention { origin: 2, closing_axis: 0, parent_from_grasp: Some(parent) }),
+            ..Default::default()
+        };
+        let grasp = Isometry3::new(Vector3::new(0.1, 0.2, 0.3), Vector3::new(3.0, 0.0, 0.0));
+        let [pose, _, retreat] = Asked::try_from(&options).unwrap().poses(&grasp);
+        assert!((retreat.translation.vector - pose.translation.vector - Vector3::new(0.0, 0.0, 0.2)).norm() < 1e-12);
+        assert!(
+            (pose * Translation3::new(0.0, 0.0, 0.0584)).translation.vector.metric_distance(&grasp.translation.vector)
+                < 1e-12
+        );
+    }
+
+    #[test]
+    fn what_cannot_be_is_named() {
+        let vector = |x, y, z| Some(pb::Vector3 { x, y, z });
+        let options = |change: fn(&mut pb::Options)| {
+            let mut options = pb::Options::default();
+            change(&mut options);
+            refused(options)
+        };
+        assert_eq!(
+            options(|o| o.threshold = Some(f32::NAN)),
+            "options.threshold is NaN, must be above 0 and at most 1"
+        );
+        assert_eq!(
+            options(|o| o.pregrasp_distance = Some(-0.1)),
+            "options.pregrasp_distance is -0.1, must be from 0 to 10 m"
+        );
+        assert_eq!(
+            options(|o| o.gripper = Some(pb::Gripper { max_opening: 85.0, ..Default::default() })),
+            "options.gripper.max_opening is 85 m, must be above 0 and at most 0.5"
+        );
+        let region = Some(pb::Box { min: vector(0.0, 0.0, 0.2), max: vector(0.1, 0.1, 0.1) });
+        assert_eq!(
+            refused(pb::Options { region, ..Default::default() }),
+            "options.region.max.z is 0.1, must be at least that of `min`, 0.2"
+        );
+        let approach = Some(pb::Cone { axis: vector(0.0, 0.0, 0.0), angle: 0.5 });
+        assert_eq!(
+            refused(pb::Options { approach, ..Default::default() }),
+            "options.approach.axis is (0, 0, 0), must be finite and of a length above 0"
+        );
+        let approach = Some(pb::Cone { axis: vector(0.0, 0.0, -1.0), angle: 30.0 });
+        assert_eq!(
+            refused(pb::Options { approach, ..Default::default() }),
+            "options.approach.angle is 30, must be above 0 and at most π (radians)"
+        );
+        let convention = Some(pb::Convention { origin: 2, ..Default::default() });
+        assert_eq!(
+            refused(pb::Options { convention, ..Default::default() }),
+            "options.convention.parent_from_grasp is absent, must be given for ORIGIN_PARENT"
+        );
+        let collision = Some(pb::CollisionCheck { mode: 7, table_height: None });
+        assert_eq!(
+            refused(pb::Options { collision, ..Default::default() }),
+            "options.collision.mode is 7, must be 0 (off), 1 (flag) or 2 (filter)"
+        );
+    }
+}

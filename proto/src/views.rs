@@ -1,0 +1,327 @@
+use grasp::{DepthImage, Intrinsics, Unit, View};
+use nalgebra::{Isometry3, Point3};
+
+use crate::pb::depth_view::Extrinsics;
+use crate::pose::{self, PoseFields};
+use crate::{FieldError, pb};
+
+/// The most views of one request.
+pub const MAX_VIEWS: usize = 64;
+
+/// Longest edge of an image, pixels.
+const MAX_EDGE: u32 = 16_384;
+
+const WORKSPACE: PoseFields =
+    PoseFields { position: "workspace.pose.position", orientation: "workspace.pose.orientation" };
+const CAMERA_FROM_TASK: PoseFields =
+    PoseFields { position: "camera_from_task.position", orientation: "camera_from_task.orientation" };
+const FRAME_FROM_CAMERA: PoseFields =
+    PoseFields { position: "frame_from_camera.position", orientation: "frame_from_camera.orientation" };
+const FRAME_FROM_CLOUD: PoseFields =
+    PoseFields { position: "frame_from_cloud.position", orientation: "frame_from_cloud.orientation" };
+
+/// The cube in which grasps are looked for, checked.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Workspace {
+    /// `T_frame_task`.
+    pub frame_from_task: Isometry3<f64>,
+    /// Edge, metres; the model's own, where it is `None`.
+    pub size: Option<f64>,
+    /// The frame of the grasps.
+    pub frame_id: String,
+    /// When the views were taken.
+    pub stamp: Option<prost_types::Timestamp>,
+}
+
+/// What one camera saw as points of the task frame, with where it stood.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Points {
+    /// Metres.
+    pub points: Vec<Point3<f64>>,
+    /// The camera.
+    pub eye: Point3<f64>,
+}
+
+impl TryFrom<pb::Workspace> for Workspace {
+    type Error = FieldError;
+
+    fn try_from(workspace: pb::Workspace) -> Result<Self, FieldError> {
+        let pb::Workspace { pose, size, frame_id, stamp } = workspace;
+        if !(0.0..=100.0).contains(&size) {
+            return Err(FieldError::new(
+                "workspace.size",
+                size,
+                "must be above 0 and at most 100 m, or 0 for the model's",
+            ));
+        }
+        let frame_from_task = pose.map_or(Ok(Isometry3::identity()), |pose| pose::decode(&pose, &WORKSPACE))?;
+        Ok(Self { frame_from_task, size: Some(size).filter(|size| *size > 0.0), frame_id, stamp })
+    }
+}
+
+/// Checks how many views there are.
+///
+/// # Errors
+/// [`FieldError`] when there are none or too many.
+pub fn check_count(views: usize) -> Result<(), FieldError> {
+    if (1..=MAX_VIEWS).contains(&views) {
+        return Ok(());
+    }
+    Err(FieldError::new("views", format_args!("a list of {views}"), format_args!("must have from 1 to {MAX_VIEWS}")))
+}
+
+/// The depth image number `index`, in metres, and its camera's pose to the task frame.
+///
+/// # Errors
+/// [`FieldError`] names what is not what it must be.
+pub fn depth_view(view: &pb::DepthView, index: usize, frame_from_task: &Isometry3<f64>) -> Result<View, FieldError> {
+    try_depth_view(view, frame_from_task).map_err(|error| error.inside(format_args!("views[{index}]")))
+}
+
+fn try_depth_view(view: &pb::DepthView, frame_from_task: &Isometry3<f64>) -> Result<View, FieldError> {
+    let camera = view.camera.as_ref().ok_or_else(|| FieldError::new("camera", "absent", "must be given"))?;
+    let intrinsics = intrinsics(camera)?;
+    let pixels = intrinsics.width * intrinsics.height;
+    let value_size = match view.unit() {
+        pb::DepthUnit::F32Metres => 4,
+        pb::DepthUnit::U16Millimetres => 2,
+        pb::DepthUnit::Unspecified => {
+            return Err(FieldError::new("unit", view.unit, "must be 1 (f32, metres) or 2 (u16, millimetres)"));
+        }
+    };
+    if view.data.len() != pixels * value_size {
+        let needed = format_args!(
+            "{} × {} pixels need {} ({})",
+            intrinsics.width,
+            intrinsics.height,
+            pixels * value_size,
+            view.unit().as_str_name()
+        );
+        return Err(FieldError::new("data", format_args!("{} bytes", view.data.len()), needed));
+    }
+    let camera_from_task = match &view.extrinsics {
+        Some(Extrinsics::CameraFromTask(pose)) => pose::decode(pose, &CAMERA_FROM_TASK)?,
+        Some(Extrinsics::FrameFromCamera(pose)) => pose::decode(pose, &FRAME_FROM_CAMERA)?.inverse() * frame_from_task,
+        None => {
+            let needed = "camera_from_task (T_camera_task) or frame_from_camera (T_frame_camera) must be given";
+            return Err(FieldError::new("extrinsics", "absent", needed));
+        }
+    };
+    let depth: Vec<f32> = match view.unit() {
+        pb::DepthUnit::U16Millimetres => {
+            view.data.as_chunks().0.iter().map(|&bytes| f32::from(u16::from_le_bytes(bytes)) * 1e-3).collect()
+        }
+        _ => view.data.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect(),
+    };
+    let image =
+        DepthImage::new(intrinsics, &depth).map_err(|error| FieldError::new("camera", error, "must be mended"))?;
+    match (image.unit(), view.unit()) {
+        (Unit::Millimetres, _) => {
+            let needed =
+                "these look like millimetres: send them as u16 with DEPTH_UNIT_U16_MILLIMETRES, or divide them by 1000";
+            return Err(FieldError::new("data", "in metres, with a median above 20", needed));
+        }
+        (Unit::Thousandths, pb::DepthUnit::U16Millimetres) => {
+            let needed = "these look like metres: send them as f32 with DEPTH_UNIT_F32_METRES";
+            return Err(FieldError::new("data", "in millimetres, with a median below 20", needed));
+        }
+        (Unit::Thousandths, _) => {
+            let needed = "no such camera sees so near: were they divided by 1000 twice?";
+            return Err(FieldError::new("data", "in metres, with a median below 0.02", needed));
+        }
+        (Unit::Metres, _) => {}
+    }
+    Ok(View { intrinsics, depth, camera_from_task })
+}
+
+/// The intrinsic matrix, as cameras' drivers give it.
+fn intrinsics(camera: &pb::Camera) -> Result<Intrinsics, FieldError> {
+    const FORM: &str = "must be nine numbers, row by row: fx 0 cx, 0 fy cy, 0 0 1";
+    for (field, edge) in [("camera.width", camera.width), ("camera.height", camera.height)] {
+        if !(1..=MAX_EDGE).contains(&edge) {
+            return Err(FieldError::new(field, edge, format_args!("must be from 1 to {MAX_EDGE} pixels")));
+        }
+    }
+    let k: &[f64] = &camera.k;
+    let &[fx, skew, cx, zero, fy, cy, left, right, one] = k else {
+        return Err(FieldError::new("camera.k", format_args!("{} numbers", k.len()), FORM));
+    };
+    let wrong = |needed: &str| Err(FieldError::new("camera.k", format_args!("{k:?}"), needed));
+    if !k.iter().all(|value| value.is_finite()) {
+        return wrong("must be finite");
+    }
+    if [skew, cx, cy] == [0.0; 3] && (left != 0.0 || right != 0.0) {
+        return wrong("has its principal point in the last row: is it transposed?");
+    }
+    if [zero, left, right] != [0.0; 3] || (one - 1.0).abs() > 1e-6 {
+        return wrong(FORM);
+    }
+    if skew.abs() > 1e-3 * fx.abs() {
+        return wrong("must have no skew (its second number): rectify the image");
+    }
+    if !(fx > 0.0 && fy > 0.0) {
+        return wrong("must have focal lengths above 0 (its first and fifth number)");
+    }
+    // Both fit: they are at most MAX_EDGE.
+    Ok(Intrinsics { width: camera.width as usize, height: camera.height as usize, fx, fy, cx, cy })
+}
+
+/// The points number `index` and where their camera stood, in the task frame.
+///
+/// # Errors
+/// [`FieldError`] names what is not what it must be.
+pub fn cloud_view(view: &pb::CloudView, index: usize, frame_from_task: &Isometry3<f64>) -> Result<Points, FieldError> {
+    try_cloud_view(view, frame_from_task).map_err(|error| error.inside(format_args!("views[{index}]")))
+}
+
+fn try_cloud_view(view: &pb::CloudView, frame_from_task: &Isometry3<f64>) -> Result<Points, FieldError> {
+    const POINT: usize = 12;
+    if view.points.is_empty() || !view.points.len().is_multiple_of(POINT) {
+        let value = format_args!("{} bytes", view.points.len());
+        return Err(FieldError::new("points", value, "must be a multiple of 12 above 0: x, y, z of each point, f32"));
+    }
+    let frame_from_cloud = view.frame_from_cloud.as_ref();
+    let frame_from_cloud =
+        frame_from_cloud.map_or(Ok(Isometry3::identity()), |p| pose::decode(p, &FRAME_FROM_CLOUD))?;
+    let task_from_cloud = frame_from_task.inverse() * frame_from_cloud;
+    let eye = view.camera_position.ok_or_else(|| FieldError::new("camera_position", "absent", "must be given"))?;
+    let pb::Vector3 { x, y, z } = eye;
+    if ![x, y, z].iter().all(|c| c.is_finite()) {
+        return Err(FieldError::new("camera_position", format_args!("({x}, {y}, {z})"), "must be finite"));
+    }
+    let point = |bytes: &[u8; POINT]| {
+        let [x, y, z] =
+            [0, 4, 8].map(|at| f32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]));
+        let finite = x.is_finite() && y.is_finite() && z.is_finite();
+        finite.then(|| task_from_cloud * Point3::new(x, y, z).cast::<f64>())
+    };
+    let points: Vec<_> = view.points.as_chunks().0.iter().filter_map(point).collect();
+    if points.is_empty() {
+        return Err(FieldError::new("points", "NaN throughout", "must have a point that is none"));
+    }
+    Ok(Points { points, eye: task_from_cloud * Point3::new(x, y, z) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A wall half a metre away.
+    fn view() -> pb::DepthView {
+        pb::DepthView {
+            data: [500_u16; 12].iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>().into(),
+            unit: pb::DepthUnit::U16Millimetres.into(),
+            camera: Some(pb::Camera { width: 4, height: 3, k: vec![5.0, 0.0, 2.0, 0.0, 5.0, 1.5, 0.0, 0.0, 1.0] }),
+            extrinsics: Some(Extrinsics::CameraFromTask((&Isometry3::translation(0.0, 0.0, 0.4)).into())),
+        }
+    }
+
+    fn refused(change: impl Fn(&mut pb::DepthView)) -> String {
+        let mut view = view();
+        change(&mut view);
+        let error = depth_view(&view, 1, &Isometry3::identity()).unwrap_err();
+        assert!(error.message.starts_with(&*error.field), "{error:?}");
+        error.to_string()
+    }
+
+    #[test]
+    fn both_units_and_both_directions_give_the_same_view() {
+        let frame_from_task = Isometry3::translation(1.0, 2.0, 3.0);
+        let wanted = depth_view(&view(), 0, &frame_from_task).unwrap();
+        assert_eq!(wanted.depth, [0.5; 12]);
+        let intrinsics = Intrinsics { width: 4, height: 3, fx: 5.0, fy: 5.0, cx: 2.0, cy: 1.5 };
+        assert_eq!(wanted.intrinsics, intrinsics);
+
+        let metres: Vec<u8> = [0.5_f32; 12].iter().flat_map(|v| v.to_le_bytes()).collect();
+        let frame_from_camera = frame_from_task * wanted.camera_from_task.inverse();
+        let other = pb::DepthView {
+            data: metres.into(),
+            unit: pb::DepthUnit::F32Metres.into(),
+            extrinsics: Some(Extrinsics::FrameFromCamera((&frame_from_camera).into())),
+            ..view()
+        };
+        let other = depth_view(&other, 0, &frame_from_task).unwrap();
+        assert_eq!(other.depth, wanted.depth);
+        assert!((other.camera_from_task.to_homogeneous() - wanted.camera_from_task.to_homogeneous()).norm() < 1e-9);
+    }
+
+    #[test]
+    fn each_mistake_is_named() {
+        let camera = |k: &[f64]| Some(pb::Camera { width: 4, height: 3, k: k.to_vec() });
+        assert_eq!(refused(|v| v.camera = None), "views[1].camera is absent, must be given");
+        assert_eq!(
+            refused(|v| v.camera = camera(&[5.0; 4])),
+            "views[1].camera.k is 4 numbers, must be nine numbers, row by row: fx 0 cx, 0 fy cy, 0 0 1"
+        );
+        let transposed = [5.0, 0.0, 0.0, 0.0, 5.0, 0.0, 2.0, 1.5, 1.0];
+        assert!(refused(|v| v.camera = camera(&transposed)).ends_with("is it transposed?"));
+        let skewed = [5.0, 0.3, 2.0, 0.0, 5.0, 1.5, 0.0, 0.0, 1.0];
+        assert!(refused(|v| v.camera = camera(&skewed)).ends_with("rectify the image"));
+        assert!(refused(|v| v.camera = camera(&[0.0; 9])).contains("must be nine numbers"));
+        assert!(refused(|v| v.camera = camera(&[f64::NAN; 9])).ends_with("must be finite"));
+        let negative = [-5.0, 0.0, 2.0, 0.0, 5.0, 1.5, 0.0, 0.0, 1.0];
+        assert!(refused(|v| v.camera = camera(&negative)).contains("focal lengths above 0"));
+        assert_eq!(
+            refused(|v| v.camera.as_mut().unwrap().width = 0),
+            "views[1].camera.width is 0, must be from 1 to 16384 pixels"
+        );
+        assert_eq!(
+            refused(|v| v.data = vec![0; 23].into()),
+            "views[1].data is 23 bytes, 4 × 3 pixels need 24 (DEPTH_UNIT_U16_MILLIMETRES)"
+        );
+        assert_eq!(refused(|v| v.unit = 0), "views[1].unit is 0, must be 1 (f32, metres) or 2 (u16, millimetres)");
+        assert!(refused(|v| v.extrinsics = None).starts_with("views[1].extrinsics is absent, camera_from_task"));
+        let nowhere = pb::Pose { position: None, orientation: None };
+        assert_eq!(
+            refused(|v| v.extrinsics = Some(Extrinsics::FrameFromCamera(nowhere))),
+            "views[1].frame_from_camera.position is absent, must be given"
+        );
+    }
+
+    #[test]
+    fn a_wrong_unit_is_told_and_not_answered_with_nothing() {
+        let f32s = |value: f32| [value; 12].iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
+        let metres = |value: f32| refused(|v| (v.data, v.unit) = (f32s(value).into(), pb::DepthUnit::F32Metres.into()));
+        assert!(metres(500.0).contains("these look like millimetres"), "{}", metres(500.0));
+        assert!(metres(0.0005).contains("divided by 1000 twice"));
+        let millimetres =
+            refused(|v| v.data = [1_u16; 12].iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>().into());
+        assert!(millimetres.contains("these look like metres"), "{millimetres}");
+    }
+
+    #[test]
+    fn points_are_brought_into_the_task_frame() {
+        let points: [f32; 6] = [0.1, 0.2, 0.3, f32::NAN, 0.0, 0.0];
+        let view = pb::CloudView {
+            points: points.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>().into(),
+            frame_from_cloud: Some((&Isometry3::translation(1.0, 0.0, 0.0)).into()),
+            camera_position: Some(pb::Vector3::default()),
+        };
+        let points = cloud_view(&view, 0, &Isometry3::translation(0.5, 0.0, 0.0)).unwrap();
+        let [point] = points.points[..] else { panic!("the NaN is left out") };
+        assert!((point - Point3::new(0.6, 0.2, 0.3)).norm() < 1e-6);
+        assert!((points.eye - Point3::new(0.5, 0.0, 0.0)).norm() < 1e-12);
+        let refused = |view: pb::CloudView| cloud_view(&view, 2, &Isometry3::identity()).unwrap_err().to_string();
+        assert!(
+            refused(pb::CloudView { points: vec![0; 13].into(), ..view.clone() })
+                .starts_with("views[2].points is 13 bytes")
+        );
+        assert!(
+            refused(pb::CloudView { camera_position: None, ..view }).starts_with("views[2].camera_position is absent")
+        );
+    }
+
+    #[test]
+    fn a_workspace_has_a_size() {
+        let workspace = |size| Workspace::try_from(pb::Workspace { size, ..Default::default() });
+        assert_eq!(workspace(0.0).unwrap().size, None);
+        assert_eq!(workspace(0.3).unwrap().size, Some(0.3));
+        for size in [-0.3, f64::NAN, 300.0] {
+            assert!(
+                workspace(size).unwrap_err().message.starts_with(&format!("workspace.size is {size}, must be above 0"))
+            );
+        }
+        assert!(check_count(1).is_ok() && check_count(64).is_ok());
+        assert_eq!(check_count(0).unwrap_err().message, "views is a list of 0, must have from 1 to 64");
+    }
+}

@@ -1,0 +1,273 @@
+use std::collections::hash_map::RandomState;
+use std::hash::BuildHasher;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use grasp_proto::{Asked, FieldError, pb};
+use tokio::sync::watch;
+use tonic::Code;
+use tracing::field::Empty;
+use tracing::{Span, debug, info, info_span};
+
+use crate::deadline::Deadline;
+use crate::engine::{Answer, Engine, Found, Reply, Tensors};
+use crate::health::State;
+use crate::metrics::Metrics;
+use crate::planner::Scene;
+use crate::refusal::Refusal;
+use crate::timings::Timings;
+
+/// Longest request id and frame id, bytes: they are echoed, and the first is logged.
+const MAX_ID: usize = 256;
+
+/// When to ask again while the sessions warm up.
+const WARM_UP: Duration = Duration::from_secs(1);
+
+/// Opens the calls of a service.
+#[derive(Clone)]
+pub(crate) struct Calls {
+    metrics: Arc<Metrics>,
+    state: watch::Receiver<State>,
+    ids: Arc<RequestIds>,
+}
+
+/// A request on its way. Dropped before its end, it counts as cancelled by its caller, unless that one's time was up.
+pub(crate) struct Call {
+    pub id: String,
+    pub deadline: Option<Deadline>,
+    started: Instant,
+    span: Span,
+    metrics: Arc<Metrics>,
+    name: String,
+    version: String,
+    /// The planner's, empty as long as none is chosen.
+    label: String,
+    ended: bool,
+}
+
+/// What a request that was taken needs for its reply.
+pub(crate) struct Work {
+    reply: Reply<Found>,
+    asked: Asked,
+    /// What to look at was made in this time, checking and fusing.
+    preprocessing: Duration,
+    fusion: Option<Duration>,
+    origin: Origin,
+}
+
+/// Where and when a request's views were taken: echoed.
+#[derive(Clone, Default)]
+pub(crate) struct Origin {
+    pub frame_id: String,
+    pub stamp: Option<prost_types::Timestamp>,
+}
+
+impl Calls {
+    pub fn new(metrics: Arc<Metrics>, state: watch::Receiver<State>) -> Self {
+        Self { metrics, state, ids: Arc::new(RequestIds::new()) }
+    }
+
+    /// Whether the server is starting, serving or draining.
+    pub fn state(&self) -> watch::Receiver<State> {
+        self.state.clone()
+    }
+
+    /// Opens a call. What is wrong with its id or its moment is the second of the two.
+    pub fn open(&self, mut id: String, deadline: Option<Deadline>) -> (Call, Result<(), Refusal>) {
+        let started = Instant::now();
+        let mut checked = check_id("request_id", &id).map_err(Refusal::from);
+        if id.is_empty() || checked.is_err() {
+            id = self.ids.next();
+        }
+        // What arrives on a connection that is already open is still answered; streams stop reading by themselves.
+        if checked.is_ok() && *self.state.borrow() == State::Starting {
+            checked = Err(Refusal::Starting(WARM_UP));
+        }
+        let span = info_span!(
+            "detect",
+            request_id = id,
+            model = Empty,
+            queue = Empty,
+            preprocessing = Empty,
+            fusion = Empty,
+            inference = Empty,
+            postprocessing = Empty,
+            total = Empty,
+        );
+        let call = Call {
+            id,
+            deadline,
+            started,
+            span,
+            metrics: Arc::clone(&self.metrics),
+            name: String::new(),
+            version: String::new(),
+            label: String::new(),
+            ended: false,
+        };
+        (call, checked)
+    }
+}
+
+impl Origin {
+    pub fn checked(
+        field: &'static str,
+        frame_id: String,
+        stamp: Option<prost_types::Timestamp>,
+    ) -> Result<Self, Refusal> {
+        check_id(field, &frame_id)?;
+        Ok(Self { frame_id, stamp })
+    }
+}
+
+fn check_id(field: &'static str, id: &str) -> Result<(), FieldError> {
+    if id.len() <= MAX_ID {
+        return Ok(());
+    }
+    Err(FieldError::new(field, format_args!("{} bytes long", id.len()), format_args!("at most {MAX_ID} are taken")))
+}
+
+impl Call {
+    /// This planner will answer.
+    pub fn by(&mut self, engine: &Engine) {
+        self.label.clone_from(&engine.label);
+        engine.source.name().clone_into(&mut self.name);
+        engine.source.version().clone_into(&mut self.version);
+        self.span.record("model", &engine.label);
+    }
+
+    /// Queues what there is to look at; `fusion` of the time until now was spent on making it.
+    pub fn submit(
+        &self,
+        engine: &Engine,
+        scene: Scene,
+        asked: Asked,
+        origin: Origin,
+        fusion: Option<Duration>,
+    ) -> Result<Work, Refusal> {
+        let preprocessing = self.started.elapsed().saturating_sub(fusion.unwrap_or_default());
+        let reply = engine.detect(scene, asked.clone(), self.deadline, self.span.clone())?;
+        Ok(Work { reply, asked, preprocessing, fusion, origin })
+    }
+
+    /// Waits for the session, and says in the log and the metrics how it went.
+    pub async fn finish(mut self, work: Result<Work, Refusal>) -> Result<pb::DetectGraspsResponse, Refusal> {
+        let outcome = match work {
+            Ok(work) => self.reply(work).await,
+            Err(refusal) => Err(refusal),
+        };
+        match outcome {
+            Ok(response) => {
+                self.ended = true;
+                Ok(response)
+            }
+            Err(refusal) => Err(self.end(refusal)),
+        }
+    }
+
+    /// Waits for the maps of each volume, and says how it went. The times are those of the volume that took longest.
+    pub async fn maps(mut self, replies: Vec<Reply<Tensors>>) -> Result<(Vec<Tensors>, Timings), Refusal> {
+        let preprocessing = self.started.elapsed();
+        let mut maps = Vec::with_capacity(replies.len());
+        let mut timings = Timings { preprocessing, ..Timings::default() };
+        for reply in replies {
+            let Answer { made, queue, inference, postprocessing } = match reply.wait(self.deadline).await {
+                Ok(answer) => answer,
+                Err(error) => return Err(self.end(error.into())),
+            };
+            maps.push(made);
+            if queue + inference >= timings.queue + timings.inference {
+                timings = Timings { queue, inference, postprocessing, ..timings };
+            }
+        }
+        timings.total = self.started.elapsed();
+        self.answered(&timings, 0);
+        self.ended = true;
+        Ok((maps, timings))
+    }
+
+    /// It ends with a refusal.
+    pub fn end(mut self, refusal: Refusal) -> Refusal {
+        self.refused(&refusal);
+        self.ended = true;
+        refusal
+    }
+
+    /// The span of its log.
+    pub fn span(&self) -> Span {
+        self.span.clone()
+    }
+
+    async fn reply(&mut self, work: Work) -> Result<pb::DetectGraspsResponse, Refusal> {
+        let Work { reply, asked, preprocessing, fusion, origin } = work;
+        let Answer { made, queue, inference, postprocessing } = reply.wait(self.deadline).await?;
+        let Found { grasps, collides, dropped, over_limit } = made;
+
+        let grasps: Vec<_> = grasps
+            .iter()
+            .enumerate()
+            .map(|(index, grasp)| {
+                let [pose, pregrasp, retreat] = asked.poses(&grasp.pose).map(|pose| Some((&pose).into()));
+                let collides = collides.as_ref().map(|collides| collides[index]);
+                pb::Grasp { pose, width: grasp.width, quality: grasp.quality, pregrasp, retreat, collides }
+            })
+            .collect();
+        // At most one grasp per voxel.
+        let over_limit = over_limit as u32;
+        let dropped = (asked.explain || grasps.is_empty()).then(|| pb::Dropped { over_limit, ..(&dropped).into() });
+
+        let total = self.started.elapsed();
+        let timings = Timings { queue, preprocessing, fusion, inference, postprocessing, total };
+        self.answered(&timings, grasps.len());
+        Ok(pb::DetectGraspsResponse {
+            request_id: self.id.clone(),
+            frame_id: origin.frame_id,
+            stamp: origin.stamp,
+            grasps,
+            model: std::mem::take(&mut self.name),
+            version: std::mem::take(&mut self.version),
+            latency: Some((&timings).into()),
+            dropped,
+        })
+    }
+
+    fn answered(&self, timings: &Timings, grasps: usize) {
+        timings.record(&self.span);
+        self.metrics.answered(&self.label, timings, grasps);
+        self.span.in_scope(|| debug!(grasps, "answered"));
+    }
+
+    fn refused(&self, refusal: &Refusal) {
+        self.metrics.ended(&self.label, refusal.code());
+        self.span.in_scope(|| info!(code = ?refusal.code(), %refusal, "refused"));
+    }
+}
+
+impl Drop for Call {
+    fn drop(&mut self) {
+        if !self.ended {
+            let expired = self.deadline.is_some_and(|Deadline(deadline)| deadline <= Instant::now());
+            let code = if expired { Code::DeadlineExceeded } else { Code::Cancelled };
+            self.metrics.ended(&self.label, code);
+            self.span.in_scope(|| info!(?code, "the caller has gone"));
+        }
+    }
+}
+
+/// Ids for requests that bring none: the process's own number, then a counter.
+struct RequestIds {
+    process: u32,
+    next: AtomicU64,
+}
+
+impl RequestIds {
+    fn new() -> Self {
+        // The standard library's hashers are seeded by the system: randomness without another dependency.
+        Self { process: RandomState::new().hash_one(0) as u32, next: AtomicU64::new(1) }
+    }
+
+    fn next(&self) -> String {
+        format!("{:08x}-{}", self.process, self.next.fetch_add(1, Ordering::Relaxed))
+    }
+}

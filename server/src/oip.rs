@@ -1,0 +1,296 @@
+use std::sync::Arc;
+
+use grasp::Volume;
+use grasp_proto::FieldError;
+use grasp_proto::oip::grpc_inference_service_server::GrpcInferenceService;
+use grasp_proto::oip::model_infer_request::InferInputTensor;
+use grasp_proto::oip::model_infer_response::InferOutputTensor;
+use grasp_proto::oip::model_metadata_response::TensorMetadata;
+use grasp_proto::oip::{self, infer_parameter::ParameterChoice};
+use nalgebra::Isometry3;
+use prost::bytes::Bytes;
+use tonic::{Request, Response, Status};
+
+use crate::call::{Call, Calls};
+use crate::deadline::Deadline;
+use crate::engine::{Engine, Reply, Tensors};
+use crate::health::State;
+use crate::models::Models;
+use crate::refusal::Refusal;
+use crate::timings::Timings;
+
+/// What a network reads.
+const INPUT: &str = "tsdf";
+
+/// Its outputs with their channels.
+const OUTPUTS: [(&str, i64); 3] = [("quality", 1), ("rotation", 4), ("width", 1)];
+
+const FP32: &str = "FP32";
+
+/// The most volumes of one request.
+const MAX_BATCH: usize = 64;
+
+/// The Open Inference Protocol: a network's own input and output, for tools that know nothing of grasps.
+#[derive(Clone)]
+pub(crate) struct Inference {
+    models: Arc<Models>,
+    calls: Calls,
+}
+
+impl Inference {
+    pub fn new(models: Arc<Models>, calls: Calls) -> Self {
+        Self { models, calls }
+    }
+
+    fn is_ready(&self) -> bool {
+        *self.calls.state().borrow() == State::Ready
+    }
+
+    /// The network of that name; a planner without one has nothing to infer.
+    fn network(&self, name: &str, version: &str) -> Result<Arc<Engine>, Refusal> {
+        let wanted = || format!("{name} {version}").trim_end().to_owned();
+        let networks = || {
+            let served = self.models.now();
+            let names = served.iter().filter(|engine| engine.source.network().is_some());
+            names.map(|engine| engine.label.clone()).collect::<Vec<_>>().join(", ")
+        };
+        let unknown = || Refusal::UnknownModel { field: "model_name", wanted: wanted(), available: networks() };
+        if name.is_empty() {
+            return Err(unknown());
+        }
+        let engine = self.models.select(name, version, None).map_err(|_| unknown())?;
+        if engine.source.network().is_some() { Ok(engine) } else { Err(unknown()) }
+    }
+
+    /// Checks a request and queues each of its volumes.
+    fn submit(&self, request: &oip::ModelInferRequest, call: &mut Call) -> Result<Queued, Refusal> {
+        let engine = self.network(&request.model_name, &request.model_version)?;
+        call.by(&engine);
+        let network = engine.source.network().map(|entry| &entry.metadata);
+        let (n, voxel_size) = network.map_or((0, 0.0), |metadata| (metadata.resolution, metadata.voxel_size));
+        for output in &request.outputs {
+            if !OUTPUTS.iter().any(|(name, _)| *name == output.name) {
+                let needed = "the outputs are quality, rotation and width";
+                return Err(FieldError::new("outputs", format_args!("`{}`", output.name), needed).into());
+            }
+        }
+        let batch = batches(request, n)?;
+        let volume = |values: &[f32]| {
+            let volume = Volume::new(n, voxel_size, Isometry3::identity(), values.to_vec());
+            volume.map_err(|error| {
+                Refusal::from(FieldError { field: "inputs".into(), message: format!("inputs: {error}") })
+            })
+        };
+        let volumes = batch.chunks_exact(n.pow(3)).map(volume).collect::<Result<Vec<_>, _>>()?;
+        // If one finds no place, those before it leave theirs.
+        let replies = volumes.into_iter().map(|volume| engine.maps(volume, call.deadline, call.span()));
+        let replies = replies.collect::<Result<Vec<_>, _>>()?;
+        Ok(Queued { engine, replies })
+    }
+}
+
+/// The volumes of a request, on their way.
+struct Queued {
+    engine: Arc<Engine>,
+    replies: Vec<Reply<Tensors>>,
+}
+
+/// The values of the input, checked: `[batch, 1, n, n, n]`.
+fn batches(request: &oip::ModelInferRequest, n: usize) -> Result<Vec<f32>, FieldError> {
+    let [InferInputTensor { name, datatype, shape, contents, .. }] = &request.inputs[..] else {
+        let needed = format_args!("must have the one tensor `{INPUT}`");
+        return Err(FieldError::new("inputs", format_args!("a list of {}", request.inputs.len()), needed));
+    };
+    if name != INPUT {
+        return Err(FieldError::new("inputs[0].name", format_args!("`{name}`"), format_args!("must be `{INPUT}`")));
+    }
+    if datatype != FP32 {
+        return Err(FieldError::new("inputs[0].datatype", format_args!("`{datatype}`"), "must be FP32"));
+    }
+    let edge = n as i64;
+    let batch = match shape[..] {
+        [batch, 1, x, y, z] if [x, y, z] == [edge; 3] => usize::try_from(batch).unwrap_or(0),
+        _ => 0,
+    };
+    if !(1..=MAX_BATCH).contains(&batch) {
+        let needed = format_args!("must be [batch, 1, {n}, {n}, {n}] with a batch from 1 to {MAX_BATCH}");
+        return Err(FieldError::new("inputs[0].shape", format_args!("{shape:?}"), needed));
+    }
+    let expected = batch * n.pow(3);
+    let values: Vec<f32> = match (&request.raw_input_contents[..], contents) {
+        ([raw], None) if raw.len() % 4 == 0 => {
+            raw.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect()
+        }
+        ([raw], None) => {
+            let needed = format_args!("the shape needs {}", 4 * expected);
+            return Err(FieldError::new("raw_input_contents[0]", format_args!("{} bytes", raw.len()), needed));
+        }
+        ([], Some(contents)) => contents.fp32_contents.clone(),
+        (raw, contents) => {
+            let given = usize::from(contents.is_some());
+            let value = format_args!("a list of {}, beside {given} of contents", raw.len());
+            return Err(FieldError::new(
+                "raw_input_contents",
+                value,
+                "the tensor's values must come in one of the two",
+            ));
+        }
+    };
+    if values.len() == expected {
+        Ok(values)
+    } else {
+        Err(FieldError::new(
+            "inputs[0]",
+            format_args!("{} values", values.len()),
+            format_args!("the shape needs {expected}"),
+        ))
+    }
+}
+
+/// The volumes' maps one after the other, as one tensor for each output that was asked for.
+fn response(
+    request: oip::ModelInferRequest,
+    engine: &Engine,
+    maps: &[Tensors],
+    timings: &Timings,
+) -> oip::ModelInferResponse {
+    let n = edge(engine);
+    let mut outputs = Vec::new();
+    let mut raw_output_contents = Vec::new();
+    for (name, channels) in OUTPUTS {
+        if !request.outputs.is_empty() && !request.outputs.iter().any(|output| output.name == name) {
+            continue;
+        }
+        let part = |tensors: &Tensors| match name {
+            "quality" => tensors.quality.clone(),
+            "rotation" => tensors.rotation.clone(),
+            _ => tensors.width.clone(),
+        };
+        let shape = vec![maps.len() as i64, channels, n, n, n];
+        outputs.push(InferOutputTensor {
+            name: name.to_owned(),
+            datatype: FP32.to_owned(),
+            shape,
+            ..Default::default()
+        });
+        raw_output_contents.push(Bytes::from(maps.iter().flat_map(part).collect::<Vec<u8>>()));
+    }
+    let parameters = timings.stages().map(|(stage, seconds)| {
+        let parameter = oip::InferParameter { parameter_choice: Some(ParameterChoice::DoubleParam(seconds)) };
+        (format!("{stage}_seconds"), parameter)
+    });
+    oip::ModelInferResponse {
+        model_name: engine.source.name().to_owned(),
+        model_version: engine.source.version().to_owned(),
+        id: request.id,
+        parameters: parameters.collect(),
+        outputs,
+        raw_output_contents,
+    }
+}
+
+#[tonic::async_trait]
+impl GrpcInferenceService for Inference {
+    async fn server_live(
+        &self,
+        _: Request<oip::ServerLiveRequest>,
+    ) -> Result<Response<oip::ServerLiveResponse>, Status> {
+        Ok(Response::new(oip::ServerLiveResponse { live: true }))
+    }
+
+    async fn server_ready(
+        &self,
+        _: Request<oip::ServerReadyRequest>,
+    ) -> Result<Response<oip::ServerReadyResponse>, Status> {
+        Ok(Response::new(oip::ServerReadyResponse { ready: self.is_ready() }))
+    }
+
+    async fn model_ready(
+        &self,
+        request: Request<oip::ModelReadyRequest>,
+    ) -> Result<Response<oip::ModelReadyResponse>, Status> {
+        let oip::ModelReadyRequest { name, version } = request.into_inner();
+        let ready = self.is_ready() && self.network(&name, &version).is_ok();
+        Ok(Response::new(oip::ModelReadyResponse { ready }))
+    }
+
+    async fn server_metadata(
+        &self,
+        _: Request<oip::ServerMetadataRequest>,
+    ) -> Result<Response<oip::ServerMetadataResponse>, Status> {
+        Ok(Response::new(oip::ServerMetadataResponse {
+            name: env!("CARGO_PKG_NAME").to_owned(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            extensions: vec!["model_configuration".to_owned()],
+        }))
+    }
+
+    async fn model_metadata(
+        &self,
+        request: Request<oip::ModelMetadataRequest>,
+    ) -> Result<Response<oip::ModelMetadataResponse>, Status> {
+        let oip::ModelMetadataRequest { name, version } = request.into_inner();
+        let engine = self.network(&name, &version).map_err(|refusal| refusal.status(""))?;
+        let tensor = |name: &str, channels| {
+            let edge = edge(&engine);
+            let shape = vec![-1, channels, edge, edge, edge];
+            TensorMetadata { name: name.to_owned(), datatype: FP32.to_owned(), shape }
+        };
+        let served = self.models.now();
+        let versions = served.iter().filter(|other| other.source.name() == engine.source.name());
+        Ok(Response::new(oip::ModelMetadataResponse {
+            name: engine.source.name().to_owned(),
+            versions: versions.map(|engine| engine.source.version().to_owned()).collect(),
+            platform: PLATFORM.to_owned(),
+            inputs: vec![tensor(INPUT, 1)],
+            outputs: OUTPUTS.into_iter().map(|(name, channels)| tensor(name, channels)).collect(),
+        }))
+    }
+
+    async fn model_infer(
+        &self,
+        request: Request<oip::ModelInferRequest>,
+    ) -> Result<Response<oip::ModelInferResponse>, Status> {
+        let deadline: Option<Deadline> = request.extensions().get().copied();
+        let request = request.into_inner();
+        let (mut call, checked) = self.calls.open(request.id.clone(), deadline);
+        let id = call.id.clone();
+        let outcome = match checked.and_then(|()| self.submit(&request, &mut call)) {
+            Ok(Queued { engine, replies }) => call.maps(replies).await.map(|answer| (engine, answer)),
+            Err(refusal) => Err(call.end(refusal)),
+        };
+        let (engine, (maps, timings)) = outcome.map_err(|refusal| refusal.status(&id))?;
+        Ok(Response::new(response(request, &engine, &maps, &timings)))
+    }
+
+    async fn model_config(
+        &self,
+        request: Request<oip::ModelConfigRequest>,
+    ) -> Result<Response<oip::ModelConfigResponse>, Status> {
+        let oip::ModelConfigRequest { name, version } = request.into_inner();
+        let engine = self.network(&name, &version).map_err(|refusal| refusal.status(""))?;
+        let edge = edge(&engine);
+        let (data_type, dims) = (oip::DataType::TypeFp32.into(), |channels| vec![channels, edge, edge, edge]);
+        let output =
+            |(name, channels): (&str, i64)| oip::ModelOutput { name: name.to_owned(), data_type, dims: dims(channels) };
+        Ok(Response::new(oip::ModelConfigResponse {
+            config: Some(oip::ModelConfig {
+                name: engine.source.name().to_owned(),
+                platform: PLATFORM.to_owned(),
+                backend: "onnxruntime".to_owned(),
+                // At most, as the requests are bounded.
+                max_batch_size: MAX_BATCH as i32,
+                input: vec![oip::ModelInput { name: INPUT.to_owned(), data_type, dims: dims(1) }],
+                output: OUTPUTS.into_iter().map(output).collect(),
+            }),
+        }))
+    }
+}
+
+/// As Triton calls what runs ONNX files.
+const PLATFORM: &str = "onnxruntime_onnx";
+
+/// Voxels along an edge of what a network reads.
+fn edge(engine: &Engine) -> i64 {
+    engine.source.network().map_or(0, |entry| entry.metadata.resolution as i64)
+}

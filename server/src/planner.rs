@@ -1,0 +1,176 @@
+use std::cmp::Ordering;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::Context;
+use grasp::gpd::{Cloud, Image, Params, candidates, is_on_an_object, ranked, scored};
+use grasp::{DecodeParams, Decoded, Fusion, Grasp, Hand, SurfacePoint, Volume, select};
+use grasp_models::{Backend, Classifier, Entry, Network, Options};
+use grasp_proto::Asked;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+
+use crate::engine::EngineError;
+
+/// The height above the table below which no hand is sent, metres: the noise of a camera.
+const ABOVE_TABLE: f64 = 0.002;
+
+/// How much narrower than the hand's opening something must be, metres, that GPD closes on.
+const PLAY: f64 = 0.01;
+
+/// A success is the likelier.
+const GPD_THRESHOLD: f32 = 0.5;
+
+/// Its quality is a rank, and says nothing.
+const SHAF_THRESHOLD: f32 = 1e-6;
+
+/// What can be asked for by name, and what it is made from.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Source {
+    /// A network, from volumes to maps.
+    Network(Entry),
+    /// Places where the hand fits into a point cloud, scored by a classifier.
+    Gpd(Entry),
+    /// The highest of those places.
+    Shaf,
+}
+
+/// What a planner looks at.
+#[derive(Debug)]
+pub(crate) struct Scene {
+    /// What networks read, and what hands must not touch.
+    pub volume: Volume,
+    /// What was seen, in the volume's own frame, where that is known more finely than by the volume.
+    pub sights: Option<Vec<SurfacePoint>>,
+}
+
+/// A planner, ready to run. A thread has it for itself.
+pub(crate) enum Planner {
+    Network(Network),
+    Classical(Classical),
+}
+
+/// A planner on the point cloud.
+pub(crate) enum Classical {
+    Gpd(Classifier),
+    Shaf,
+}
+
+impl Source {
+    pub fn name(&self) -> &str {
+        match self {
+            Self::Network(entry) | Self::Gpd(entry) => &entry.metadata.name,
+            Self::Shaf => "shaf",
+        }
+    }
+
+    pub fn version(&self) -> &str {
+        match self {
+            Self::Network(entry) | Self::Gpd(entry) => &entry.metadata.version,
+            Self::Shaf => "1",
+        }
+    }
+
+    /// Of its file; empty if it has none.
+    pub fn sha256(&self) -> &str {
+        match self {
+            Self::Network(entry) | Self::Gpd(entry) => &entry.sha256,
+            Self::Shaf => "",
+        }
+    }
+
+    pub fn path(&self) -> Option<&Path> {
+        match self {
+            Self::Network(entry) | Self::Gpd(entry) => Some(&entry.path),
+            Self::Shaf => None,
+        }
+    }
+
+    pub fn provenance(&self) -> BTreeMap<String, String> {
+        match self {
+            Self::Network(entry) | Self::Gpd(entry) => entry.metadata.provenance.clone(),
+            Self::Shaf => [("method".to_owned(), "the highest place where the hand fits".to_owned())].into(),
+        }
+    }
+
+    /// What it says of the volumes that it reads, if it is a network.
+    pub fn network(&self) -> Option<&Entry> {
+        match self {
+            Self::Network(entry) => Some(entry),
+            Self::Gpd(_) | Self::Shaf => None,
+        }
+    }
+
+    /// Which of two versions of a name is the older.
+    pub fn by_version(&self, other: &Self) -> Ordering {
+        match (self, other) {
+            (Self::Network(one) | Self::Gpd(one), Self::Network(other) | Self::Gpd(other)) => one.by_version(other),
+            _ => Ordering::Equal,
+        }
+    }
+
+    /// How its grasps are chosen, unless a request says otherwise.
+    pub fn decode_params(&self) -> DecodeParams {
+        match self {
+            Self::Network(entry) => entry.metadata.decode_params(),
+            Self::Gpd(_) => Classical::above(GPD_THRESHOLD),
+            Self::Shaf => Classical::above(SHAF_THRESHOLD),
+        }
+    }
+
+    /// Loads as many as there are sessions.
+    pub fn load(&self, options: &Options, count: usize) -> anyhow::Result<(Vec<Planner>, Backend)> {
+        let classical = |load: &dyn Fn() -> anyhow::Result<Classical>| {
+            (0..count).map(|_| load().map(Planner::Classical)).collect::<anyhow::Result<Vec<_>>>()
+        };
+        Ok(match self {
+            Self::Network(entry) => {
+                let networks = Network::load_several(entry, options, count)?;
+                let backend = networks.first().context("at least one session is wanted")?.backend();
+                (networks.into_iter().map(Planner::Network).collect(), backend)
+            }
+            Self::Gpd(entry) => {
+                (classical(&|| Ok(Classical::Gpd(Classifier::load(&entry.path, options)?)))?, Backend::REFERENCE)
+            }
+            Self::Shaf => (classical(&|| Ok(Classical::Shaf))?, Backend::REFERENCE),
+        })
+    }
+}
+
+impl Classical {
+    /// How its grasps are chosen, unless a request says otherwise.
+    pub fn decode_params(&self) -> DecodeParams {
+        match self {
+            Self::Gpd(_) => Self::above(GPD_THRESHOLD),
+            Self::Shaf => Self::above(SHAF_THRESHOLD),
+        }
+    }
+
+    fn above(threshold: f32) -> DecodeParams {
+        DecodeParams { threshold, ..DecodeParams::default() }
+    }
+
+    /// Looks for places where the hand fits, the same ones whenever it is asked again.
+    pub fn plan(&mut self, scene: &Scene, asked: &Asked, params: &DecodeParams) -> Result<Decoded, EngineError> {
+        let volume = &scene.volume;
+        let size = volume.resolution() as f64 * volume.voxel_size();
+        let table = asked.table.unwrap_or(0.0);
+        let coarse = || Fusion::of(volume).surface();
+        let sights = scene.sights.as_ref().map_or_else(coarse, Clone::clone);
+        let cloud = Cloud::new(sights.into_iter().filter(|point| is_on_an_object(&point.position, size, table)));
+        let hand = asked.hand.unwrap_or(Hand::GPD);
+        let aperture = PLAY..=(2.0 * hand.half_opening() - PLAY);
+        let params_of_hands = Params { hand, aperture, ..Params::above(table + ABOVE_TABLE) };
+        let found = candidates(&cloud, &params_of_hands, &mut ChaCha8Rng::seed_from_u64(0));
+        let grasps = match self {
+            Self::Shaf => ranked(found),
+            Self::Gpd(classifier) => {
+                let images: Vec<Image> = found.iter().map(|candidate| Image::of(&cloud, candidate)).collect();
+                scored(&found, &classifier.score(&images)?)
+            }
+        };
+        let in_frame: Vec<Grasp> =
+            grasps.into_iter().map(|grasp| Grasp { pose: volume.pose() * grasp.pose, ..grasp }).collect();
+        Ok(select(&in_frame, volume, params))
+    }
+}

@@ -1,0 +1,134 @@
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use grasp::Fusion;
+use grasp_proto::{Asked, FieldError, MAX_VIEWS, Workspace, depth_view, pb};
+use nalgebra::Isometry3;
+use prometheus::IntGauge;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tonic::Status;
+
+use crate::call::Origin;
+use crate::engine::Engine;
+use crate::perceive::{Grid, eyes};
+use crate::planner::Scene;
+use crate::refusal::Refusal;
+
+/// How many volumes are kept for calls of TrackGrasps, and for how long without a view.
+pub(crate) struct Kept {
+    places: Arc<Semaphore>,
+    most: usize,
+    timeout: Duration,
+    gauge: IntGauge,
+}
+
+/// The place of one volume. Dropped, it is free.
+pub(crate) struct Place {
+    _permit: OwnedSemaphorePermit,
+    gauge: IntGauge,
+}
+
+impl Kept {
+    pub fn new(most: usize, timeout: Duration, gauge: IntGauge) -> Self {
+        Self { places: Arc::new(Semaphore::new(most)), most, timeout, gauge }
+    }
+
+    /// A place, if there is one.
+    pub fn place(&self) -> Result<Place, Status> {
+        let Ok(permit) = Arc::clone(&self.places).try_acquire_owned() else {
+            let message =
+                format!("{} volumes are kept already, no more are; end a stream, or raise --max-tracked", self.most);
+            return Err(Status::resource_exhausted(message));
+        };
+        self.gauge.inc();
+        Ok(Place { _permit: permit, gauge: self.gauge.clone() })
+    }
+
+    /// Returns when a volume has been kept for too long without a view.
+    pub async fn expired(&self) -> Status {
+        tokio::time::sleep(self.timeout).await;
+        Status::aborted(format!("no view came for {:?}: the volume is gone; open another stream", self.timeout))
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        self.gauge.dec();
+    }
+}
+
+/// A volume that grows from view to view.
+pub(crate) struct Track {
+    grid: Grid,
+    fusion: Fusion,
+    frame_from_task: Isometry3<f64>,
+    origin: Origin,
+    /// By the last request that asked for something.
+    pub asked: Asked,
+}
+
+/// What is looked at next, what was asked of it, whence it comes, and how long fusing took.
+type Fused = (Scene, Asked, Origin, Duration);
+
+impl Track {
+    /// Adds views to the volume, or to a new one where a workspace is given. What is wrong with a view leaves the volume
+    /// as the views before it made it.
+    pub fn integrate(
+        track: Option<Self>,
+        engine: &Engine,
+        asked: Asked,
+        workspace: Option<pb::Workspace>,
+        views: &[pb::DepthView],
+    ) -> (Option<Self>, Result<Fused, Refusal>) {
+        match (track, workspace) {
+            (None, None) => {
+                let missing = FieldError::new("workspace", "absent", "must be given in the first request of a stream");
+                (None, Err(missing.into()))
+            }
+            (Some(mut track), None) => {
+                let fused = track.add(engine, asked, views);
+                (Some(track), fused)
+            }
+            (track, Some(workspace)) => match Self::start(engine, &asked, workspace, views) {
+                Ok(mut track) => {
+                    let fused = track.add(engine, asked, views);
+                    (Some(track), fused)
+                }
+                Err(refusal) => (track, Err(refusal)),
+            },
+        }
+    }
+
+    fn start(
+        engine: &Engine,
+        asked: &Asked,
+        workspace: pb::Workspace,
+        views: &[pb::DepthView],
+    ) -> Result<Self, Refusal> {
+        let mut workspace = Workspace::try_from(workspace)?;
+        let origin = Origin::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
+        let frame_from_task = workspace.frame_from_task;
+        let views = converted(views, &frame_from_task)?;
+        let grid = Grid::of(&engine.source, &workspace, &eyes(&views))?;
+        Ok(Self { fusion: grid.fusion(), grid, frame_from_task, origin, asked: asked.clone() })
+    }
+
+    fn add(&mut self, engine: &Engine, asked: Asked, views: &[pb::DepthView]) -> Result<Fused, Refusal> {
+        let started = Instant::now();
+        self.grid.check(&engine.source)?;
+        let views = converted(views, &self.frame_from_task)?;
+        self.grid.integrate(&mut self.fusion, &views)?;
+        // Of a view long ago the volume has kept all there is.
+        let scene = self.grid.scene(&self.fusion, None)?;
+        self.asked = Asked { constraints: self.grid.within(asked.constraints), ..asked };
+        Ok((scene, self.asked.clone(), self.origin.clone(), started.elapsed()))
+    }
+}
+
+fn converted(views: &[pb::DepthView], frame_from_task: &Isometry3<f64>) -> Result<Vec<grasp::View>, FieldError> {
+    if views.len() > MAX_VIEWS {
+        let needed = format_args!("must have at most {MAX_VIEWS}");
+        return Err(FieldError::new("views", format_args!("a list of {}", views.len()), needed));
+    }
+    views.iter().enumerate().map(|(index, view)| depth_view(view, index, frame_from_task)).collect()
+}

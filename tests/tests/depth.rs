@@ -1,0 +1,307 @@
+//! Depth images and point clouds are answered as the volume that they make; what is wrong with them is told.
+
+use grasp::{DepthImage, Fusion, RESOLUTION as PAPERS, Volume, WORKSPACE_SIZE};
+use grasp_client::{
+    Asked, Client, CloudView, Depth, DepthView, Detection, Error, Extrinsics, Options, Proposal, Workspace,
+};
+use grasp_proto::pb;
+use grasp_tests::scene::{BLOCK, CAMERA, TABLE, camera, depth, view};
+use grasp_tests::{RESOLUTION, Server, TestModel};
+use nalgebra::{Isometry3, Point3, Vector3};
+use tonic::Code;
+
+fn low() -> Options {
+    Options { asked: Asked { threshold: Some(0.6), ..Asked::default() }, ..Options::default() }
+}
+
+fn asking(asked: Asked) -> Options {
+    Options { asked, ..Options::default() }
+}
+
+/// What the server should fuse.
+fn fused(cameras: &[Isometry3<f64>], resolution: usize, pose: Isometry3<f64>) -> Volume {
+    let mut fusion = Fusion::new(resolution, WORKSPACE_SIZE);
+    for camera in cameras {
+        fusion.integrate(&DepthImage::new(CAMERA, &depth(camera)).unwrap(), camera);
+    }
+    fusion.volume(pose).unwrap()
+}
+
+fn assert_same(got: &[Proposal], wanted: &[Proposal]) {
+    assert!(!wanted.is_empty() && got.len() == wanted.len(), "{} instead of {}", got.len(), wanted.len());
+    for (got, wanted) in got.iter().zip(wanted) {
+        assert!((got.pose.translation.vector - wanted.pose.translation.vector).norm() < 1e-9, "{got:?} {wanted:?}");
+        assert!((got.quality - wanted.quality).abs() < 1e-5, "{got:?} {wanted:?}");
+    }
+}
+
+fn assert_at_the_block(grasp: &Proposal) {
+    let between = grasp.pose * Point3::new(0.0, 0.0, 0.03);
+    let near = (0..3).all(|axis| (BLOCK[0][axis] - 0.03..=BLOCK[1][axis] + 0.03).contains(&between[axis]));
+    assert!(near, "{between} is not at the block");
+}
+
+fn refusal(outcome: Result<Detection, Error>) -> (Code, String) {
+    match outcome {
+        Err(Error::Refused { code, message, .. }) => (code, message),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[tokio::test]
+async fn depth_is_answered_like_the_volume_that_it_makes() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let client = server.client().await;
+    let pose = Isometry3::new(Vector3::new(0.4, -0.2, 1.1), Vector3::new(0.0, 0.0, 2.0));
+    let workspace = Workspace { pose, size: Some(0.3) };
+    let cameras = [camera(30.0, -90.0), camera(45.0, 60.0)];
+    let wanted = client.detect(&fused(&cameras, RESOLUTION, pose), low()).await.unwrap();
+
+    let metres = cameras.map(|camera| view(&camera));
+    let frame_id = "panda_link0".to_owned();
+    let options = Options { frame_id, ..low() };
+    let detection = client.detect_from_depth(&metres, &workspace, options).await.unwrap();
+    assert_same(&detection.grasps, &wanted.grasps);
+    assert_eq!((detection.frame_id.as_str(), detection.model.as_str()), ("panda_link0", "mirror"));
+    assert!(detection.latency.fusion > 0.0 && detection.latency.total > detection.latency.fusion);
+    let count = "graspd_stage_duration_seconds_count{model=\"mirror 1\",stage=\"fusion\"}";
+    assert_eq!(server.metric(count), 1.0, "a finished volume was not fused");
+
+    // As hand-eye calibration gives the poses, in the millimetres of a driver.
+    let millimetres = cameras.map(|camera| DepthView {
+        depth: Depth::Millimetres(depth(&camera).iter().map(|metres| (metres * 1e3).round() as u16).collect()),
+        extrinsics: Extrinsics::FrameFromCamera(pose * camera.inverse()),
+        ..view(&camera)
+    });
+    let rounded = client.detect_from_depth(&millimetres, &workspace, low()).await.unwrap();
+    let near = |a: &Proposal, b: &Proposal| (a.pose.translation.vector - b.pose.translation.vector).norm() < 0.02;
+    assert!(detection.grasps.iter().all(|grasp| rounded.grasps.iter().any(|other| near(grasp, other))));
+}
+
+#[tokio::test]
+async fn points_are_answered_like_the_depth_that_they_were_seen_in() {
+    let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS)], &[]);
+    let client = server.client().await;
+    let pose = camera(35.0, -60.0);
+    let image = depth(&pose);
+    let pixels = image.iter().enumerate().filter(|(_, depth)| **depth > 0.0).map(|(index, &depth)| {
+        let (u, v) = ((index % CAMERA.width) as f64, (index / CAMERA.width) as f64);
+        let z = f64::from(depth);
+        [(u - CAMERA.cx) / CAMERA.fx * z, (v - CAMERA.cy) / CAMERA.fy * z, z].map(|c| c as f32)
+    });
+    // In the camera's own frame, as a driver publishes them.
+    let cloud = CloudView {
+        points: pixels.chain([[f32::NAN; 3]]).collect(),
+        frame_from_cloud: pose.inverse(),
+        camera_position: [0.0; 3],
+    };
+    let network = client.detect_from_cloud(std::slice::from_ref(&cloud), &Workspace::default(), low()).await.unwrap();
+    assert!(!network.grasps.is_empty() && network.latency.fusion > 0.0);
+    let shaf = || asking(Asked { model: "shaf".to_owned(), ..Asked::default() });
+    let detection =
+        client.detect_from_cloud(std::slice::from_ref(&cloud), &Workspace::default(), shaf()).await.unwrap();
+    assert!(!detection.grasps.is_empty(), "{:?}", detection.dropped);
+    detection.grasps.iter().for_each(assert_at_the_block);
+
+    let inside = CloudView { camera_position: [0.0, 0.0, 0.6], ..cloud.clone() };
+    let (code, message) = refusal(client.detect_from_cloud(&[inside], &Workspace::default(), low()).await);
+    assert_eq!(code, Code::InvalidArgument);
+    assert!(message.starts_with("views[0] is blind from") && message.contains("camera_position"), "{message}");
+}
+
+#[tokio::test]
+async fn what_is_wrong_with_a_view_is_told() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let client = server.client().await;
+    let pose = camera(30.0, -90.0);
+    let good = || view(&pose);
+    let workspace = Workspace::default();
+    let refused = async |view: DepthView, begins: &str| {
+        let (code, message) = refusal(client.detect_from_depth(&[good(), view], &workspace, low()).await);
+        assert!(code == Code::InvalidArgument && message.starts_with(begins), "{code:?}: {message}");
+        assert!(client.detect_from_depth(&[good()], &workspace, low()).await.is_ok(), "the connection goes on");
+    };
+
+    let millimetres = depth(&pose).iter().map(|metres| metres * 1e3).collect();
+    refused(
+        DepthView { depth: Depth::Metres(millimetres), ..good() },
+        "views[1].data is in metres, with a median above 20, these look like millimetres",
+    )
+    .await;
+    let metres = depth(&pose).iter().map(|metres| metres.round() as u16).collect();
+    refused(
+        DepthView { depth: Depth::Millimetres(metres), ..good() },
+        "views[1].data is in millimetres, with a median below 20, these look like metres",
+    )
+    .await;
+    let behind = Extrinsics::CameraFromTask(Isometry3::translation(-0.15, -0.15, -1.0));
+    refused(DepthView { extrinsics: behind, ..good() }, "views[1] is blind, the workspace lies behind the camera")
+        .await;
+    let none = vec![f32::NAN; CAMERA.width * CAMERA.height];
+    refused(
+        DepthView { depth: Depth::Metres(none), ..good() },
+        "views[1] is blind, no pixel on the workspace has a depth",
+    )
+    .await;
+    let [fx, _, cx, _, fy, cy, ..] = good().k;
+    let transposed = [fx, 0.0, 0.0, 0.0, fy, 0.0, cx, cy, 1.0];
+    refused(DepthView { k: transposed, ..good() }, "views[1].camera.k is [135.0").await;
+    refused(DepthView { k: [0.0; 9], ..good() }, "views[1].camera.k is [0.0").await;
+    refused(DepthView { width: 161, ..good() }, "views[1].data is 76800 bytes, 161 × 120 pixels need").await;
+
+    let refused = async |views: &[DepthView], workspace: Workspace, begins: &str| {
+        let (code, message) = refusal(client.detect_from_depth(views, &workspace, low()).await);
+        assert!(code == Code::InvalidArgument && message.starts_with(begins), "{code:?}: {message}");
+    };
+    refused(&[], workspace, "views is a list of 0, must have from 1 to 64").await;
+    refused(
+        &[good()],
+        Workspace { size: Some(0.5), ..workspace },
+        "workspace.size is 0.5, the model mirror takes 0.3 m",
+    )
+    .await;
+    refused(&[good()], Workspace { size: Some(-1.0), ..workspace }, "workspace.size is -1, must be above 0").await;
+    // Above everything, in front of the camera.
+    let above = Workspace { pose: Isometry3::translation(0.0, 0.0, 0.25), size: None };
+    let hand_eye = Extrinsics::FrameFromCamera(pose.inverse());
+    let elsewhere = DepthView { extrinsics: hand_eye, ..good() };
+    refused(&[elsewhere], above, "views is a list of views, in none of which a surface lies in the workspace").await;
+}
+
+#[tokio::test]
+async fn planners_without_a_network_answer_by_their_names() {
+    let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS)], &[]);
+    let classifiers = server.models().join("classifiers");
+    std::fs::create_dir(&classifiers).unwrap();
+    let zoo = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo/classifiers/gpd.onnx");
+    std::fs::copy(zoo, classifiers.join("gpd.onnx")).unwrap();
+    server.reload().unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
+    let client = server.client().await;
+    let names: Vec<_> = client.list_models().await.unwrap().into_iter().map(|model| model.name).collect();
+    assert_eq!(names, ["mirror", "gpd", "shaf"], "a network is the default");
+
+    let cameras = [camera(30.0, -90.0), camera(40.0, 90.0)];
+    let views = cameras.map(|camera| view(&camera));
+    let volume = fused(&cameras, PAPERS, Isometry3::identity());
+    for planner in ["gpd", "shaf"] {
+        let options = || asking(Asked { model: planner.to_owned(), ..Asked::default() });
+        let seen = client.detect_from_depth(&views, &Workspace::default(), options()).await.unwrap();
+        assert!(!seen.grasps.is_empty() && seen.model == planner, "{planner}: {:?}", seen.dropped);
+        assert!(seen.grasps.is_sorted_by(|a, b| a.quality >= b.quality));
+        seen.grasps.iter().for_each(assert_at_the_block);
+        let again = client.detect_from_depth(&views, &Workspace::default(), options()).await.unwrap();
+        assert_same(&again.grasps, &seen.grasps);
+        // From the volume alone it is seen less finely, but seen.
+        let coarse = client.detect(&volume, options()).await.unwrap();
+        assert!(!coarse.grasps.is_empty(), "{planner}: {:?}", coarse.dropped);
+    }
+    let own =
+        pb::Gripper { max_opening: 0.03, finger_depth: 0.05, finger_width: 0.01, finger_breadth: 0.02, palm: None };
+    let asked = Asked { model: "shaf".to_owned(), gripper: Some(own), ..Asked::default() };
+    let narrow = client.detect_from_depth(&views, &Workspace::default(), asking(asked)).await.unwrap();
+    let widest = narrow.grasps.iter().map(|grasp| grasp.width).fold(0.0, f64::max);
+    assert!(widest <= 0.02, "a hand that opens to 3 cm takes nothing of {widest} m");
+}
+
+async fn asked_with(client: &Client, asked: Asked) -> Detection {
+    let views = [camera(30.0, -90.0), camera(40.0, 90.0)].map(|camera| view(&camera));
+    let asked = Asked { threshold: Some(0.6), ..asked };
+    client.detect_from_depth(&views, &Workspace::default(), asking(asked)).await.unwrap()
+}
+
+fn vector(x: f64, y: f64, z: f64) -> Option<pb::Vector3> {
+    Some(pb::Vector3 { x, y, z })
+}
+
+#[tokio::test]
+async fn what_is_asked_of_the_grasps_is_kept() {
+    // Straight down, half a turn about x.
+    let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS).rotation([1.0, 0.0, 0.0, 0.0])], &[]);
+    let client = server.client().await;
+    let all = asked_with(&client, Asked::default()).await.grasps;
+    let tips = |grasp: &Proposal| grasp.pose * Point3::new(0.0, 0.0, 0.05);
+
+    let region = pb::Box { min: vector(0.1, 0.0, 0.0), max: vector(0.2, 0.15, 0.3) };
+    let detection = asked_with(&client, Asked { region: Some(region), explain: true, ..Asked::default() }).await;
+    assert!(!detection.grasps.is_empty() && detection.grasps.len() < all.len());
+    assert!(detection.grasps.iter().all(|g| (0.1..=0.2).contains(&tips(g).x) && tips(g).y <= 0.15));
+    assert!(detection.dropped.unwrap().region > 0);
+
+    let cone = |z| Some(pb::Cone { axis: vector(0.0, 0.0, z), angle: 0.2 });
+    assert_same(&asked_with(&client, Asked { approach: cone(-3.0), ..Asked::default() }).await.grasps, &all);
+    let up = asked_with(&client, Asked { approach: cone(3.0), ..Asked::default() }).await;
+    assert!(up.grasps.is_empty() && up.dropped.is_some_and(|dropped| dropped.approach > 0), "an empty answer says why");
+
+    let high = asked_with(&client, Asked { min_height: Some(0.12), explain: true, ..Asked::default() }).await;
+    assert!(high.grasps.iter().all(|g| tips(g).z >= 0.1199) && high.dropped.unwrap().height > 0);
+
+    assert!(all.iter().all(|grasp| grasp.collides.is_none()), "nobody asked");
+}
+
+#[tokio::test]
+async fn hands_that_would_meet_something_are_marked_or_dropped() {
+    // Sideways, along x.
+    let half = std::f32::consts::FRAC_1_SQRT_2;
+    let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS).rotation([0.0, half, 0.0, half])], &[]);
+    let client = server.client().await;
+    // A hand without a palm, lest all of them meet the table.
+    let (max_opening, finger_depth, finger_width, finger_breadth) = (0.08, 0.05, 0.01, 0.02);
+    let gripper = Some(pb::Gripper { max_opening, finger_depth, finger_width, finger_breadth, palm: None });
+    let asked_with = async |client: &Client, asked| asked_with(client, Asked { gripper, ..asked }).await;
+    let all = asked_with(&client, Asked::default()).await.grasps;
+    let collision = |mode: i32| Some(pb::CollisionCheck { mode, table_height: None });
+    let flagged = asked_with(&client, Asked { collision: collision(1), ..Asked::default() }).await.grasps;
+    let filtered = asked_with(&client, Asked { collision: collision(2), explain: true, ..Asked::default() }).await;
+    assert_same(&flagged, &all);
+    let free: Vec<_> = flagged.iter().filter(|grasp| grasp.collides == Some(false)).copied().collect();
+    assert!(free.len() < flagged.len(), "hands in the block or the table");
+    assert_same(&filtered.grasps, &free);
+    assert_eq!(filtered.dropped.unwrap().collision as usize, flagged.len() - free.len());
+    assert!(free.iter().all(|grasp| grasp.pose.translation.z >= TABLE + 0.01), "none goes through the table");
+    let buried = Some(pb::CollisionCheck { mode: 1, table_height: Some(0.3) });
+    let buried = asked_with(&client, Asked { collision: buried, ..Asked::default() }).await.grasps;
+    assert!(buried.iter().all(|grasp| grasp.collides == Some(true)), "under a table");
+}
+
+#[tokio::test]
+async fn poses_are_told_as_the_robot_wants_them() {
+    let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS).rotation([1.0, 0.0, 0.0, 0.0])], &[]);
+    let client = server.client().await;
+    let own = asked_with(&client, Asked::default()).await.grasps;
+    let offset = |a: &Isometry3<f64>, b: &Isometry3<f64>| (a.inverse() * b).translation.vector;
+    for grasp in &own {
+        assert!((offset(&grasp.pose, &grasp.pregrasp) - Vector3::new(0.0, 0.0, -0.05)).norm() < 1e-9);
+        assert!((offset(&grasp.pose, &grasp.retreat) - Vector3::new(0.0, 0.0, -0.1)).norm() < 1e-9);
+    }
+
+    let asked = Asked {
+        convention: Some(pb::Convention { origin: 1, closing_axis: 1, parent_from_grasp: None }),
+        pregrasp_distance: Some(0.12),
+        retreat: Some(pb::Retreat { distance: 0.2, direction: vector(0.0, 0.0, 1.0) }),
+        ..Asked::default()
+    };
+    let told = asked_with(&client, asked).await.grasps;
+    for (own, told) in own.iter().zip(&told) {
+        assert!((offset(&own.pose, &told.pose) - Vector3::new(0.0, 0.0, 0.05)).norm() < 1e-9, "the fingertips");
+        let closing = own.pose.inverse() * (told.pose * Vector3::x());
+        assert!((closing - Vector3::y()).norm() < 1e-9, "what was y is x");
+        assert!((offset(&told.pose, &told.pregrasp) - Vector3::new(0.0, 0.0, -0.12)).norm() < 1e-9);
+        let lifted = told.retreat.translation.vector - told.pose.translation.vector;
+        assert!((lifted - Vector3::new(0.0, 0.0, 0.2)).norm() < 1e-9);
+    }
+
+    // Twice as long fingers stand further back, with their tips in the same place.
+    let gripper =
+        pb::Gripper { max_opening: 0.1, finger_depth: 0.1, finger_width: 0.01, finger_breadth: 0.02, palm: None };
+    let long = asked_with(&client, Asked { gripper: Some(gripper), ..Asked::default() }).await.grasps;
+    assert_eq!(long.len(), own.len());
+    for (own, long) in own.iter().zip(&long) {
+        assert!((offset(&own.pose, &long.pose) - Vector3::new(0.0, 0.0, -0.05)).norm() < 1e-9);
+    }
+    let bad = Asked { gripper: Some(pb::Gripper { max_opening: 85.0, ..gripper }), ..Asked::default() };
+    let views = [view(&camera(30.0, -90.0))];
+    let (code, message) = refusal(client.detect_from_depth(&views, &Workspace::default(), asking(bad)).await);
+    assert_eq!(code, Code::InvalidArgument);
+    assert_eq!(message, "options.gripper.max_opening is 85 m, must be above 0 and at most 0.5");
+}

@@ -1,0 +1,94 @@
+//! A volume that the server keeps from view to view.
+
+use grasp_client::{Asked, Detection, Error, Extrinsics, Options, Workspace};
+use grasp_proto::pb;
+use grasp_tests::scene::{camera, view};
+use grasp_tests::{Server, TestModel};
+use nalgebra::Isometry3;
+use tonic::Code;
+
+const TRACKED: &str = "graspd_tracked_volumes";
+
+fn low() -> Options {
+    Options { asked: Asked { threshold: Some(0.6), ..Asked::default() }, ..Options::default() }
+}
+
+fn code(outcome: Result<Detection, Error>) -> (Code, String) {
+    match outcome {
+        Err(Error::Refused { code, message, .. }) => (code, message),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[tokio::test]
+async fn each_view_is_added_to_those_before_it() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let client = server.client().await;
+    let pose = Isometry3::translation(0.4, 0.0, 0.2);
+    let workspace = Workspace { pose, size: None };
+    let views = [-90.0, 0.0, 90.0].map(|azimuth| view(&camera(40.0, azimuth)));
+
+    let mut tracking = client.track(workspace).await.unwrap();
+    for seen in 1..=views.len() {
+        let options = Options { frame_id: "base".to_owned(), ..low() };
+        let kept = tracking.add(&views[seen - 1..seen], options).await.unwrap();
+        let wanted = client.detect_from_depth(&views[..seen], &workspace, low()).await.unwrap();
+        let poses = |detection: &Detection| detection.grasps.iter().map(|grasp| grasp.pose).collect::<Vec<_>>();
+        assert!(!kept.grasps.is_empty());
+        assert_eq!(poses(&kept), poses(&wanted), "after {seen} views");
+        assert_eq!(kept.frame_id, "base");
+        assert_eq!(server.metric(TRACKED), 1.0);
+    }
+    // Looks once more, at nothing new, with other wishes.
+    let asked = Asked { max_grasps: 1, ..low().asked };
+    let one = tracking.add(&[], Options { asked, ..Options::default() }).await.unwrap();
+    assert_eq!(one.grasps.len(), 1);
+
+    drop(tracking);
+    server.wait_for(TRACKED, 0.0).await;
+}
+
+#[tokio::test]
+async fn a_bad_view_costs_neither_the_stream_nor_the_volume() {
+    let server = Server::run(&[TestModel::new("mirror"), TestModel::new("other").resolution(24)], &[]);
+    let client = server.client().await;
+    let good = view(&camera(40.0, -90.0));
+    let away = Extrinsics::CameraFromTask(Isometry3::translation(-0.15, -0.15, -1.0));
+    let bad = grasp_client::DepthView { extrinsics: away, ..good.clone() };
+
+    let mut tracking = client.track(Workspace::default()).await.unwrap();
+    let first = tracking.add(std::slice::from_ref(&good), low()).await.unwrap();
+    let (status, message) = code(tracking.add(&[bad], low()).await);
+    assert!(status == Code::InvalidArgument && message.starts_with("views[0] is blind"), "{message}");
+    let again = tracking.add(&[], low()).await.unwrap();
+    assert_eq!(again.grasps, first.grasps);
+    let other = Asked { model: "other".to_owned(), ..low().asked };
+    let (status, message) = code(tracking.add(&[], Options { asked: other, ..Options::default() }).await);
+    assert_eq!(status, Code::InvalidArgument);
+    assert!(message.starts_with("options.model is `other`, which reads another volume"), "{message}");
+    assert_eq!(tracking.add(&[], low()).await.unwrap().grasps, first.grasps);
+
+    // By hand: the library always sends a workspace first.
+    let request = pb::TrackGraspsRequest { views: vec![(&good).into()], ..Default::default() };
+    let replies = server.raw().await.track_grasps(tokio_stream::iter([request])).await.unwrap();
+    let reply = replies.into_inner().message().await.unwrap().unwrap();
+    let Some(pb::detect_grasps_stream_response::Outcome::Error(error)) = reply.outcome else { panic!("{reply:?}") };
+    assert_eq!(error.message, "workspace is absent, must be given in the first request of a stream");
+}
+
+#[tokio::test]
+async fn as_many_volumes_are_kept_as_were_allowed_and_none_for_ever() {
+    let server = Server::run(&[TestModel::new("mirror")], &["--max-tracked", "1", "--track-timeout", "0.3"]);
+    let client = server.client().await;
+    let views = [view(&camera(40.0, -90.0))];
+    let mut tracking = client.track(Workspace::default()).await.unwrap();
+    tracking.add(&views, low()).await.unwrap();
+    let refused = client.track(Workspace::default()).await.unwrap_err();
+    assert_eq!(refused.code(), Some(Code::ResourceExhausted), "{refused}");
+
+    server.wait_for(TRACKED, 0.0).await;
+    let (status, message) = code(tracking.add(&views, low()).await);
+    assert!(status == Code::Aborted && message.contains("no view came for 300ms"), "{message}");
+    let mut tracking = client.track(Workspace::default()).await.unwrap();
+    assert!(tracking.add(&views, low()).await.is_ok(), "its place is free again");
+}
