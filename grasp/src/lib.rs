@@ -30,7 +30,7 @@ pub use fusion::{Blind, DEPTH_MAX, Fusion, TRUNCATION_VOXELS};
 pub use grasp::{FINGER_DEPTH, Grasp, MAX_OPENING};
 pub use hand::{Hand, HandError};
 pub use obstacles::{Clearance, Obstacles};
-pub use surface::SurfacePoint;
+pub use surface::{SurfaceMesh, SurfacePoint};
 pub use volume::{Volume, VolumeError};
 
 /// Edge of the workspace cube, metres (the paper, section "Problem formulation").

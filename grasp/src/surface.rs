@@ -1,5 +1,7 @@
 use nalgebra::{Point3, Vector3};
 
+use std::collections::HashMap;
+
 use crate::Fusion;
 
 /// A point where the fused field crosses zero, with the outward normal. Cube frame, metres.
@@ -11,7 +13,83 @@ pub struct SurfacePoint {
     pub normal: Vector3<f64>,
 }
 
+/// The observed surface as triangles, counter-clockwise seen from free space. Cube frame, metres.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct SurfaceMesh {
+    /// Corners.
+    pub vertices: Vec<Point3<f64>>,
+    /// Three indices of corners for each triangle.
+    pub triangles: Vec<[u32; 3]>,
+}
+
 impl Fusion {
+    /// The observed surface, for people: a corner for each group of eight voxels that the field changes its sign within,
+    /// in the middle of where it does (surface nets: Gibson, "Constrained Elastic Surface Nets", MICCAI 1998). Only where
+    /// both ends of an edge were observed.
+    #[must_use]
+    pub fn mesh(&self) -> SurfaceMesh {
+        let n = self.resolution();
+        let index = |[x, y, z]: [usize; 3]| (x * n + y) * n + z;
+        let mut mesh = SurfaceMesh::default();
+        let mut corners = HashMap::new();
+        for cell in (0..(n - 1).pow(3)).map(|i| [i / (n - 1).pow(2), i / (n - 1) % (n - 1), i % (n - 1)]) {
+            if let Some(vertex) = self.corner(cell) {
+                corners.insert(cell, mesh.vertices.len() as u32);
+                mesh.vertices.push(vertex);
+            }
+        }
+        // Each edge between voxels of different signs is surrounded by four groups.
+        for at in (0..n.pow(3)).map(|i| [i / (n * n), i / n % n, i % n]) {
+            for axis in 0..3 {
+                let [u, v] = [(axis + 1) % 3, (axis + 2) % 3];
+                let mut next = at;
+                next[axis] += 1;
+                if next[axis] >= n || at[u] == 0 || at[v] == 0 {
+                    continue;
+                }
+                let (Some(here), Some(there)) = (self.near_surface(index(at)), self.near_surface(index(next))) else {
+                    continue;
+                };
+                if (here < 0.0) == (there < 0.0) {
+                    continue;
+                }
+                let around = [[0, 0], [1, 0], [1, 1], [0, 1]].map(|[du, dv]| {
+                    let mut cell = at;
+                    cell[u] -= du;
+                    cell[v] -= dv;
+                    corners.get(&cell).copied()
+                });
+                let [Some(a), Some(b), Some(c), Some(d)] = around else { continue };
+                // From inside to free space along the axis, or the other way.
+                let [b, d] = if here < 0.0 { [b, d] } else { [d, b] };
+                mesh.triangles.extend([[a, b, c], [a, c, d]]);
+            }
+        }
+        mesh
+    }
+
+    /// The middle of where the field changes its sign along the edges of a group of eight voxels.
+    fn corner(&self, cell: [usize; 3]) -> Option<Point3<f64>> {
+        let n = self.resolution();
+        let at = |corner: usize| [cell[0] + (corner >> 2), cell[1] + (corner >> 1 & 1), cell[2] + (corner & 1)];
+        let value = |corner: usize| {
+            let [x, y, z] = at(corner);
+            self.near_surface((x * n + y) * n + z).map(f64::from)
+        };
+        let (mut sum, mut count) = (Vector3::zeros(), 0.0);
+        let edges = (0..8).flat_map(|from| [1, 2, 4].map(|bit| (from, from | bit)));
+        for (from, to) in edges.filter(|(from, to)| from != to) {
+            let (Some(here), Some(there)) = (value(from), value(to)) else { continue };
+            if (here < 0.0) != (there < 0.0) {
+                let share = here / (here - there);
+                let [from, to] = [from, to].map(|corner| Vector3::from(at(corner).map(|c| c as f64 + 0.5)));
+                sum += from + (to - from) * share;
+                count += 1.0;
+            }
+        }
+        (count > 0.0).then(|| Point3::from(sum / count * self.voxel_size()))
+    }
+
     /// The observed surface: every zero crossing between neighbouring voxels, as in Open3D's `ExtractPointCloud`.
     #[must_use]
     pub fn surface(&self) -> Vec<SurfacePoint> {
@@ -54,5 +132,42 @@ impl Fusion {
             gradient[axis] = self.interpolate(&(point + offset)) - self.interpolate(&(point - offset));
         }
         gradient.try_normalize(1e-12)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Isometry3;
+
+    use super::*;
+    use crate::Volume;
+
+    /// The field of a ball of 0.05 m in the middle of the cube, seen from everywhere.
+    fn ball() -> Fusion {
+        let (n, size) = (40, 0.0075);
+        let value = |i: usize| {
+            let p = Point3::from([i / (n * n), i / n % n, i % n].map(|c| (c as f64 + 0.5) * size));
+            let distance = ((p - Point3::new(0.15, 0.15, 0.15)).norm() - 0.05) / 0.03;
+            if distance.abs() < 1.0 { (distance as f32 + 1.0) / 2.0 } else { 0.0 }
+        };
+        Fusion::of(&Volume::new(n, size, Isometry3::identity(), (0..n.pow(3)).map(value).collect()).unwrap())
+    }
+
+    #[test]
+    fn the_mesh_of_a_ball_is_a_ball() {
+        let SurfaceMesh { vertices, triangles } = ball().mesh();
+        let centre = Point3::new(0.15, 0.15, 0.15);
+        assert!(vertices.iter().all(|vertex| ((vertex - centre).norm() - 0.05).abs() < 0.001));
+        let corners = |triangle: &[u32; 3]| triangle.map(|corner| vertices[corner as usize]);
+        let mut area = 0.0;
+        for [a, b, c] in triangles.iter().map(corners) {
+            let normal = (b - a).cross(&(c - a)) / 2.0;
+            assert!(normal.dot(&(a - centre)) > 0.0, "towards free space");
+            area += normal.norm();
+        }
+        let wanted = 4.0 * std::f64::consts::PI * 0.05 * 0.05;
+        assert!((area / wanted - 1.0).abs() < 0.03, "{area} m² of {wanted}");
+        // Closed: twice as many triangles as corners, but for four.
+        assert_eq!(triangles.len(), 2 * (vertices.len() - 2));
     }
 }

@@ -15,6 +15,7 @@ use crate::engine::{Answer, Engine, Found, Reply, Tensors};
 use crate::health::State;
 use crate::metrics::Metrics;
 use crate::planner::Scene;
+use crate::recent::{Answered, Outcome, Recent};
 use crate::refusal::Refusal;
 use crate::timings::Timings;
 
@@ -28,6 +29,7 @@ const WARM_UP: Duration = Duration::from_secs(1);
 #[derive(Clone)]
 pub(crate) struct Calls {
     metrics: Arc<Metrics>,
+    recent: Arc<Recent>,
     state: watch::Receiver<State>,
     ids: Arc<RequestIds>,
 }
@@ -39,6 +41,7 @@ pub(crate) struct Call {
     started: Instant,
     span: Span,
     metrics: Arc<Metrics>,
+    recent: Arc<Recent>,
     name: String,
     version: String,
     /// The planner's, empty as long as none is chosen.
@@ -64,8 +67,8 @@ pub(crate) struct Origin {
 }
 
 impl Calls {
-    pub fn new(metrics: Arc<Metrics>, state: watch::Receiver<State>) -> Self {
-        Self { metrics, state, ids: Arc::new(RequestIds::new()) }
+    pub fn new(metrics: Arc<Metrics>, recent: Arc<Recent>, state: watch::Receiver<State>) -> Self {
+        Self { metrics, recent, state, ids: Arc::new(RequestIds::new()) }
     }
 
     /// Whether the server is starting, serving or draining.
@@ -101,6 +104,7 @@ impl Calls {
             started,
             span,
             metrics: Arc::clone(&self.metrics),
+            recent: Arc::clone(&self.recent),
             name: String::new(),
             version: String::new(),
             label: String::new(),
@@ -202,9 +206,9 @@ impl Call {
     async fn reply(&mut self, work: Work) -> Result<pb::DetectGraspsResponse, Refusal> {
         let Work { reply, asked, preprocessing, fusion, origin } = work;
         let Answer { made, queue, inference, postprocessing } = reply.wait(self.deadline).await?;
-        let Found { grasps, collides, dropped, over_limit } = made;
+        let Found { grasps: found, collides, dropped, over_limit, volume } = made;
 
-        let grasps: Vec<_> = grasps
+        let grasps: Vec<_> = found
             .iter()
             .enumerate()
             .map(|(index, grasp)| {
@@ -220,6 +224,8 @@ impl Call {
         let total = self.started.elapsed();
         let timings = Timings { queue, preprocessing, fusion, inference, postprocessing, total };
         self.answered(&timings, grasps.len());
+        let outcome = Outcome::Answered(Box::new(Answered { timings, volume, grasps: found, collides }));
+        self.recent.add(self.id.clone(), self.label.clone(), outcome);
         Ok(pb::DetectGraspsResponse {
             request_id: self.id.clone(),
             frame_id: origin.frame_id,
@@ -240,6 +246,8 @@ impl Call {
 
     fn refused(&self, refusal: &Refusal) {
         self.metrics.ended(&self.label, refusal.code());
+        let outcome = Outcome::Refused { code: refusal.code(), message: refusal.to_string() };
+        self.recent.add(self.id.clone(), self.label.clone(), outcome);
         self.span.in_scope(|| info!(code = ?refusal.code(), %refusal, "refused"));
     }
 }

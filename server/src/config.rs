@@ -51,10 +51,15 @@ pub(crate) struct Config {
     pub max_tracked: usize,
     /// For how long, without a view.
     pub track_timeout: Duration,
+    /// Requests that the page shows; none where there is no page.
+    pub recent: usize,
     pub drain_timeout: Duration,
     pub log: String,
     pub log_format: LogFormat,
 }
+
+/// Requests that the page shows, unless told otherwise: their volumes are 5 MB.
+const RECENT: usize = 20;
 
 /// How the log is written.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -158,6 +163,11 @@ struct Flags {
     )]
     track_timeout: String,
 
+    /// The latest requests that are kept to be looked at, with what was seen, on the page of the HTTP listener. 0 for no
+    /// page, which is also the default with --token-file: whoever reaches that listener sees it.
+    #[arg(long, env = "GRASPD_RECENT", value_name = "N")]
+    recent: Option<String>,
+
     /// How long a message may stand still in the middle, seconds.
     #[arg(
         long,
@@ -231,6 +241,10 @@ impl Config {
         let track_timeout = errors
             .parse("track-timeout", &flags.track_timeout, "a number of seconds, 0 or more")
             .map(|Seconds(duration)| duration);
+        let recent = match &flags.recent {
+            Some(recent) => errors.parse("recent", recent, "a whole number, 0 or more"),
+            None => Some(if flags.token_file.is_some() { 0 } else { RECENT }),
+        };
         let stall = errors
             .parse("stall-timeout", &flags.stall_timeout, "a number of seconds, 0 or more")
             .map(|Seconds(duration)| duration);
@@ -280,6 +294,7 @@ impl Config {
                 limits: Limits { message_bytes: max_message_bytes.map(NonZeroUsize::get)?, stall: stall? },
                 max_tracked: max_tracked?,
                 track_timeout: track_timeout?,
+                recent: recent?,
                 drain_timeout: drain_timeout?,
                 log: flags.log,
                 log_format: log_format?,

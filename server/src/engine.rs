@@ -84,6 +84,8 @@ pub(crate) struct Found {
     pub dropped: Dropped,
     /// How many more there are.
     pub over_limit: usize,
+    /// What was looked at.
+    pub volume: Volume,
 }
 
 /// A network's maps, as bytes: f32, little-endian.
@@ -335,7 +337,7 @@ fn infer(network: &mut Network, jobs: Vec<Job>, done: impl FnOnce(Duration, usiz
         match task {
             Task::Grasps(asked, reply) => answer(reply, submitted, taken, || {
                 let decoded = decode(&scene.volume, &output.maps(index), &asked.decode_params(own))?;
-                Ok(found(decoded, &scene.volume, &asked))
+                Ok(found(decoded, scene.volume, &asked))
             }),
             Task::Maps(reply) => answer(reply, submitted, taken, || Ok(tensors(output, index))),
         }
@@ -360,7 +362,7 @@ fn plan(classical: &mut Classical, jobs: Vec<Job>, done: impl FnOnce(Duration, u
         let _entered = span.enter();
         match (task, decoded) {
             (Task::Grasps(asked, reply), Ok(decoded)) => {
-                answer(reply, submitted, taken, || Ok(found(decoded, &scene.volume, &asked)));
+                answer(reply, submitted, taken, || Ok(found(decoded, scene.volume, &asked)));
             }
             (task, Err(error)) => {
                 error!(%error, "the session failed");
@@ -385,15 +387,15 @@ fn answer<T>(reply: Sender<T>, submitted: Instant, taken: Taken, make: impl FnOn
 }
 
 /// As many of the grasps as were asked for, and whether the hand would meet something there.
-fn found(decoded: Decoded, volume: &Volume, asked: &Asked) -> Found {
+fn found(decoded: Decoded, volume: Volume, asked: &Asked) -> Found {
     let Decoded { mut grasps, dropped } = decoded;
     let over_limit = grasps.len().saturating_sub(asked.max_grasps);
     grasps.truncate(asked.max_grasps);
     let collides = (asked.collision == Collision::Flag).then(|| {
-        let obstacles = Obstacles::observed(volume, asked.clearance());
+        let obstacles = Obstacles::observed(&volume, asked.clearance());
         grasps.iter().map(|grasp| obstacles.meet(&grasp.pose)).collect()
     });
-    Found { grasps, collides, dropped, over_limit }
+    Found { grasps, collides, dropped, over_limit, volume }
 }
 
 fn tensors(output: &Output, index: usize) -> Tensors {

@@ -1,28 +1,50 @@
+use std::convert::Infallible;
 use std::io;
 use std::sync::Arc;
 
-use axum::Router;
+use axum::extract::{Path, State as Shared};
 use axum::http::StatusCode;
 use axum::http::header::CONTENT_TYPE;
-use axum::response::IntoResponse;
+use axum::response::sse::{Event, KeepAlive, Sse};
+use axum::response::{Html, IntoResponse};
 use axum::routing::get;
+use axum::{Json, Router};
+use serde_json::{Value, json};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
+use tokio_stream::wrappers::WatchStream;
+use tokio_stream::{Stream, StreamExt};
 
 use crate::health::State;
 use crate::metrics::Metrics;
+use crate::models::Models;
+use crate::recent::Recent;
 
-/// What a machine asks over HTTP: Prometheus its metrics, an orchestrator whether to restart or to send requests.
-pub(crate) async fn serve(
-    listener: TcpListener,
-    metrics: Arc<Metrics>,
-    state: watch::Receiver<State>,
-) -> io::Result<()> {
-    let now = state.clone();
-    let app = Router::new()
+/// What the HTTP listener shows.
+#[derive(Clone)]
+pub(crate) struct Pages {
+    pub metrics: Arc<Metrics>,
+    pub models: Arc<Models>,
+    pub recent: Arc<Recent>,
+}
+
+/// What a machine asks over HTTP: Prometheus its metrics, an orchestrator whether to restart or to send requests. And a page
+/// for people, with what it reads.
+pub(crate) async fn serve(listener: TcpListener, pages: Pages, state: watch::Receiver<State>) -> io::Result<()> {
+    let (metrics, now) = (Arc::clone(&pages.metrics), state.clone());
+    let mut app = Router::new()
         .route("/metrics", get(async move || ([(CONTENT_TYPE, Metrics::CONTENT_TYPE)], metrics.render(*now.borrow()))))
         .route("/healthz", get("ok\n"))
         .route("/readyz", get(async move || readiness(*state.borrow())));
+    if pages.recent.is_kept() {
+        let page = Router::new()
+            .route("/", get(Html(include_str!("page.html"))))
+            .route("/api/requests", get(requests))
+            .route("/api/requests/{number}", get(request))
+            .route("/api/models", get(models))
+            .route("/api/events", get(events));
+        app = app.merge(page.with_state(pages));
+    }
     axum::serve(listener, app).await
 }
 
@@ -32,4 +54,33 @@ fn readiness(state: State) -> impl IntoResponse {
         State::Ready => (StatusCode::OK, "ready\n"),
         State::Draining => (StatusCode::SERVICE_UNAVAILABLE, "draining\n"),
     }
+}
+
+/// The latest requests in short, the last one first.
+async fn requests(Shared(pages): Shared<Pages>) -> Json<Value> {
+    Json(pages.recent.list())
+}
+
+/// One of them, with the observed surface and the grasps.
+async fn request(Path(number): Path<u64>, Shared(pages): Shared<Pages>) -> Result<Json<Value>, StatusCode> {
+    pages.recent.get(number).map(Json).ok_or(StatusCode::NOT_FOUND)
+}
+
+/// What is served, and what runs it.
+async fn models(Shared(pages): Shared<Pages>) -> Json<Value> {
+    let model = |engine: &Arc<crate::engine::Engine>| {
+        json!({
+            "name": engine.source.name(),
+            "version": engine.source.version(),
+            "provider": engine.backend.provider.to_string(),
+            "precision": engine.backend.precision.to_string(),
+        })
+    };
+    Json(pages.models.now().iter().map(model).collect())
+}
+
+/// The number of the last request, whenever there is another.
+async fn events(Shared(pages): Shared<Pages>) -> Sse<impl Stream<Item = Result<Event, Infallible>>> {
+    let numbers = WatchStream::new(pages.recent.last());
+    Sse::new(numbers.map(|number| Ok(Event::default().data(number.to_string())))).keep_alive(KeepAlive::default())
 }

@@ -12,7 +12,7 @@ use rand_distr::{Distribution, Gamma, Normal};
 
 use crate::TABLE_HEIGHT;
 use crate::physics::World;
-use crate::raster::{Instance, render};
+use grasp_picture::{Instance, render};
 
 /// Nearest depth that is seen, metres.
 const NEAR: f64 = 0.1;

@@ -15,8 +15,10 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use clap::{Args, Parser, ValueEnum};
+use grasp_picture::{Picture, object_color};
 use grasp_sim::camera::Views;
 use grasp_sim::objects::{ObjectSet, Split};
+use grasp_sim::physics::World;
 use grasp_sim::scene::SceneKind;
 
 /// Simulated clutter for grasp detection: scenes, labels, benchmarks.
@@ -160,6 +162,14 @@ fn parse_views(text: &str) -> Option<Views> {
         }
         _ => None,
     }
+}
+
+/// Adds the objects of a scene to a picture, each in its colour.
+fn show<'a>(picture: &'a mut Picture, world: &World) -> &'a mut Picture {
+    for (index, body) in world.objects().iter().enumerate() {
+        picture.mesh(&body.object.visual, &world.pose(body.id), body.scale, object_color(index));
+    }
+    picture
 }
 
 #[cfg(test)]

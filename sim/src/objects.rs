@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use rand::{Rng, RngExt};
 
-use crate::mesh::Mesh;
+use grasp_picture::Mesh;
 pub use urdf::ObjectError;
 
 /// A rigid object. Its frame has z up in the pose in which it best stands on a table.

@@ -3,9 +3,9 @@
 use std::sync::Arc;
 
 use grasp::Intrinsics;
+use grasp_picture::Mesh;
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::camera::{Views, add_noise, look};
-use grasp_sim::mesh::Mesh;
 use grasp_sim::objects::Object;
 use grasp_sim::physics::World;
 use nalgebra::{Isometry3, Point3, Vector3};

@@ -3,10 +3,11 @@
 use std::f64::consts::PI;
 use std::sync::Arc;
 
+use grasp_picture::Mesh;
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::camera::Views;
+use grasp_sim::hull::convex_hull;
 use grasp_sim::label::{LabelledScene, Recipe};
-use grasp_sim::mesh::Mesh;
 use grasp_sim::objects::{Object, ObjectSet, Split};
 use grasp_sim::physics::{Gripper, HandBox, STEPS_PER_SECOND, World};
 use grasp_sim::scene::{SceneKind, generate, is_at_rest};
@@ -80,7 +81,7 @@ fn outlines_of_hulls_and_cylinders_are_those_of_their_meshes() {
     let cloud: Vec<Point3<f64>> =
         (0..40).map(|_| Point3::from(Vector3::from_fn(|_, _| rng.random_range(-0.03..0.03)))).collect();
     let along_x = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), PI / 2.0);
-    for mesh in [Mesh::convex_hull(&cloud).unwrap(), Mesh::cylinder(0.02, 0.08, 48)] {
+    for mesh in [convex_hull(&cloud).unwrap(), Mesh::cylinder(0.02, 0.08, 48)] {
         let tilted = Isometry3::new(Vector3::new(0.15, 0.15, 0.2), Vector3::new(0.4, 0.7, -0.3));
         let mut world = World::new();
         let object =

@@ -44,6 +44,14 @@ fn prometheus_sees_what_the_dashboard_shows_seen_from_python() {
 }
 
 #[test]
+fn a_client_in_cpp_is_built_and_gets_grasps_seen_from_python() {
+    // GRASPD_CPP is the environment's.
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo");
+    let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.as_os_str())];
+    run("test_cpp.py", &environment, "test_the_grasps_are_at_the_block");
+}
+
+#[test]
 fn python_reads_and_writes_our_data() {
     run("test_data.py", &[("GRASP_SIM", grasp_sim().as_os_str())], "test_processed_data_load_with_pandas");
 }

@@ -8,14 +8,14 @@ use anyhow::Context;
 use clap::{Args, ValueEnum};
 use grasp::{Clearance, DecodeParams, Grasp};
 use grasp_models::{Choice, Options, Precision, Provider};
+use grasp_picture::{Picture, quality_color, save_sheet};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::{Benchmark, Event};
-use grasp_sim::picture::{Picture, quality_color, save_sheet};
 use grasp_sim::planner::PlannerSpec;
 use grasp_sim::score::{Spread, Summary};
 use indicatif::ProgressBar;
 
-use super::SceneArgs;
+use super::{SceneArgs, show};
 
 /// The scenes depend on the seed alone, so every planner meets the same ones.
 #[derive(Args)]
@@ -272,7 +272,7 @@ impl<'a> Watcher<'a> {
         let picture = || {
             let color = if attempt.outcome.is_success() { quality_color(1.0) } else { quality_color(0.0) };
             let mut picture = Picture::of_workspace(480, 360, TABLE_HEIGHT);
-            picture.scene(before).hand(&attempt.grasp.pose, attempt.grasp.width, color);
+            show(&mut picture, before).hand(&attempt.grasp.pose, attempt.grasp.width, color);
             for grasp in proposals.iter().skip(1) {
                 picture.gripper(&grasp.pose, grasp.width, quality_color(f64::from(grasp.quality)));
             }

@@ -5,15 +5,15 @@ use clap::Args;
 use comfy_table::{CellAlignment, Table, presets};
 use grasp::Intrinsics;
 use grasp_client::{Asked, Client, Depth, DepthView, Detection, Extrinsics, LocalServer, Options, Workspace};
+use grasp_picture::{Picture, quality_color};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
 use grasp_sim::camera::View;
 use grasp_sim::physics::World;
-use grasp_sim::picture::{Picture, quality_color};
 use grasp_sim::trial::{Outcome, execute};
 use nalgebra::{UnitQuaternion, Vector3};
 
-use super::SceneArgs;
+use super::{SceneArgs, show};
 
 /// Rows of the table of grasps.
 const SHOWN: usize = 8;
@@ -144,7 +144,7 @@ fn angle_off_vertical(rotation: &UnitQuaternion<f64>) -> f64 {
 /// The scene, every proposal coloured by its quality, and the one that was executed as a solid hand.
 fn draw(world: &World, detection: &Detection) -> Picture {
     let mut picture = Picture::of_workspace(1200, 900, TABLE_HEIGHT);
-    picture.scene(world);
+    show(&mut picture, world);
     for (index, grasp) in detection.grasps.iter().enumerate() {
         let color = quality_color(f64::from(grasp.quality));
         if index == 0 {

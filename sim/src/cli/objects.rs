@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use clap::Args;
+use grasp_picture::{Picture, object_color};
 use grasp_sim::objects::Object;
-use grasp_sim::picture::{Picture, object_color};
 use nalgebra::{Isometry3, Point3};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;

@@ -14,8 +14,8 @@ mod toys;
 use std::ops::Range;
 
 use super::{Object, Split};
-use crate::mesh::Mesh;
 use dice::Dice;
+use grasp_picture::Mesh;
 use shape::Shape;
 
 /// Friction of everything, that of the public grasping sets.

@@ -13,7 +13,8 @@ use roxmltree::{Document, Node};
 use thiserror::Error;
 
 use super::Object;
-use crate::mesh::Mesh;
+use crate::hull::convex_hull;
+use grasp_picture::Mesh;
 
 /// PyBullet's friction for a link that states none.
 const DEFAULT_FRICTION: f64 = 0.5;
@@ -127,7 +128,7 @@ pub(super) fn load(path: &Path) -> Result<Object, ObjectError> {
     let mut parts = Vec::new();
     for collision in children(link, "collision") {
         // Decompositions leave slivers without volume; they hold nothing up.
-        parts.extend(urdf.geometry(collision)?.iter().filter_map(|mesh| Mesh::convex_hull(&mesh.vertices)));
+        parts.extend(urdf.geometry(collision)?.iter().filter_map(|mesh| convex_hull(&mesh.vertices)));
     }
     if parts.is_empty() {
         return Err(urdf.wrong("has no <collision> shape that encloses a volume"));

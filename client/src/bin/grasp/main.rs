@@ -1,20 +1,32 @@
 //! The command line of graspd.
 
-mod file;
+mod export;
+mod record;
+mod scene;
 mod show;
+mod view;
+mod volume;
+mod wishes;
 
 use std::fs;
+use std::io::{self, IsTerminal};
 use std::path::PathBuf;
+use std::pin::pin;
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant, SystemTime};
 
 use anyhow::{Context, anyhow};
 use clap::{Args, Parser, Subcommand};
 use grasp_client::{
-    Access, Arrivals, Asked, Certificate, Client, Health, Identity, Options, Retry, Token, Until, load,
+    Access, Arrivals, Certificate, Client, Detection, Health, Identity, Options, Retry, Token, Until, load,
 };
+use indicatif::{ProgressBar, ProgressStyle};
 use tonic::Code;
+
+use crate::scene::SceneArgs;
+use crate::view::ViewArgs;
+use crate::wishes::WishArgs;
 
 /// Asks a graspd for grasps.
 #[derive(Parser)]
@@ -56,57 +68,77 @@ struct AccessArgs {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Finds the grasps in a volume.
+    /// Finds the grasps in a volume or in depth images.
     Detect(Detect),
-    /// Asks for the grasps in a volume many times, and says how long that took.
+    /// Finds them again whenever one of the files changes, until it is stopped.
+    Watch(Watch),
+    /// Draws them, or records them for Foxglove and Rerun.
+    View(View),
+    /// Asks for the grasps many times, and says how long that took.
     Bench(Bench),
-    /// Lists the models that are loaded.
+    /// Lists what can be asked for by name.
     Models,
     /// Says whether the server is ready; the exit status is 1 when it is not.
     Health,
 }
 
 #[derive(Args)]
-struct Volume {
-    /// A .npy file, or a .npz file with one array or one called `grid`: N×N×N values in [0, 1] (u8: 0 to 255), indexed
-    /// x, y, z, 0.5 on the surface and 0 where nothing was observed.
-    file: PathBuf,
+struct Detect {
+    #[command(flatten)]
+    scene: SceneArgs,
 
-    /// Edge of a voxel, metres. By default that of a cube of 0.3 m.
-    #[arg(long, value_name = "METRES")]
-    voxel_size: Option<f64>,
+    #[command(flatten)]
+    wishes: WishArgs,
 
-    /// Which model answers. By default the server chooses.
-    #[arg(long, default_value = "", hide_default_value = true)]
-    model: String,
+    /// Also write them as a table with commas.
+    #[arg(long, value_name = "FILE")]
+    csv: Option<PathBuf>,
 
-    /// Which version of it. By default the newest.
-    #[arg(long, default_value = "", hide_default_value = true)]
-    version: String,
+    /// Also write them as a list of moveit_msgs/Grasp, YAML.
+    #[arg(long, value_name = "FILE")]
+    moveit: Option<PathBuf>,
+
+    /// Also write them as isaac_grasp, YAML.
+    #[arg(long, value_name = "FILE")]
+    isaac: Option<PathBuf>,
 }
 
 #[derive(Args)]
-struct Detect {
+struct Watch {
     #[command(flatten)]
-    volume: Volume,
+    scene: SceneArgs,
 
-    /// Smallest quality of a grasp, above 0 and at most 1. By default the model's own.
-    #[arg(long)]
-    threshold: Option<f32>,
+    #[command(flatten)]
+    wishes: WishArgs,
 
-    /// At most this many grasps, the best. 0 for all.
-    #[arg(long, default_value_t = 0)]
-    max_grasps: u32,
+    /// How often it is looked whether a file has changed, seconds.
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.1, value_parser = positive)]
+    every: f64,
 
-    /// Also say why the other voxels hold no grasp.
-    #[arg(long)]
-    explain: bool,
+    /// How many answers are enough. By default none are.
+    #[arg(long, value_name = "N")]
+    count: Option<u64>,
+}
+
+#[derive(Args)]
+struct View {
+    #[command(flatten)]
+    scene: SceneArgs,
+
+    #[command(flatten)]
+    wishes: WishArgs,
+
+    #[command(flatten)]
+    view: ViewArgs,
 }
 
 #[derive(Args)]
 struct Bench {
     #[command(flatten)]
-    volume: Volume,
+    scene: SceneArgs,
+
+    #[command(flatten)]
+    wishes: WishArgs,
 
     /// How many ask at the same time, each again as soon as there is an answer.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..), conflicts_with = "rate")]
@@ -154,45 +186,82 @@ async fn main() -> ExitCode {
     }
 }
 
+fn options(scene: &SceneArgs, wishes: &WishArgs) -> Options {
+    Options { asked: wishes.asked(), frame_id: scene.frame_id(), stamp: Some(SystemTime::now()), ..Options::default() }
+}
+
 async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitCode> {
+    let connect = async || anyhow::Ok(Client::connect_with(server.clone(), access.read()?).await?);
+    let print = |detection: &Detection| {
+        println!("{}", if json { show::detection_json(detection) } else { show::detection(detection) });
+    };
     match command {
-        Command::Detect(args) => {
-            // The file first: a mistake in it needs no server to be found.
-            let Detect { volume: Volume { file, voxel_size, model, version }, .. } = args;
-            let volume = file::read(&file, voxel_size)?;
-            let (threshold, max_grasps, explain) = (args.threshold, args.max_grasps, args.explain);
-            let asked = Asked { model, version, threshold, max_grasps, explain, ..Asked::default() };
-            let options = Options { asked, ..Options::default() };
-            let detection = Client::connect_with(server, access.read()?).await?.detect(&volume, options).await?;
-            println!("{}", if json { show::detection_json(&detection) } else { show::detection(&detection) });
+        Command::Detect(Detect { scene: args, wishes, csv, moveit, isaac }) => {
+            // The files first: a mistake in them needs no server to be found.
+            let scene = args.read()?;
+            let detection = scene.detect(&connect().await?, options(&args, &wishes)).await?;
+            print(&detection);
+            let write = |path: Option<PathBuf>, text: fn(&Detection) -> String| match path {
+                Some(path) => fs::write(&path, text(&detection)).with_context(|| path.display().to_string()),
+                None => Ok(()),
+            };
+            write(csv, export::csv)?;
+            write(moveit, export::moveit)?;
+            write(isaac, export::isaac)?;
         }
-        Command::Bench(Bench { volume: Volume { file, voxel_size, model, version }, callers, rate, seconds }) => {
-            let volume = Arc::new(file::read(&file, voxel_size)?);
-            let asked = Asked { model, version, ..Asked::default() };
-            let options = Options { asked, ..Options::default() };
+        Command::Watch(Watch { scene: args, wishes, every, count }) => {
+            let client = connect().await?;
+            let stamps =
+                || args.files().iter().map(|path| fs::metadata(path)?.modified()).collect::<io::Result<Vec<_>>>();
+            let (mut seen, mut answers) = (None, 0);
+            while count.is_none_or(|count| answers < count) {
+                // A file that is not there, or not whole yet, will be.
+                let now = stamps().ok();
+                if now.is_some() && now != seen {
+                    match args.read() {
+                        Ok(scene) => {
+                            print(&scene.detect(&client, options(&args, &wishes)).await?);
+                            answers += 1;
+                        }
+                        Err(error) => eprintln!("grasp: {error:#}; waiting for it to change"),
+                    }
+                    seen = now;
+                }
+                tokio::time::sleep(Duration::from_secs_f64(every)).await;
+            }
+        }
+        Command::View(View { scene: args, wishes, view }) => {
+            let scene = args.read()?;
+            let detection = scene.detect(&connect().await?, options(&args, &wishes)).await?;
+            let path = view.write(&scene.volume()?, &detection)?;
+            println!("{} grasps in {}", detection.grasps.len(), path.display());
+        }
+        Command::Bench(Bench { scene: args, wishes, callers, rate, seconds }) => {
+            let scene = Arc::new(args.read()?);
+            let options = options(&args, &wishes);
             // What is refused is to be seen, not to be tried again.
             let access = Access { retry: Retry::NONE, ..access.read()? };
             let client = Client::connect_with(server, access).await?;
             // A mistake in the request is told at once, as the error that it is.
-            client.detect(&volume, options.clone()).await?;
+            scene.detect(&client, options.clone()).await?;
             let arrivals = rate.map_or(Arrivals::Callers(callers.into()), Arrivals::Rate);
             let until = Until::Elapsed(Duration::from_secs_f64(seconds));
             let report = load(arrivals, until, move |_| {
-                let (client, volume, options) = (client.clone(), Arc::clone(&volume), options.clone());
+                let (client, scene, options) = (client.clone(), Arc::clone(&scene), options.clone());
                 async move {
-                    let detection = client.detect(&volume, options).await;
+                    let detection = scene.detect(&client, options).await;
                     detection.map(drop).map_err(|error| error.code().unwrap_or(Code::Unknown))
                 }
             });
-            let report = report.await;
+            let report = with_progress(seconds, !json, report).await;
             println!("{}", if json { show::report_json(&report) } else { show::report(&report) });
         }
         Command::Models => {
-            let models = Client::connect_with(server, access.read()?).await?.list_models().await?;
+            let models = connect().await?.list_models().await?;
             println!("{}", if json { show::models_json(&models) } else { show::models(&models) });
         }
         Command::Health => {
-            let serving = Client::connect_with(server, access.read()?).await?.health().await? == Health::Serving;
+            let serving = connect().await?.health().await? == Health::Serving;
             println!("{}", if json { show::health_json(serving) } else { show::health(serving) });
             if !serving {
                 return Ok(ExitCode::FAILURE);
@@ -200,4 +269,26 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
         }
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// Shows on a terminal how much of the time is over.
+async fn with_progress<T>(seconds: f64, shown: bool, work: impl Future<Output = T>) -> T {
+    if !shown || !io::stderr().is_terminal() {
+        return work.await;
+    }
+    let started = Instant::now();
+    let bar = ProgressBar::new((seconds * 10.0) as u64).with_style(
+        ProgressStyle::with_template("{wide_bar} {eta} left").unwrap_or_else(|_| ProgressStyle::default_bar()),
+    );
+    let mut work = pin!(work);
+    let mut tick = tokio::time::interval(Duration::from_millis(100));
+    loop {
+        tokio::select! {
+            done = &mut work => {
+                bar.finish_and_clear();
+                return done;
+            }
+            _ = tick.tick() => bar.set_position((started.elapsed().as_secs_f64() * 10.0) as u64),
+        }
+    }
 }

@@ -36,6 +36,9 @@ pub(crate) fn detection_json(detection: &Detection) -> String {
             "position": position.as_slice(),
             "orientation_xyzw": rotation.as_slice(),
             "width": grasp.width,
+            "pregrasp_position": grasp.pregrasp.translation.vector.as_slice(),
+            "retreat_position": grasp.retreat.translation.vector.as_slice(),
+            "collides": grasp.collides,
         })
     });
     let object =

@@ -6,7 +6,8 @@ use std::f64::consts::TAU;
 
 use nalgebra::{Isometry3, Point3, Rotation3, Vector3};
 
-use crate::mesh::Mesh;
+use crate::hull::convex_hull;
+use grasp_picture::Mesh;
 
 /// The most vertices of a part: the physics looks through all of them at every contact.
 const MOST_VERTICES: usize = 64;
@@ -21,7 +22,7 @@ impl Shape {
     /// The convex hull of points; nothing where they span no volume.
     pub(super) fn hull(points: impl IntoIterator<Item = Point3<f64>>) -> Shape {
         let points: Vec<_> = points.into_iter().collect();
-        Shape { parts: Mesh::convex_hull(&points).into_iter().collect() }
+        Shape { parts: convex_hull(&points).into_iter().collect() }
     }
 
     /// Both solids.

@@ -15,7 +15,6 @@ use rayon::prelude::*;
 use thiserror::Error;
 
 use crate::mesh::Mesh;
-use crate::physics::World;
 use crate::raster::{Instance, View};
 
 /// Subpixels along each side of a pixel.
@@ -125,14 +124,6 @@ impl Picture {
     /// Adds the table, an endless plane at `height` (task frame, metres).
     pub fn table(&mut self, height: f64) -> &mut Self {
         self.table = Some(height);
-        self
-    }
-
-    /// Adds the objects of a scene, each in its colour.
-    pub fn scene(&mut self, world: &World) -> &mut Self {
-        for (index, body) in world.objects().iter().enumerate() {
-            self.mesh(&body.object.visual, &world.pose(body.id), body.scale, object_color(index));
-        }
         self
     }
 

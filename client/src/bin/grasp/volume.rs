@@ -4,6 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context, bail, ensure};
 use grasp::{Volume, WORKSPACE_SIZE};
+use nalgebra::Isometry3;
 use npyz::half::f16;
 use npyz::npz::NpzArchive;
 use npyz::{NpyFile, Order, TypeChar};
@@ -11,12 +12,12 @@ use npyz::{NpyFile, Order, TypeChar};
 /// The name under which VGN's data has its volumes.
 const ARRAY: &str = "grid";
 
-/// Reads a volume from a .npy or .npz file, at the origin of its frame.
-pub(crate) fn read(path: &Path, voxel_size: Option<f64>) -> anyhow::Result<Volume> {
-    try_read(path, voxel_size).with_context(|| path.display().to_string())
+/// Reads a volume from a .npy or .npz file, with its corner at `pose`.
+pub(crate) fn read(path: &Path, voxel_size: Option<f64>, pose: Isometry3<f64>) -> anyhow::Result<Volume> {
+    try_read(path, voxel_size, pose).with_context(|| path.display().to_string())
 }
 
-fn try_read(path: &Path, voxel_size: Option<f64>) -> anyhow::Result<Volume> {
+fn try_read(path: &Path, voxel_size: Option<f64>, pose: Isometry3<f64>) -> anyhow::Result<Volume> {
     let file = BufReader::new(File::open(path)?);
     if path.extension().is_some_and(|extension| extension == "npz") {
         let mut archive = NpzArchive::new(file)?;
@@ -28,13 +29,13 @@ fn try_read(path: &Path, voxel_size: Option<f64>) -> anyhow::Result<Volume> {
             })?,
         };
         let array = archive.by_name(name)?.with_context(|| format!("holds no array `{name}`"))?;
-        volume(array, voxel_size)
+        volume(array, voxel_size, pose)
     } else {
-        volume(NpyFile::new(file)?, voxel_size)
+        volume(NpyFile::new(file)?, voxel_size, pose)
     }
 }
 
-fn volume(array: NpyFile<impl Read>, voxel_size: Option<f64>) -> anyhow::Result<Volume> {
+fn volume(array: NpyFile<impl Read>, voxel_size: Option<f64>, pose: Isometry3<f64>) -> anyhow::Result<Volume> {
     let shape = array.shape().to_vec();
     let order = array.order();
     // Leading dimensions of 1 are the batch and the channel that networks want.
@@ -59,7 +60,7 @@ fn volume(array: NpyFile<impl Read>, voxel_size: Option<f64>) -> anyhow::Result<
             .collect();
     }
     let voxel_size = voxel_size.unwrap_or(WORKSPACE_SIZE / resolution as f64);
-    Ok(Volume::new(resolution, voxel_size, nalgebra::Isometry3::identity(), values)?)
+    Ok(Volume::new(resolution, voxel_size, pose, values)?)
 }
 
 fn values(array: NpyFile<impl Read>) -> anyhow::Result<Vec<f32>> {
