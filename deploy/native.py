@@ -10,6 +10,7 @@
     native.py prometheus       what the tests of deploy/prometheus and deploy/grafana ask, for GRASPD_PROMETHEUS
     native.py promtool         what checks its rules, for GRASPD_PROMTOOL
     native.py cpp              a prefix with CMake, protoc and gRPC for C++, for GRASPD_CPP
+    native.py chromium         the browser that the page is tested in, for GRASPD_CHROMIUM
 
 The path is all that goes to stdout. Where the named variable is set already, its path is checked and
 printed. What is fetched stays in ${GRASPD_CACHE:-~/.cache/graspd}: a second run touches no network.
@@ -128,7 +129,7 @@ def python() -> Path:
     if sys.version_info < (3, 11):
         version = "{}.{}".format(*sys.version_info)
         raise Unavailable(f"The Python client's tests need Python 3.11 or newer; {sys.executable} is {version}.")
-    return interpreter("python", sys.executable, "The Python packages of the tests", 95, "GRASPD_PYTHON")
+    return interpreter("python", sys.executable, "The Python packages of the tests", 131, "GRASPD_PYTHON")
 
 
 def peers() -> Path:
@@ -157,6 +158,13 @@ def promtool() -> Path:
     if os.environ.get("GRASPD_PROMTOOL"):
         return given("GRASPD_PROMTOOL")
     return from_debian("prometheus", "promtool", "GRASPD_PROMTOOL")
+
+
+def chromium() -> Path:
+    if os.environ.get("GRASPD_CHROMIUM"):
+        return given("GRASPD_CHROMIUM")
+    # The shell without a window: the same engine, and none of GTK.
+    return from_debian("chromium-headless-shell", "chromium-headless-shell", "GRASPD_CHROMIUM")
 
 
 def cpp() -> Path:
@@ -208,9 +216,11 @@ def unpacked(name: str, packages: List[str], title: str, variable: str) -> Path:
                 library = Path("/", link.relative_to(part)).with_name(os.readlink(link))
                 for name in {library.name, library.resolve().name}:
                     link.with_name(name).symlink_to(library)
-        libraries = os.pathsep.join(str(folder / path.relative_to(part)) for path in part.glob("usr/lib/*-linux-gnu"))
-        # A script for each program: the package may have several.
-        for program in [*part.glob("usr/bin/*"), *part.glob("usr/sbin/*")]:
+        # PulseAudio's library has half of itself in a folder of its own.
+        holding = [*part.glob("usr/lib/*-linux-gnu"), *part.glob("usr/lib/*-linux-gnu/pulseaudio")]
+        libraries = os.pathsep.join(str(folder / path.relative_to(part)) for path in holding)
+        # A script for each program: the package may have several. What Chromium has in usr/bin is one that looks in /usr.
+        for program in [*part.glob("usr/bin/*"), *part.glob("usr/sbin/*"), *part.glob("usr/lib/chromium/chromium-*")]:
             script = part / program.name
             script.write_text(f'#!/bin/sh\nLD_LIBRARY_PATH="{libraries}" exec "{folder / program.relative_to(part)}" "$@"\n')
             script.chmod(0o755)
@@ -351,7 +361,7 @@ def say(line: str) -> None:
 
 
 if __name__ == "__main__":
-    commands = [onnxruntime, onnxruntime_gpu, libtorch, python, peers, haproxy, prometheus, promtool, cpp]
+    commands = [onnxruntime, onnxruntime_gpu, libtorch, python, peers, haproxy, prometheus, promtool, cpp, chromium]
     subcommands = {command.__name__.replace("_", "-"): command for command in commands}
     if sys.argv[1:] not in [[name] for name in subcommands]:
         sys.exit(__doc__)

@@ -252,7 +252,7 @@ fn convention(convention: &pb::Convention) -> Result<Convention, FieldError> {
 }
 
 fn retreat(retreat: &pb::Retreat) -> Result<Retreat, FieldError> {
-    let length = distance("options.retreat.distance", Some(retreat.distance))?.filter(|distance| *distance > 0.0);
+    let length = distance("options.retreat.distance", retreat.distance)?;
     let towards = retreat.direction.map(|vector| direction(Some(vector), "options.retreat.direction")).transpose()?;
     Ok(Retreat { distance: length.unwrap_or(RETREAT), direction: towards })
 }
@@ -285,7 +285,7 @@ mod tests {
         let up = pb::Vector3 { x: 0.0, y: 0.0, z: 2.0 };
         let parent = (&Isometry3::translation(0.0, 0.0, 0.0584)).into();
         let options = pb::Options {
-            retreat: Some(pb::Retreat { distance: 0.2, direction: Some(up) }),
+            retreat: Some(pb::Retreat { distance: Some(0.2), direction: Some(up) }),
             convention: Some(pb::Convention { origin: 2, closing_axis: 0, parent_from_grasp: Some(parent) }),
             ..Default::default()
         };

@@ -5,18 +5,20 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use grasp_proto::{Asked, FieldError, pb};
+use opentelemetry::Context;
 use tokio::sync::watch;
-use tonic::Code;
+use tonic::{Code, Request};
 use tracing::field::Empty;
 use tracing::{Span, debug, info, info_span};
 
-use crate::deadline::Deadline;
+use crate::deadline::{self, Deadline};
 use crate::engine::{Answer, Engine, Found, Reply, Tensors};
 use crate::health::State;
 use crate::metrics::Metrics;
 use crate::planner::Scene;
 use crate::recent::{Answered, Outcome, Recent};
 use crate::refusal::Refusal;
+use crate::telemetry::{self, REQUEST};
 use crate::timings::Timings;
 
 /// Longest request id and frame id, bytes: they are echoed, and the first is logged.
@@ -49,6 +51,19 @@ pub(crate) struct Call {
     ended: bool,
 }
 
+/// Who calls: until when they wait, and what the call is a part of.
+#[derive(Clone, Default)]
+pub(crate) struct Caller {
+    deadline: Option<Deadline>,
+    parent: Option<Context>,
+}
+
+impl Caller {
+    pub fn of<T>(request: &Request<T>) -> Self {
+        Self { deadline: deadline::of(request.extensions()), parent: telemetry::parent(request.metadata()) }
+    }
+}
+
 /// What a request that was taken needs for its reply.
 pub(crate) struct Work {
     reply: Reply<Found>,
@@ -77,7 +92,7 @@ impl Calls {
     }
 
     /// Opens a call. What is wrong with its id or its moment is the second of the two.
-    pub fn open(&self, mut id: String, deadline: Option<Deadline>) -> (Call, Result<(), Refusal>) {
+    pub fn open(&self, mut id: String, caller: Caller) -> (Call, Result<(), Refusal>) {
         let started = Instant::now();
         let mut checked = check_id("request_id", &id).map_err(Refusal::from);
         if id.is_empty() || checked.is_err() {
@@ -87,8 +102,11 @@ impl Calls {
         if checked.is_ok() && *self.state.borrow() == State::Starting {
             checked = Err(Refusal::Starting(WARM_UP));
         }
+        let Caller { deadline, parent } = caller;
         let span = info_span!(
-            "detect",
+            REQUEST,
+            otel.kind = "server",
+            otel.status_code = Empty,
             request_id = id,
             model = Empty,
             queue = Empty,
@@ -98,6 +116,7 @@ impl Calls {
             postprocessing = Empty,
             total = Empty,
         );
+        telemetry::adopt(&span, parent);
         let call = Call {
             id,
             deadline,
@@ -240,12 +259,16 @@ impl Call {
 
     fn answered(&self, timings: &Timings, grasps: usize) {
         timings.record(&self.span);
+        telemetry::stages(&self.span, timings);
         self.metrics.answered(&self.label, timings, grasps);
         self.span.in_scope(|| debug!(grasps, "answered"));
     }
 
     fn refused(&self, refusal: &Refusal) {
         self.metrics.ended(&self.label, refusal.code());
+        if refusal.code() == Code::Internal {
+            self.span.record("otel.status_code", "ERROR");
+        }
         let outcome = Outcome::Refused { code: refusal.code(), message: refusal.to_string() };
         self.recent.add(self.id.clone(), self.label.clone(), outcome);
         self.span.in_scope(|| info!(code = ?refusal.code(), %refusal, "refused"));

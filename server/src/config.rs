@@ -54,6 +54,8 @@ pub(crate) struct Config {
     /// Requests that the page shows; none where there is no page.
     pub recent: usize,
     pub drain_timeout: Duration,
+    /// Where traces go.
+    pub otlp: Option<String>,
     pub log: String,
     pub log_format: LogFormat,
 }
@@ -192,6 +194,11 @@ struct Flags {
     )]
     drain_timeout: String,
 
+    /// Collector of OpenTelemetry that gets a trace of each request, over gRPC, such as http://127.0.0.1:4317. A request
+    /// that brings a W3C traceparent is a part of its caller's trace. By default nobody gets any.
+    #[arg(long, env = "GRASPD_OTLP", value_name = "URL")]
+    otlp: Option<String>,
+
     /// What is logged to stderr: a level, or tracing's directives such as `warn,graspd=debug`.
     #[arg(long, env = "GRASPD_LOG", value_name = "FILTER", default_value = "info")]
     log: String,
@@ -296,6 +303,7 @@ impl Config {
                 track_timeout: track_timeout?,
                 recent: recent?,
                 drain_timeout: drain_timeout?,
+                otlp: flags.otlp,
                 log: flags.log,
                 log_format: log_format?,
             })

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use tonic::metadata::MetadataMap;
-use tonic::{Request, Status};
+use tonic::{Extensions, Request, Status};
 
 /// The header (gRPC over HTTP/2, "Requests"): up to eight digits and a unit.
 const HEADER: &str = "grpc-timeout";
@@ -14,6 +14,11 @@ const MARGIN: Duration = Duration::from_millis(2);
 /// A moment after which nobody waits for the answer.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Deadline(pub Instant);
+
+/// The deadline that was [noted](note).
+pub(crate) fn of(extensions: &Extensions) -> Option<Deadline> {
+    extensions.get().copied()
+}
 
 /// Notes the deadline of a request, counted from its headers: the message may take a while to come.
 #[expect(clippy::unnecessary_wraps, reason = "the form of tonic's interceptors")]

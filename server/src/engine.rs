@@ -220,6 +220,11 @@ impl Engine {
         Ok(Reply { answer, _place: place })
     }
 
+    /// The most scenes that wait.
+    pub fn capacity(&self) -> usize {
+        self.queue.capacity()
+    }
+
     /// Refuses where there is no place at this moment, so that nothing is prepared in vain.
     pub fn check_place(&self) -> Result<(), Overloaded> {
         self.queue.is_full().map_or(Ok(()), |waiting| Err(self.overloaded(waiting)))

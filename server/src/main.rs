@@ -33,6 +33,7 @@ use std::sync::Arc;
 use anyhow::Context;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::net::TcpListener;
+use tokio::runtime::Runtime;
 use tracing::{error, info, warn};
 
 use crate::call::Calls;
@@ -48,6 +49,7 @@ use crate::oip::Inference;
 use crate::recent::Recent;
 use crate::service::Grasps;
 use crate::shutdown::{Signals, hangup};
+use crate::telemetry::Traces;
 use crate::track::Kept;
 
 fn main() -> ExitCode {
@@ -58,8 +60,15 @@ fn main() -> ExitCode {
             return ExitCode::from(2);
         }
     };
-    telemetry::init(&config);
-    match run(&config) {
+    let started = runtime(&config).and_then(|runtime| Ok((telemetry::init(&config, &runtime)?, runtime)));
+    let (traces, runtime) = match started {
+        Ok(started) => started,
+        Err(error) => {
+            eprintln!("graspd: {error:#}");
+            return ExitCode::FAILURE;
+        }
+    };
+    match run(&config, runtime, &traces) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             error!("{error:#}");
@@ -68,29 +77,28 @@ fn main() -> ExitCode {
     }
 }
 
+/// The threads that move messages.
+fn runtime(config: &Config) -> anyhow::Result<Runtime> {
+    let mut builder = tokio::runtime::Builder::new_multi_thread();
+    let builder = builder.worker_threads(config.io_threads).thread_name("grpc").enable_all();
+    builder.build().context("cannot start the runtime's threads")
+}
+
 /// From the configuration to the last session dropped.
-fn run(config: &Config) -> anyhow::Result<()> {
+fn run(config: &Config, runtime: Runtime, traces: &Traces) -> anyhow::Result<()> {
     allow_connections(config.max_connections);
     let onnxruntime = grasp_models::init()?;
     info!(version = onnxruntime.version, library = %onnxruntime.library.display(), "ONNX Runtime");
 
     let metrics = Arc::new(Metrics::new());
     let sessions = Arc::new(Sessions::default());
-    let served = serve_all(config, &metrics, &sessions);
+    let served = runtime.block_on(serve(config, &metrics, &sessions));
+    traces.finish();
+    // With the runtime the last way to reach the sessions goes.
+    drop(runtime);
     // Whatever happened, no session may still be inside ONNX Runtime when the process ends.
     sessions.join();
     served
-}
-
-/// From the start of the runtime to its end, and with it of the last way to reach the sessions.
-fn serve_all(config: &Config, metrics: &Arc<Metrics>, sessions: &Arc<Sessions>) -> anyhow::Result<()> {
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(config.io_threads)
-        .thread_name("grpc")
-        .enable_all()
-        .build()
-        .context("cannot start the runtime's threads")?;
-    runtime.block_on(serve(config, metrics, sessions))
 }
 
 /// From binding the listeners to the end of the drain.

@@ -57,8 +57,9 @@ impl Models {
         let is_named = |engine: &&Arc<Engine>| {
             engine.source.name() == name && (version.is_empty() || engine.source.version() == version)
         };
+        let is_known = served.iter().any(|engine| engine.source.name() == name);
         let engine = served.iter().find(is_named).ok_or_else(|| Refusal::UnknownModel {
-            field: "options.model",
+            field: if is_known { "options.version" } else { "options.model" },
             wanted: format!("{name} {version}").trim_end().to_owned(),
             available: describe(&served.iter().collect::<Vec<_>>(), |engine| engine.label.clone()),
         })?;

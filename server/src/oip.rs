@@ -11,8 +11,7 @@ use nalgebra::Isometry3;
 use prost::bytes::Bytes;
 use tonic::{Request, Response, Status};
 
-use crate::call::{Call, Calls};
-use crate::deadline::Deadline;
+use crate::call::{Call, Caller, Calls};
 use crate::engine::{Engine, Reply, Tensors};
 use crate::health::State;
 use crate::models::Models;
@@ -27,7 +26,7 @@ const OUTPUTS: [(&str, i64); 3] = [("quality", 1), ("rotation", 4), ("width", 1)
 
 const FP32: &str = "FP32";
 
-/// The most volumes of one request.
+/// The most volumes of one request, if so many may wait.
 const MAX_BATCH: usize = 64;
 
 /// The Open Inference Protocol: a network's own input and output, for tools that know nothing of grasps.
@@ -74,11 +73,11 @@ impl Inference {
                 return Err(FieldError::new("outputs", format_args!("`{}`", output.name), needed).into());
             }
         }
-        let batch = batches(request, n)?;
+        let batch = batches(request, n, max_batch(&engine))?;
         let volume = |values: &[f32]| {
             let volume = Volume::new(n, voxel_size, Isometry3::identity(), values.to_vec());
             volume.map_err(|error| {
-                Refusal::from(FieldError { field: "inputs".into(), message: format!("inputs: {error}") })
+                Refusal::from(FieldError { field: "inputs[0]".into(), message: format!("inputs[0]: {error}") })
             })
         };
         let volumes = batch.chunks_exact(n.pow(3)).map(volume).collect::<Result<Vec<_>, _>>()?;
@@ -96,7 +95,7 @@ struct Queued {
 }
 
 /// The values of the input, checked: `[batch, 1, n, n, n]`.
-fn batches(request: &oip::ModelInferRequest, n: usize) -> Result<Vec<f32>, FieldError> {
+fn batches(request: &oip::ModelInferRequest, n: usize, most: usize) -> Result<Vec<f32>, FieldError> {
     let [InferInputTensor { name, datatype, shape, contents, .. }] = &request.inputs[..] else {
         let needed = format_args!("must have the one tensor `{INPUT}`");
         return Err(FieldError::new("inputs", format_args!("a list of {}", request.inputs.len()), needed));
@@ -112,8 +111,8 @@ fn batches(request: &oip::ModelInferRequest, n: usize) -> Result<Vec<f32>, Field
         [batch, 1, x, y, z] if [x, y, z] == [edge; 3] => usize::try_from(batch).unwrap_or(0),
         _ => 0,
     };
-    if !(1..=MAX_BATCH).contains(&batch) {
-        let needed = format_args!("must be [batch, 1, {n}, {n}, {n}] with a batch from 1 to {MAX_BATCH}");
+    if !(1..=most).contains(&batch) {
+        let needed = format_args!("must be [batch, 1, {n}, {n}, {n}] with a batch from 1 to {most}");
         return Err(FieldError::new("inputs[0].shape", format_args!("{shape:?}"), needed));
     }
     let expected = batch * n.pow(3);
@@ -251,9 +250,9 @@ impl GrpcInferenceService for Inference {
         &self,
         request: Request<oip::ModelInferRequest>,
     ) -> Result<Response<oip::ModelInferResponse>, Status> {
-        let deadline: Option<Deadline> = request.extensions().get().copied();
+        let caller = Caller::of(&request);
         let request = request.into_inner();
-        let (mut call, checked) = self.calls.open(request.id.clone(), deadline);
+        let (mut call, checked) = self.calls.open(request.id.clone(), caller);
         let id = call.id.clone();
         let outcome = match checked.and_then(|()| self.submit(&request, &mut call)) {
             Ok(Queued { engine, replies }) => call.maps(replies).await.map(|answer| (engine, answer)),
@@ -279,7 +278,7 @@ impl GrpcInferenceService for Inference {
                 platform: PLATFORM.to_owned(),
                 backend: "onnxruntime".to_owned(),
                 // At most, as the requests are bounded.
-                max_batch_size: MAX_BATCH as i32,
+                max_batch_size: max_batch(&engine) as i32,
                 input: vec![oip::ModelInput { name: INPUT.to_owned(), data_type, dims: dims(1) }],
                 output: OUTPUTS.into_iter().map(output).collect(),
             }),
@@ -293,4 +292,9 @@ const PLATFORM: &str = "onnxruntime_onnx";
 /// Voxels along an edge of what a network reads.
 fn edge(engine: &Engine) -> i64 {
     engine.source.network().map_or(0, |entry| entry.metadata.resolution as i64)
+}
+
+/// A request whose volumes do not all fit into the queue could never be answered.
+fn max_batch(engine: &Engine) -> usize {
+    MAX_BATCH.min(engine.capacity())
 }

@@ -79,6 +79,11 @@ impl<T> Queue<T> {
         Ok(Place { queue: Arc::clone(self), number })
     }
 
+    /// How many may wait.
+    pub fn capacity(&self) -> usize {
+        self.capacity
+    }
+
     /// How many wait, if no more can: what [`push`](Self::push) would say at this moment.
     pub fn is_full(&self) -> Option<usize> {
         let state = self.lock();

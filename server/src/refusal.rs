@@ -19,6 +19,12 @@ pub(crate) enum Refusal {
     Overloaded(#[from] Overloaded),
     #[error("the server is warming up; come back in {0:?}")]
     Starting(Duration),
+    #[error("the server is shutting down; another one may be up")]
+    Draining,
+    #[error("{0} volumes are kept already, no more are; end a stream, or raise --max-tracked")]
+    TooManyKept(usize),
+    #[error("no view came for {0:?}: the volume is gone; open another stream")]
+    Forgotten(Duration),
     #[error(transparent)]
     Failed(#[from] EngineError),
 }
@@ -26,13 +32,17 @@ pub(crate) enum Refusal {
 /// The trailer with which gRPC servers tell clients when to retry (gRPC proposal A6).
 const RETRY_PUSHBACK: &str = "grpc-retry-pushback-ms";
 
+/// When it is worth asking again for a volume to be kept: streams live long.
+const KEPT: Duration = Duration::from_secs(1);
+
 impl Refusal {
     pub fn code(&self) -> Code {
         match self {
             Self::Field(_) => Code::InvalidArgument,
             Self::UnknownModel { .. } => Code::NotFound,
-            Self::Overloaded(_) => Code::ResourceExhausted,
-            Self::Starting(_) => Code::Unavailable,
+            Self::Overloaded(_) | Self::TooManyKept(_) => Code::ResourceExhausted,
+            Self::Starting(_) | Self::Draining => Code::Unavailable,
+            Self::Forgotten(_) => Code::Aborted,
             Self::Failed(EngineError::Expired) => Code::DeadlineExceeded,
             Self::Failed(_) => Code::Internal,
         }
@@ -43,7 +53,8 @@ impl Refusal {
         match self {
             Self::Overloaded(overloaded) => Some(overloaded.retry_after),
             Self::Starting(retry_after) => Some(*retry_after),
-            Self::Field(_) | Self::UnknownModel { .. } | Self::Failed(_) => None,
+            Self::TooManyKept(_) => Some(KEPT),
+            Self::Field(_) | Self::UnknownModel { .. } | Self::Draining | Self::Forgotten(_) | Self::Failed(_) => None,
         }
     }
 }

@@ -11,8 +11,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::codegen::BoxStream;
 use tonic::{Request, Response, Status, Streaming};
 
-use crate::call::{Call, Calls, Origin, Work};
-use crate::deadline::Deadline;
+use crate::call::{Call, Caller, Calls, Origin, Work};
 use crate::engine::{Engine, EngineError};
 use crate::health::draining;
 use crate::models::{Models, check_voxel_size};
@@ -56,8 +55,8 @@ impl Grasps {
     }
 
     /// Checks a request and queues its volume. What is wrong with it comes out of [`Begun::finish`], like the answer.
-    fn begin(&self, mut request: pb::DetectGraspsRequest, deadline: Option<Deadline>) -> Begun {
-        let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), deadline);
+    fn begin(&self, mut request: pb::DetectGraspsRequest, caller: Caller) -> Begun {
+        let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), caller);
         let work = checked.and_then(|()| self.submit(request, &mut call));
         Begun { call, work }
     }
@@ -102,6 +101,13 @@ impl Grasps {
         });
         let (scene, asked, fusion) = fused.await?;
         call.submit(&engine, scene, asked, origin, Some(fusion))
+    }
+
+    /// Ends a stream, and counts and tells that.
+    fn refuse(&self, refusal: Refusal, caller: Caller) -> Status {
+        let (call, _) = self.calls.open(String::new(), caller);
+        let id = call.id.clone();
+        call.end(refusal).status(&id)
     }
 
     /// What can be checked before anything is converted.
@@ -175,17 +181,17 @@ impl GraspService for Grasps {
         &self,
         request: Request<pb::DetectGraspsRequest>,
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
-        let deadline = request.extensions().get().copied();
-        self.begin(request.into_inner(), deadline).respond().await
+        let caller = Caller::of(&request);
+        self.begin(request.into_inner(), caller).respond().await
     }
 
     async fn detect_grasps_from_depth(
         &self,
         request: Request<pb::DetectGraspsFromDepthRequest>,
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
-        let deadline = request.extensions().get().copied();
+        let caller = Caller::of(&request);
         let mut request = request.into_inner();
-        let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), deadline);
+        let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), caller);
         let work = match checked {
             Ok(()) => self.submit_depth(request, &mut call).await,
             Err(refusal) => Err(refusal),
@@ -197,9 +203,9 @@ impl GraspService for Grasps {
         &self,
         request: Request<pb::DetectGraspsFromCloudRequest>,
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
-        let deadline = request.extensions().get().copied();
+        let caller = Caller::of(&request);
         let mut request = request.into_inner();
-        let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), deadline);
+        let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), caller);
         let work = match checked {
             Ok(()) => self.submit_cloud(request, &mut call).await,
             Err(refusal) => Err(refusal),
@@ -214,7 +220,7 @@ impl GraspService for Grasps {
         request: Request<Streaming<pb::DetectGraspsRequest>>,
     ) -> Result<Response<Self::DetectGraspsStreamStream>, Status> {
         // The stream's, hence that of every request in it.
-        let deadline = request.extensions().get().copied();
+        let caller = Caller::of(&request);
         let mut requests = request.into_inner();
         let service = self.clone();
         let (begun, calls) = mpsc::channel(READ_AHEAD);
@@ -223,10 +229,10 @@ impl GraspService for Grasps {
             while let Ok(place) = begun.reserve().await {
                 let message = tokio::select! {
                     message = requests.message() => message,
-                    () = draining(service.calls.state()) => return,
+                    () = draining(service.calls.state()) => return place.send(Err(service.refuse(Refusal::Draining, caller))),
                 };
                 match message {
-                    Ok(Some(request)) => place.send(Ok(service.begin(request, deadline))),
+                    Ok(Some(request)) => place.send(Ok(service.begin(request, caller.clone()))),
                     Ok(None) => return,
                     // Too large, or no message at all: HTTP/2's framing is lost, so the stream ends with this status.
                     Err(status) => return place.send(Err(status)),
@@ -247,10 +253,10 @@ impl GraspService for Grasps {
         &self,
         request: Request<Streaming<pb::TrackGraspsRequest>>,
     ) -> Result<Response<Self::TrackGraspsStream>, Status> {
-        let deadline = request.extensions().get().copied();
+        let caller = Caller::of(&request);
         let mut requests = request.into_inner();
         let service = self.clone();
-        let place = self.kept.place()?;
+        let place = self.kept.place().map_err(|refusal| self.refuse(refusal, caller.clone()))?;
         let (replies, sent) = mpsc::channel(1);
         tokio::spawn(async move {
             // Given back when the stream ends, with the volume.
@@ -259,15 +265,15 @@ impl GraspService for Grasps {
             while let Ok(reply) = replies.reserve().await {
                 let message = tokio::select! {
                     message = requests.message() => message,
-                    () = draining(service.calls.state()) => return,
-                    status = service.kept.expired() => return reply.send(Err(status)),
+                    () = draining(service.calls.state()) => return reply.send(Err(service.refuse(Refusal::Draining, caller))),
+                    refusal = service.kept.expired() => return reply.send(Err(service.refuse(refusal, caller))),
                 };
                 let mut request = match message {
                     Ok(Some(request)) => request,
                     Ok(None) => return,
                     Err(status) => return reply.send(Err(status)),
                 };
-                let (mut call, checked) = service.calls.open(std::mem::take(&mut request.request_id), deadline);
+                let (mut call, checked) = service.calls.open(std::mem::take(&mut request.request_id), caller.clone());
                 let work = match checked {
                     Ok(()) => service.submit_track(request, &mut track, &mut call).await,
                     Err(refusal) => Err(refusal),

@@ -6,7 +6,6 @@ use grasp_proto::{Asked, FieldError, MAX_VIEWS, Workspace, depth_view, pb};
 use nalgebra::Isometry3;
 use prometheus::IntGauge;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
-use tonic::Status;
 
 use crate::call::Origin;
 use crate::engine::Engine;
@@ -34,20 +33,18 @@ impl Kept {
     }
 
     /// A place, if there is one.
-    pub fn place(&self) -> Result<Place, Status> {
+    pub fn place(&self) -> Result<Place, Refusal> {
         let Ok(permit) = Arc::clone(&self.places).try_acquire_owned() else {
-            let message =
-                format!("{} volumes are kept already, no more are; end a stream, or raise --max-tracked", self.most);
-            return Err(Status::resource_exhausted(message));
+            return Err(Refusal::TooManyKept(self.most));
         };
         self.gauge.inc();
         Ok(Place { _permit: permit, gauge: self.gauge.clone() })
     }
 
     /// Returns when a volume has been kept for too long without a view.
-    pub async fn expired(&self) -> Status {
+    pub async fn expired(&self) -> Refusal {
         tokio::time::sleep(self.timeout).await;
-        Status::aborted(format!("no view came for {:?}: the volume is gone; open another stream", self.timeout))
+        Refusal::Forgotten(self.timeout)
     }
 }
 

@@ -278,7 +278,7 @@ async fn poses_are_told_as_the_robot_wants_them() {
     let asked = Asked {
         convention: Some(pb::Convention { origin: 1, closing_axis: 1, parent_from_grasp: None }),
         pregrasp_distance: Some(0.12),
-        retreat: Some(pb::Retreat { distance: 0.2, direction: vector(0.0, 0.0, 1.0) }),
+        retreat: Some(pb::Retreat { distance: Some(0.2), direction: vector(0.0, 0.0, 1.0) }),
         ..Asked::default()
     };
     let told = asked_with(&client, asked).await.grasps;

@@ -57,7 +57,9 @@ async fn a_stream_is_answered_as_far_as_it_was_read_and_ended() {
     let mut replies = server.client().await.detect_stream(ReceiverStream::new(requests)).await.unwrap();
     assert_eq!(replies.next().await.unwrap().unwrap().grasps.len(), 1);
     server.terminate().unwrap();
-    // The client would go on sending; it is the server that ends the stream, without an error.
+    // The client would go on sending; it is the server that ends the stream, and says so.
+    let ended = replies.next().await.expect("why the stream ends").unwrap_err();
+    assert_eq!(ended.code(), Some(tonic::Code::Unavailable), "{ended}");
     assert!(replies.next().await.is_none());
     assert_eq!(server.wait().unwrap().code(), Some(0));
     drop(send);

@@ -44,6 +44,20 @@ fn prometheus_sees_what_the_dashboard_shows_seen_from_python() {
 }
 
 #[test]
+fn the_python_package_does_what_it_says() {
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo");
+    let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.as_os_str())];
+    run("test_package.py", &environment, "test_the_grasps_are_at_the_block");
+}
+
+#[test]
+fn tritonclient_gets_the_maps_seen_from_python() {
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo");
+    let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.as_os_str())];
+    run("test_inference.py", &environment, "test_calls_run_at_the_same_time");
+}
+
+#[test]
 fn a_client_in_cpp_is_built_and_gets_grasps_seen_from_python() {
     // GRASPD_CPP is the environment's.
     let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo");

@@ -1,0 +1,179 @@
+"""The client for asyncio: what `graspd.Client` does, awaited."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterable, AsyncIterator, Callable, Iterable
+from contextlib import suppress
+from typing import Any, TypeVar
+
+import grpc
+import grpc.aio
+from grpc_health.v1.health_pb2 import HealthCheckRequest
+from numpy.typing import NDArray
+
+from graspd import grasp_pb2 as pb
+from graspd import wire
+from graspd.connection import OPTIONS, Connection
+from graspd.detection import Detection, Model
+from graspd.errors import Error, from_status
+from graspd.methods import (
+    CHECK,
+    DETECT,
+    DETECT_FROM_CLOUD,
+    DETECT_FROM_DEPTH,
+    DETECT_STREAM,
+    LIST_MODELS,
+    TRACK,
+    Method,
+    Request,
+    Response,
+)
+from graspd.options import Options
+from graspd.seen import CloudView, DepthView, Volume, Workspace
+from graspd.streams import Adding, Detecting
+
+Answer = TypeVar("Answer")
+
+
+class Client(Connection[grpc.aio.Channel]):
+    """A connection to graspd, to be made and used in one event loop. Calls may run at the same time.
+
+    Arguments, answers and errors are those of `graspd.Client`.
+    """
+
+    async def __aenter__(self) -> Client:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Ends what is still going on."""
+        await self._channel.close()
+
+    async def detect(
+        self, volume: Volume | NDArray[Any], options: Options | None = None, *, request_id: str = ""
+    ) -> Detection:
+        """The grasps in a volume."""
+        return await self._ask(DETECT, wire.detect_request(volume, options, request_id), wire.detection)
+
+    async def detect_from_depth(
+        self,
+        views: Iterable[DepthView],
+        workspace: Workspace = Workspace(),
+        options: Options | None = None,
+        *,
+        request_id: str = "",
+    ) -> Detection:
+        """The grasps in what depth cameras see."""
+        request = wire.depth_request(views, workspace, options, request_id)
+        return await self._ask(DETECT_FROM_DEPTH, request, wire.detection)
+
+    async def detect_from_cloud(
+        self,
+        views: Iterable[CloudView],
+        workspace: Workspace = Workspace(),
+        options: Options | None = None,
+        *,
+        request_id: str = "",
+    ) -> Detection:
+        """The grasps in point clouds."""
+        request = wire.cloud_request(views, workspace, options, request_id)
+        return await self._ask(DETECT_FROM_CLOUD, request, wire.detection)
+
+    async def detect_stream(
+        self, volumes: AsyncIterable[Volume | NDArray[Any]], options: Options | None = None
+    ) -> AsyncIterator[Detection | Error]:
+        """The grasps in each of the volumes, in their order, or its `Error`."""
+        detecting = Detecting(options)
+
+        async def requests() -> AsyncIterator[pb.DetectGraspsRequest]:
+            with detecting.asking():
+                async for volume in volumes:
+                    yield detecting.request(volume)
+
+        replies = self._stream(DETECT_STREAM, requests())
+        try:
+            async for reply in replies:
+                yield detecting.answer(reply)
+        except grpc.RpcError as status:
+            raise from_status(status) from None
+        finally:
+            replies.cancel()
+        detecting.end()
+
+    def track(self, workspace: Workspace = Workspace()) -> Tracking:
+        """Has the server keep a volume for a camera that moves."""
+        return Tracking(self._stream(TRACK), workspace)
+
+    async def models(self) -> tuple[Model, ...]:
+        """What can be asked for by name, the default first."""
+        return await self._ask(LIST_MODELS, pb.ListModelsRequest(), wire.models)
+
+    async def health(self) -> bool:
+        """Whether the server answers; it does not while it is warming up or shutting down."""
+        return await self._ask(CHECK, HealthCheckRequest(), wire.is_serving)
+
+    def _open(self, target: str, credentials: grpc.ChannelCredentials | None) -> grpc.aio.Channel:
+        if credentials is None:
+            return grpc.aio.insecure_channel(target, OPTIONS)
+        return grpc.aio.secure_channel(target, credentials, OPTIONS)
+
+    async def _ask(
+        self, method: Method[Request, Response], request: Request, answer: Callable[[Response], Answer]
+    ) -> Answer:
+        ask = self._channel.unary_unary(method.path, method.serialize, method.parse)
+        attempts = 0
+        while True:
+            try:
+                return answer(await ask(request, timeout=self._timeout, metadata=self._metadata))
+            except grpc.RpcError as status:
+                error = from_status(status)
+            attempts += 1
+            pause = self._retry.after(attempts, error)
+            if pause is None:
+                raise error
+            await asyncio.sleep(pause)
+
+    def _stream(
+        self, method: Method[Request, Response], requests: AsyncIterator[Request] | None = None
+    ) -> grpc.aio.StreamStreamCall[Request, Response]:
+        stream = self._channel.stream_stream(method.path, method.serialize, method.parse)
+        return stream(requests, metadata=self._metadata)
+
+
+class Tracking:
+    """A volume that the server keeps until this is closed, and the grasps in it."""
+
+    def __init__(
+        self,
+        stream: grpc.aio.StreamStreamCall[pb.TrackGraspsRequest, pb.DetectGraspsStreamResponse],
+        workspace: Workspace,
+    ) -> None:
+        self._adding = Adding(workspace)
+        self._stream = stream
+
+    async def __aenter__(self) -> Tracking:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Has the server forget the volume."""
+        self._stream.cancel()
+
+    async def add(
+        self, views: Iterable[DepthView] = (), options: Options | None = None, *, request_id: str = ""
+    ) -> Detection:
+        """Adds views to the volume: the grasps in all that was seen so far. One at a time."""
+        request = self._adding.request(views, options, request_id)
+        try:
+            # A server that hung up says why in its last reply.
+            with suppress(asyncio.InvalidStateError):
+                await self._stream.write(request)
+            reply = await self._stream.read()
+        except grpc.RpcError as status:
+            raise from_status(status) from None
+        return self._adding.answer(reply if isinstance(reply, pb.DetectGraspsStreamResponse) else None)

@@ -1,0 +1,63 @@
+"""Where things are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector: TypeAlias = Sequence[float] | NDArray[np.floating[Any]]
+"""x, y, z."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """``T_a_b``: maps points of frame b into frame a."""
+
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of b's origin in a, metres."""
+    quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    """x, y, z, w, of unit length."""
+
+    @classmethod
+    def from_matrix(cls, matrix: NDArray[np.floating[Any]]) -> Pose:
+        """From the 4 × 4 matrix that maps points (x, y, z, 1). `ValueError` if it is not a rotation and a shift."""
+        matrix = np.asarray(matrix, np.float64)
+        if matrix.shape != (4, 4):
+            raise ValueError(f"a pose is a 4 × 4 matrix, not one of shape {matrix.shape}")
+        rotation = matrix[:3, :3]
+        # As far off as quaternions may be.
+        is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
+        if not (is_rotation and np.allclose(matrix[3], [0, 0, 0, 1])):
+            raise ValueError(f"a pose is a rotation and a shift, which this is not:\n{matrix}")
+        # The quaternion is the eigenvector with the largest eigenvalue of a symmetric matrix, of which this is the
+        # lower half (Bar-Itzhack 2000): stable at every angle.
+        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+        half = [
+            [xx - yy - zz, 0, 0, 0],
+            [xy + yx, yy - xx - zz, 0, 0],
+            [xz + zx, yz + zy, zz - xx - yy, 0],
+            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
+        ]
+        x, y, z, w = np.linalg.eigh(half)[1][:, -1].tolist()
+        px, py, pz = matrix[:3, 3].tolist()
+        return cls((px, py, pz), (x, y, z, w))
+
+    def matrix(self) -> NDArray[np.float64]:
+        """The 4 × 4 matrix that maps points (x, y, z, 1) of b into a."""
+        x, y, z, w = self.quaternion
+        matrix = np.eye(4)
+        matrix[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+        matrix[:3, 3] = self.position
+        return matrix
+
+
+PoseLike: TypeAlias = Pose | NDArray[np.floating[Any]]
+"""A pose, or its 4 × 4 matrix."""

@@ -1,0 +1,301 @@
+"""From what users say to the messages of `grasp.v1`, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+import numpy as np
+from google.protobuf.timestamp_pb2 import Timestamp
+from grpc_health.v1.health_pb2 import HealthCheckResponse
+from numpy.typing import DTypeLike, NDArray
+
+from graspd import errors
+from graspd import grasp_pb2 as pb
+from graspd.detection import Detection, Dropped, Grasp, Latency, Model
+from graspd.geometry import Pose, PoseLike, Vector
+from graspd.options import Box, CollisionCheck, Cone, Convention, Gripper, Options, Retreat
+from graspd.seen import CloudView, DepthView, Volume, Workspace
+
+Said = TypeVar("Said")
+Message = TypeVar("Message")
+
+WORKSPACE_SIZE = 0.3
+"""Edge of the cube that the papers' networks see, metres."""
+
+DTYPES = {
+    np.dtype("<f4"): pb.DATA_TYPE_F32,
+    np.dtype("<f2"): pb.DATA_TYPE_F16,
+    np.dtype("u1"): pb.DATA_TYPE_U8,
+}
+
+
+def given(message: Callable[[Said], Message], said: Said | None) -> Message | None:
+    """A field that may be left out."""
+    return None if said is None else message(said)
+
+
+def detect_request(volume: Volume | NDArray[Any], options: Options | None, request_id: str) -> pb.DetectGraspsRequest:
+    return pb.DetectGraspsRequest(
+        request_id=request_id,
+        volume=volume_message(volume),
+        options=given(options_message, options),
+    )
+
+
+def depth_request(
+    views: Iterable[DepthView], workspace: Workspace, options: Options | None, request_id: str
+) -> pb.DetectGraspsFromDepthRequest:
+    return pb.DetectGraspsFromDepthRequest(
+        request_id=request_id,
+        views=map(depth_message, views),
+        workspace=workspace_message(workspace),
+        options=given(options_message, options),
+    )
+
+
+def cloud_request(
+    views: Iterable[CloudView], workspace: Workspace, options: Options | None, request_id: str
+) -> pb.DetectGraspsFromCloudRequest:
+    return pb.DetectGraspsFromCloudRequest(
+        request_id=request_id,
+        views=map(cloud_message, views),
+        workspace=workspace_message(workspace),
+        options=given(options_message, options),
+    )
+
+
+def track_request(
+    views: Iterable[DepthView], workspace: Workspace | None, options: Options | None, request_id: str
+) -> pb.TrackGraspsRequest:
+    return pb.TrackGraspsRequest(
+        request_id=request_id,
+        views=map(depth_message, views),
+        workspace=given(workspace_message, workspace),
+        options=given(options_message, options),
+    )
+
+
+def volume_message(volume: Volume | NDArray[Any]) -> pb.Volume:
+    if not isinstance(volume, Volume):
+        volume = Volume(volume)
+    resolution = volume.values.shape[-1]
+    values = encoded(volume.values, volume.dtype)
+    return pb.Volume(
+        data=values.tobytes(),
+        dtype=DTYPES[values.dtype],
+        resolution=resolution,
+        voxel_size=WORKSPACE_SIZE / resolution if volume.voxel_size is None else volume.voxel_size,
+        pose=pose_message(volume.pose),
+        frame_id=volume.frame_id,
+        stamp=given(stamp_message, volume.stamp),
+    )
+
+
+def encoded(values: NDArray[Any], dtype: DTypeLike | None) -> NDArray[Any]:
+    """As one of `DTYPES`."""
+    own = values.dtype if values.dtype in DTYPES else np.dtype("<f4")
+    wanted = own if dtype is None else np.dtype(dtype)
+    if wanted not in DTYPES:
+        raise ValueError(f"volumes travel as float32, float16 or uint8, not as {wanted}")
+    if values.dtype == wanted:
+        return values
+    if values.dtype == np.uint8:
+        return (values / 255).astype(wanted)
+    if wanted != np.uint8:
+        return values.astype(wanted)
+    # Rounded, the server could not see what was wrong with them.
+    if not (values.min() >= 0 and values.max() <= 1):
+        raise ValueError("a volume that is to travel as uint8 must have values in [0, 1]")
+    # What is above 0 stays above 0, which means unobserved.
+    steps: NDArray[Any] = np.maximum(np.rint(values * 255), values > 0).astype(np.uint8)
+    return steps
+
+
+def depth_message(view: DepthView) -> pb.DepthView:
+    height, width = view.depth.shape
+    if view.depth.dtype == np.uint16:
+        unit, depth = pb.DEPTH_UNIT_U16_MILLIMETRES, view.depth.astype("<u2", copy=False)
+    elif np.issubdtype(view.depth.dtype, np.floating):
+        unit, depth = pb.DEPTH_UNIT_F32_METRES, view.depth.astype("<f4", copy=False)
+    else:
+        raise ValueError(f"a depth image is of floats (metres) or of uint16 (millimetres), not of {view.depth.dtype}")
+    return pb.DepthView(
+        data=depth.tobytes(),
+        unit=unit,
+        camera=pb.Camera(width=width, height=height, k=np.ravel(view.k).tolist()),
+        camera_from_task=pose_message(view.camera_from_task),
+        frame_from_camera=pose_message(view.frame_from_camera),
+    )
+
+
+def cloud_message(view: CloudView) -> pb.CloudView:
+    return pb.CloudView(
+        points=np.asarray(view.points, "<f4").tobytes(),
+        camera_position=vector_message(view.camera_position),
+        frame_from_cloud=pose_message(view.frame_from_cloud),
+    )
+
+
+def workspace_message(workspace: Workspace) -> pb.Workspace:
+    return pb.Workspace(
+        pose=pose_message(workspace.pose),
+        size=workspace.size,
+        frame_id=workspace.frame_id,
+        stamp=given(stamp_message, workspace.stamp),
+    )
+
+
+def options_message(options: Options) -> pb.Options:
+    return pb.Options(
+        model=options.model,
+        version=options.version,
+        threshold=options.threshold,
+        force=options.force,
+        max_grasps=options.max_grasps,
+        explain=options.explain,
+        region=given(box_message, options.region),
+        approach=given(cone_message, options.approach),
+        min_height=options.min_height,
+        gripper=given(gripper_message, options.gripper),
+        collision=given(collision_message, options.collision),
+        convention=given(convention_message, options.convention),
+        pregrasp_distance=options.pregrasp_distance,
+        retreat=given(retreat_message, options.retreat),
+    )
+
+
+def box_message(box: Box) -> pb.Box:
+    return pb.Box(min=vector_message(box.min), max=vector_message(box.max))
+
+
+def cone_message(cone: Cone) -> pb.Cone:
+    return pb.Cone(axis=vector_message(cone.axis), angle=cone.angle)
+
+
+def gripper_message(gripper: Gripper) -> pb.Gripper:
+    return pb.Gripper(
+        max_opening=gripper.max_opening,
+        finger_depth=gripper.finger_depth,
+        finger_width=gripper.finger_width,
+        finger_breadth=gripper.finger_breadth,
+        palm=given(box_message, gripper.palm),
+    )
+
+
+def collision_message(check: CollisionCheck) -> pb.CollisionCheck:
+    return pb.CollisionCheck(mode=f"MODE_{check.mode.upper()}", table_height=check.table_height)
+
+
+def convention_message(convention: Convention) -> pb.Convention:
+    return pb.Convention(
+        origin=f"ORIGIN_{convention.origin.upper()}",
+        closing_axis=f"CLOSING_AXIS_{convention.closing_axis.upper()}",
+        parent_from_grasp=pose_message(convention.parent_from_grasp),
+    )
+
+
+def retreat_message(retreat: Retreat) -> pb.Retreat:
+    direction = None if retreat.direction is None else vector_message(retreat.direction)
+    return pb.Retreat(distance=retreat.distance, direction=direction)
+
+
+def pose_message(pose: PoseLike | None) -> pb.Pose | None:
+    if pose is None:
+        return None
+    if not isinstance(pose, Pose):
+        pose = Pose.from_matrix(pose)
+    x, y, z, w = pose.quaternion
+    return pb.Pose(position=vector_message(pose.position), orientation=pb.Quaternion(x=x, y=y, z=z, w=w))
+
+
+def vector_message(vector: Vector) -> pb.Vector3:
+    x, y, z = vector
+    return pb.Vector3(x=x, y=y, z=z)
+
+
+def stamp_message(nanoseconds: int) -> Timestamp:
+    stamp = Timestamp()
+    stamp.FromNanoseconds(nanoseconds)
+    return stamp
+
+
+def outcome(message: pb.DetectGraspsStreamResponse) -> Detection | errors.Error:
+    return errors.from_reply(message) if message.HasField("error") else detection(message.response)
+
+
+def detection(message: pb.DetectGraspsResponse) -> Detection:
+    return Detection(
+        grasps=tuple(map(grasp, message.grasps)),
+        frame_id=message.frame_id,
+        stamp=message.stamp.ToNanoseconds() if message.HasField("stamp") else None,
+        model=message.model,
+        version=message.version,
+        latency=latency(message.latency),
+        dropped=dropped(message.dropped) if message.HasField("dropped") else None,
+        request_id=message.request_id,
+    )
+
+
+def grasp(message: pb.Grasp) -> Grasp:
+    return Grasp(
+        pose=pose(message.pose),
+        width=message.width,
+        quality=message.quality,
+        pregrasp=pose(message.pregrasp),
+        retreat=pose(message.retreat),
+        collides=message.collides if message.HasField("collides") else None,
+    )
+
+
+def pose(message: pb.Pose) -> Pose:
+    p, q = message.position, message.orientation
+    return Pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+
+
+def latency(message: pb.Latency) -> Latency:
+    return Latency(
+        queue=message.queue,
+        preprocessing=message.preprocessing,
+        fusion=message.fusion,
+        inference=message.inference,
+        postprocessing=message.postprocessing,
+        total=message.total,
+    )
+
+
+def dropped(message: pb.Dropped) -> Dropped:
+    return Dropped(
+        below_threshold=message.below_threshold,
+        mask=message.mask,
+        width=message.width,
+        border=message.border,
+        region=message.region,
+        approach=message.approach,
+        height=message.height,
+        suppressed=message.suppressed,
+        collision=message.collision,
+        over_limit=message.over_limit,
+    )
+
+
+def models(message: pb.ListModelsResponse) -> tuple[Model, ...]:
+    return tuple(map(model, message.models))
+
+
+def model(message: pb.Model) -> Model:
+    return Model(
+        name=message.name,
+        version=message.version,
+        resolution=message.resolution,
+        voxel_size=message.voxel_size,
+        threshold=message.threshold,
+        sha256=message.sha256,
+        provenance=dict(message.provenance),
+        provider=message.provider,
+        precision=message.precision,
+    )
+
+
+def is_serving(message: HealthCheckResponse) -> bool:
+    return bool(message.status == HealthCheckResponse.SERVING)

@@ -1,0 +1,586 @@
+"""The package client/python, installed into a fresh folder, against graspd.
+
+    GRASPD=target/release/graspd GRASPD_MODELS=models/zoo ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
+    $(python3 deploy/native.py python) -m unittest discover --start-directory tests/python --pattern test_package.py
+"""
+
+import asyncio
+import atexit
+import itertools
+import os
+import pickle
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import unittest
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields, replace
+from pathlib import Path
+
+import grpc
+import numpy as np
+import scene
+from scipy.spatial.transform import Rotation
+from server import Server
+
+PACKAGE = Path(__file__).resolve().parents[2] / "client/python"
+INSTALLED = tempfile.TemporaryDirectory()
+atexit.register(INSTALLED.cleanup)
+# As a user would, but with the packages that are here.
+PIP = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--target"]
+subprocess.run([*PIP, INSTALLED.name, PACKAGE], check=True)
+sys.path.insert(0, INSTALLED.name)
+
+import graspd
+import graspd.aio
+from graspd import grasp_pb2
+
+CAMERAS = [scene.camera(30, -90), scene.camera(40, 90)]
+LOW = graspd.Options(threshold=0.5)
+OPTIONS = ["Options", "Box", "Cone", "Gripper", "CollisionCheck", "Convention", "Retreat"]
+
+
+def views(cameras=CAMERAS):
+    return [graspd.DepthView(scene.depth(pose), scene.K, camera_from_task=pose) for pose in cameras]
+
+
+def positions(detection):
+    return np.array([grasp.pose.position for grasp in detection.grasps])
+
+
+def readme():
+    """Its example."""
+    (example,) = re.findall(r"```python\n(.*?)```", (PACKAGE / "README.md").read_text(), re.DOTALL)
+    return example
+
+
+class ServerTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.server = cls.enterClassContext(Server("--max-tracked", 1))
+        cls.client = cls.enterClassContext(graspd.Client(cls.server.grpc))
+
+
+class DetectTest(ServerTest):
+    def test_the_grasps_are_at_the_block(self):
+        found = self.client.detect(scene.volume(*CAMERAS), LOW, request_id="from python")
+        self.assertTrue(found.grasps and all(map(scene.is_at_the_block, found.grasps)), found)
+        self.assertEqual(list(found.grasps), sorted(found.grasps, key=lambda grasp: -grasp.quality))
+        self.assertEqual((found.request_id, found.model, found.stamp), ("from python", "vgn-packed", None))
+        self.assertTrue(found.latency.total > found.latency.inference > 0)
+        for grasp in found.grasps:
+            back = np.linalg.inv(grasp.pose.matrix()) @ grasp.pregrasp.matrix()
+            np.testing.assert_allclose(back[:3, 3], [0, 0, -0.05], atol=1e-9)
+            self.assertIsNone(grasp.collides)
+        best = self.client.detect(scene.volume(*CAMERAS), replace(LOW, max_grasps=1, explain=True))
+        self.assertEqual(best.grasps, found.grasps[:1])
+        self.assertEqual(best.dropped.over_limit, len(found.grasps) - 1)
+        self.assertEqual(sum(vars(best.dropped).values()) + 1, scene.RESOLUTION**3)
+
+    def test_volumes_come_in_every_dtype_and_order(self):
+        values = scene.volume(*CAMERAS)
+        steps = np.rint(values * 255).astype(np.uint8)
+        for same in [
+            [values, values.astype(float), values.astype(">f4"), np.asfortranarray(values), values[None]],
+            [values.astype(np.float16), graspd.Volume(values, dtype=np.float16)],
+            [steps, graspd.Volume(values, dtype=np.uint8), graspd.Volume(steps / 255, dtype="f4")],
+        ]:
+            first, *others = [self.client.detect(volume, LOW).grasps for volume in same]
+            self.assertTrue(first and all(map(scene.is_at_the_block, first)))
+            for other in others:
+                self.assertEqual(other, first)
+
+    def test_poses_move_the_grasps_and_stamps_come_back(self):
+        pose = graspd.Pose((0.5, -0.2, 0.1), (0.0, 0.0, 0.6, 0.8))
+        own = self.client.detect(scene.volume(*CAMERAS), LOW)
+        for given in [pose, pose.matrix()]:
+            volume = graspd.Volume(scene.volume(*CAMERAS), pose=given, frame_id="base", stamp=1_700_000_000_123_456_789)
+            moved = self.client.detect(volume, LOW)
+            self.assertEqual((moved.frame_id, moved.stamp), ("base", volume.stamp))
+            for grasp, other in zip(own.grasps, moved.grasps, strict=True):
+                np.testing.assert_allclose(other.pose.matrix(), pose.matrix() @ grasp.pose.matrix(), atol=1e-6)
+
+    def test_depth_is_answered_like_the_volume_that_it_makes(self):
+        pose = graspd.Pose((0.4, 0.0, 1.1), (0.0, 0.0, 0.6, 0.8))
+        workspace = graspd.Workspace(pose, size=0.3, frame_id="base", stamp=7)
+        wanted = self.client.detect(graspd.Volume(scene.volume(*CAMERAS), pose=pose), LOW)
+        found = self.client.detect_from_depth(views(), workspace, LOW)
+        np.testing.assert_allclose(positions(found), positions(wanted), atol=1e-6)
+        self.assertEqual((found.frame_id, found.stamp), ("base", 7))
+        self.assertTrue(found.latency.total > found.latency.fusion > 0)
+
+        # As hand-eye calibration gives the poses, in the millimetres of a driver.
+        millimetres = [
+            graspd.DepthView(
+                np.rint(scene.depth(camera) * 1e3).astype(np.uint16),
+                scene.K,
+                frame_from_camera=pose.matrix() @ np.linalg.inv(camera),
+            )
+            for camera in CAMERAS
+        ]
+        rounded = self.client.detect_from_depth(millimetres, workspace, LOW)
+        np.testing.assert_allclose(positions(rounded)[0], positions(found)[0], atol=0.01)
+
+    def test_points_are_answered_like_the_depth_that_they_were_seen_in(self):
+        clouds = [graspd.CloudView(scene.cloud(pose), (0, 0, 0), np.linalg.inv(pose)) for pose in CAMERAS]
+        for model in ["vgn-packed", "gpd", "shaf"]:
+            found = self.client.detect_from_cloud(clouds, options=graspd.Options(model=model))
+            self.assertTrue(found.grasps and all(map(scene.is_at_the_block, found.grasps)), found)
+            self.assertEqual(found.model, model)
+
+    def test_the_models_are_listed(self):
+        network, gpd, shaf = self.client.models()
+        self.assertEqual([network.name, gpd.name, shaf.name], ["vgn-packed", "gpd", "shaf"])
+        self.assertEqual((network.resolution, network.provider, shaf.resolution), (scene.RESOLUTION, "cpu", 0))
+        self.assertAlmostEqual(network.voxel_size, 0.0075)
+        self.assertTrue(network.sha256 and network.provenance and self.client.health())
+
+
+class OptionsTest(ServerTest):
+    def ask(self, **options):
+        options = graspd.Options(**{"model": "shaf", "explain": True, **options})
+        return self.client.detect_from_depth(views(), options=options)
+
+    def tips(self, found, finger_depth=0.05):
+        return np.array([(grasp.pose.matrix() @ [0, 0, finger_depth, 1])[:3] for grasp in found.grasps])
+
+    def test_where_grasps_are_is_kept(self):
+        every = self.ask()
+        inside = self.ask(region=graspd.Box((0.1, 0.0, 0.0), np.array([0.2, 0.15, 0.3])))
+        self.assertTrue(0 < len(inside.grasps) < len(every.grasps) and inside.dropped.region > 0)
+        self.assertTrue((self.tips(inside)[:, 1] <= 0.15).all())
+        steep = self.ask(approach=graspd.Cone((0, 0, -3), 0.3))
+        self.assertTrue(0 < len(steep.grasps) < len(every.grasps) and steep.dropped.approach > 0)
+        self.assertTrue(all(grasp.pose.matrix()[2, 2] <= -np.cos(0.3) for grasp in steep.grasps))
+        high = self.ask(min_height=0.12)
+        self.assertTrue(0 < len(high.grasps) < len(every.grasps) and high.dropped.height > 0)
+        self.assertTrue((self.tips(high)[:, 2] >= 0.1199).all())
+
+    def test_hands_that_would_meet_something_are_marked_or_dropped(self):
+        off, flagged, filtered, buried = (
+            self.ask(model="vgn-packed", threshold=0.1, collision=graspd.CollisionCheck(*check))
+            for check in [("off",), ("flag",), ("filter",), ("flag", 0.3)]
+        )
+        free = [grasp for grasp in flagged.grasps if not grasp.collides]
+        self.assertTrue(0 < len(free) < len(flagged.grasps))
+        self.assertEqual([replace(grasp, collides=None) for grasp in flagged.grasps], list(off.grasps))
+        self.assertEqual(positions(filtered).tolist(), [list(grasp.pose.position) for grasp in free])
+        self.assertEqual(filtered.dropped.collision, len(flagged.grasps) - len(free))
+        self.assertTrue(all(grasp.collides for grasp in buried.grasps), "under a table")
+
+    def test_poses_are_told_as_the_robot_wants_them(self):
+        own = self.ask()
+        up = graspd.Retreat(0.2, direction=(0, 0, 1))
+        tcp = self.ask(convention=graspd.Convention("tcp", "x"), pregrasp_distance=0.12, retreat=up)
+        flange = graspd.Pose((0.0, 0.0, 0.1034))
+        parent = self.ask(convention=graspd.Convention("parent", parent_from_grasp=flange))
+        turn = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+        for grasp, told, link in zip(own.grasps, tcp.grasps, parent.grasps, strict=True):
+            hand = np.linalg.inv(grasp.pose.matrix())
+            offset = hand @ told.pose.matrix()
+            np.testing.assert_allclose(offset[:3, 3], [0, 0, 0.05], atol=1e-6)
+            np.testing.assert_allclose(offset[:3, :3], turn, atol=1e-6)
+            np.testing.assert_allclose((hand @ told.pregrasp.matrix())[:3, 3], [0, 0, 0.05 - 0.12], atol=1e-6)
+            lifted = np.subtract(told.retreat.position, told.pose.position)
+            np.testing.assert_allclose(lifted, [0, 0, 0.2], atol=1e-6)
+            np.testing.assert_allclose(hand @ link.pose.matrix() @ flange.matrix(), np.eye(4), atol=1e-6)
+
+    def test_a_longer_hand_has_its_fingertips_in_the_same_place(self):
+        palm = graspd.Box((-0.02, -0.05, -0.1), (0.02, 0.05, 0.0))
+        own = self.ask(model="vgn-packed")
+        found = self.ask(model="vgn-packed", gripper=graspd.Gripper(0.08, 0.1, 0.01, 0.02, palm))
+        np.testing.assert_allclose(self.tips(found, 0.1), self.tips(own), atol=1e-6)
+        narrow = self.ask(model="vgn-packed", gripper=graspd.Gripper(0.04, 0.05, 0.01, 0.02))
+        self.assertTrue(0 < len(narrow.grasps) < len(own.grasps) and narrow.dropped.width > 0)
+
+
+class MistakesTest(ServerTest):
+    def test_the_server_names_the_field(self):
+        volume, view = scene.volume(*CAMERAS), views()[0]
+        unseen = volume.copy()
+        unseen[1, 2, 3] = np.nan
+        detect, from_depth = self.client.detect, self.client.detect_from_depth
+        parent = graspd.Convention("parent")
+        long = graspd.Pose(quaternion=(0, 0, 0, 2))
+        for ask, field in [
+            (lambda: detect(unseen), "volume.data"),
+            (lambda: detect(graspd.Volume(volume, voxel_size=0.01)), "volume.voxel_size"),
+            (lambda: detect(graspd.Volume(volume, pose=long)), "volume.pose.orientation"),
+            (lambda: detect(volume, graspd.Options(threshold=2.0)), "options.threshold"),
+            (lambda: detect(volume, graspd.Options(region=graspd.Box((0, 0, 1), (1, 1, 0)))), "options.region.max.z"),
+            (lambda: detect(volume, graspd.Options(convention=parent)), "options.convention.parent_from_grasp"),
+            (lambda: from_depth([view, replace(view, k=view.k.T)]), "views[1].camera.k"),
+            (lambda: from_depth([]), "views"),
+            (lambda: from_depth([view], graspd.Workspace(size=0.5)), "workspace.size"),
+        ]:
+            with self.subTest(field), self.assertRaises(graspd.InvalidArgument) as caught:
+                ask()
+            error = caught.exception
+            self.assertEqual((error.field, error.code), (field, grpc.StatusCode.INVALID_ARGUMENT))
+            self.assertTrue(error.message.startswith(field) and error.request_id)
+            self.assertEqual(vars(pickle.loads(pickle.dumps(error))), vars(error))
+
+    def test_a_model_that_is_not_there(self):
+        with self.assertRaisesRegex(graspd.NotFound, "NOT_FOUND: .* there are vgn-packed 2, gpd 1, shaf 1") as caught:
+            self.client.detect(scene.volume(*CAMERAS), graspd.Options(model="nobody"), request_id="mine")
+        self.assertEqual(caught.exception.request_id, "mine")
+
+    def test_what_cannot_be_asked_is_a_value_error(self):
+        volume, depth, pose = scene.volume(*CAMERAS), scene.depth(CAMERAS[0]), np.eye(4)
+        never = graspd.CollisionCheck("never")
+        for ask, said in [
+            (lambda: graspd.Volume(volume[:-1]), r"not an array of shape \(39, 40, 40\)"),
+            (lambda: graspd.Volume(np.zeros((0, 0, 0))), "not an array of shape"),
+            (lambda: graspd.DepthView(depth[None], scene.K, camera_from_task=pose), "row"),
+            (lambda: graspd.DepthView(depth, scene.K), "one of camera_from_task and frame_from_camera"),
+            (lambda: graspd.CloudView(depth, (0, 0, 0)), "x, y, z"),
+            (lambda: graspd.Pose.from_matrix(2 * pose), "a rotation and a shift"),
+            (lambda: graspd.Pose.from_matrix(pose[:3]), "4 × 4"),
+            (lambda: self.client.detect(graspd.Volume(volume, dtype=int)), "not as int64"),
+            (lambda: self.client.detect(graspd.Volume(2 * volume, dtype=np.uint8)), r"in \[0, 1\]"),
+            (lambda: self.client.detect_from_depth([replace(views()[0], depth=depth.astype(int))]), "not of int64"),
+            (lambda: self.client.detect(volume, graspd.Options(collision=never)), "MODE_NEVER"),
+            (lambda: graspd.Client("127.0.0.1:1", tls_cert="a.pem"), "belong together"),
+            (lambda: graspd.Client("127.0.0.1:1", token=" "), "the token is empty"),
+            (lambda: graspd.Client("127.0.0.1:1", token="two\nlines"), "the token"),
+        ]:
+            with self.subTest(said), self.assertRaisesRegex(ValueError, said):
+                ask()
+
+    def test_time_that_is_up_and_nobody_there(self):
+        volume = scene.volume(*CAMERAS)
+        with graspd.Client(self.server.grpc, timeout=1e-4) as client, self.assertRaises(graspd.DeadlineExceeded):
+            client.detect(volume)
+        with graspd.Client("127.0.0.1:1", retry=graspd.Retry.NONE) as client, self.assertRaises(graspd.Unavailable):
+            client.detect(volume)
+
+
+class StreamTest(ServerTest):
+    def test_a_stream_answers_in_order(self):
+        volume = scene.volume(*CAMERAS)
+        volumes = [graspd.Volume(volume if i != 3 else 2 * volume, frame_id=str(i)) for i in range(8)]
+        answers = list(self.client.detect_stream(iter(volumes), LOW))
+        refused = answers.pop(3)
+        self.assertIsInstance(refused, graspd.InvalidArgument)
+        self.assertTrue(refused.message.startswith("volume.data[") and refused.request_id)
+        self.assertEqual([answer.frame_id for answer in answers], [str(i) for i in range(8) if i != 3])
+        self.assertTrue(all(answer.grasps == answers[0].grasps for answer in answers))
+
+    def test_what_ends_the_volumes_is_raised_after_their_answers(self):
+        def volumes():
+            yield scene.volume(*CAMERAS)
+            raise OSError("the camera is unplugged")
+
+        answers = self.client.detect_stream(volumes(), LOW)
+        self.assertTrue(next(answers).grasps)
+        with self.assertRaisesRegex(OSError, "unplugged"):
+            next(answers)
+
+    def test_a_server_that_goes_ends_the_stream_with_an_error(self):
+        with Server() as server, graspd.Client(server.grpc) as client:
+            answers = client.detect_stream(itertools.repeat(scene.volume(*CAMERAS)))
+            next(answers)
+            server.process.terminate()
+            with self.assertRaises(graspd.Unavailable):
+                list(answers)
+
+    def test_one_may_leave_a_stream(self):
+        for _ in self.client.detect_stream(itertools.repeat(scene.volume(*CAMERAS))):
+            break
+        self.assertTrue(self.client.detect(scene.volume(*CAMERAS), LOW).grasps)
+
+
+TRACKED = "graspd_tracked_volumes"
+
+
+class TrackTest(ServerTest):
+    def wait_until_none_is_tracked(self):
+        while self.server.metric(TRACKED):
+            time.sleep(0.01)
+
+    def test_each_view_is_added_to_those_before_it(self):
+        cameras = [scene.camera(40, azimuth) for azimuth in (-90, 0, 90)]
+        workspace = graspd.Workspace(np.linalg.inv(scene.camera(40, 0)), frame_id="base")
+        with self.client.track(workspace) as tracking:
+            for seen, view in enumerate(views(cameras), 1):
+                kept = tracking.add([view], LOW if seen == 1 else None)
+                wanted = self.client.detect_from_depth(views(cameras[:seen]), workspace, LOW)
+                self.assertTrue(kept.grasps)
+                np.testing.assert_allclose(positions(kept), positions(wanted), atol=1e-9)
+                self.assertEqual((kept.frame_id, self.server.metric(TRACKED)), ("base", 1))
+            self.assertEqual(tracking.add(options=replace(LOW, max_grasps=1)).grasps, kept.grasps[:1])
+        self.wait_until_none_is_tracked()
+
+    def test_a_bad_view_costs_neither_the_stream_nor_the_volume(self):
+        good = views()[0]
+        behind = np.eye(4)
+        behind[:3, 3] = [-0.15, -0.15, -1.0]
+        bad = replace(good, camera_from_task=behind)
+        with self.client.track() as tracking:
+            for _ in range(2):
+                with self.assertRaisesRegex(graspd.InvalidArgument, r"views\[0\] is blind"):
+                    tracking.add([bad], LOW)
+                kept = tracking.add([good], LOW)
+            self.assertEqual(tracking.add().grasps, kept.grasps)
+        self.wait_until_none_is_tracked()
+
+    def test_as_many_volumes_are_kept_as_were_allowed_and_none_for_ever(self):
+        with self.client.track() as tracking:
+            tracking.add(views(), LOW)
+            with self.client.track() as other, self.assertRaisesRegex(graspd.ResourceExhausted, "--max-tracked"):
+                other.add(views(), LOW)
+        with Server("--track-timeout", 0.3) as server, graspd.Client(server.grpc) as client:
+            seen = views()
+            with client.track() as tracking:
+                tracking.add(seen, LOW)
+                time.sleep(0.5)
+                for _ in range(2):
+                    with self.assertRaisesRegex(graspd.Aborted, "no view came"):
+                        tracking.add(seen, LOW)
+
+
+class RetryTest(unittest.TestCase):
+    REFUSED = 'graspd_requests_total{code="RESOURCE_EXHAUSTED",model="vgn-packed 2"}'
+    PATIENT = graspd.Retry(attempts=1000, pause=0.01, longest=0.1)
+
+    def test_who_is_refused_by_a_busy_server_comes_back(self):
+        volume = scene.volume(*CAMERAS)
+        with Server("--queue", 1) as server, ThreadPoolExecutor(8) as threads:
+            with graspd.Client(server.grpc, retry=graspd.Retry.NONE) as client:
+                calls = [threads.submit(client.detect, volume) for _ in range(64)]
+                refusals = [call.exception() for call in calls if call.exception()]
+            self.assertTrue(0 < len(refusals) < len(calls))
+            for refusal in refusals:
+                self.assertIsInstance(refusal, graspd.ResourceExhausted)
+                self.assertGreater(refusal.retry_after, 0)
+            before = server.metric(self.REFUSED)
+            self.assertEqual(before, len(refusals))
+            with graspd.Client(server.grpc, retry=self.PATIENT) as client:
+                self.assertTrue(all(found.grasps for found in threads.map(client.detect, [volume] * 64)))
+            self.assertGreater(server.metric(self.REFUSED), before)
+
+    def test_who_lost_the_server_finds_the_next_one(self):
+        volume = scene.volume(*CAMERAS)
+        with Server() as server:
+            client = self.enterContext(graspd.Client(server.grpc, retry=self.PATIENT))
+            self.assertTrue(client.detect(volume).grasps)
+        with ThreadPoolExecutor(1) as thread:
+            call = thread.submit(client.detect, volume)
+            # As long as it would take gRPC by itself to lose its patience.
+            time.sleep(3)
+            self.assertFalse(call.done())
+            with Server(listen=server.grpc):
+                started = time.monotonic()
+                self.assertTrue(call.result().grasps)
+                self.assertLess(time.monotonic() - started, 1.5)
+
+    def test_pauses_grow_up_to_the_longest_and_end(self):
+        retry = graspd.Retry(attempts=6, pause=0.1, longest=0.4)
+        busy = graspd.ResourceExhausted(grpc.StatusCode.RESOURCE_EXHAUSTED, "busy")
+        for attempts, most in enumerate([0.1, 0.2, 0.4, 0.4, 0.4], 1):
+            self.assertTrue(most / 2 <= retry.after(attempts, busy) <= most)
+        self.assertIsNone(retry.after(6, busy))
+        self.assertEqual(retry.after(1, replace(busy, retry_after=3.0)), 3.0)
+        self.assertIsNone(retry.after(1, graspd.Internal(grpc.StatusCode.INTERNAL, "it failed")))
+        self.assertLessEqual(replace(retry, attempts=10**6).after(10**5, busy), 0.4)
+
+
+class SecurityTest(unittest.TestCase):
+    def setUp(self):
+        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+
+    def test_only_bearers_of_a_token_are_answered(self):
+        file = self.folder / "tokens"
+        file.write_text("good-secret\n")
+        with Server("--token-file", file) as server:
+            with graspd.Client(server.grpc, token="good-secret\n") as client:
+                self.assertEqual(len(client.models()), 3)
+                (found,) = client.detect_stream([scene.volume(*CAMERAS)], LOW)
+                self.assertTrue(found.grasps)
+                with client.track() as tracking:
+                    self.assertTrue(tracking.add(views(), LOW).grasps)
+            for token in ["bad-secret", None]:
+                with graspd.Client(server.grpc, token=token) as client:
+                    self.assertTrue(client.health(), "a probe has no token")
+                    with self.assertRaises(graspd.Unauthenticated) as caught:
+                        client.models()
+                    self.assertNotIn("secret", repr(caught.exception))
+
+    def certificate(self, name, signer=None):
+        """Writes NAME.pem and NAME.key: a CA, or what one has signed for this machine."""
+        signed = ["-CA", f"{signer}.pem", "-CAkey", f"{signer}.key", "-addext", "basicConstraints=critical,CA:FALSE"]
+        subprocess.run(
+            ["openssl", "req", "-x509", "-noenc", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1"]
+            + ["-subj", f"/CN={name}", "-addext", "subjectAltName=IP:127.0.0.1"]
+            + ["-out", f"{name}.pem", "-keyout", f"{name}.key"]
+            + (signed if signer else []),
+            cwd=self.folder,
+            check=True,
+            capture_output=True,
+        )
+        return self.folder / f"{name}.pem", self.folder / f"{name}.key"
+
+    @unittest.skipUnless(shutil.which("openssl"), "there is no openssl to make certificates with")
+    def test_over_tls_both_sides_show_who_they_are(self):
+        (ca, _), (stranger, _) = self.certificate("ca"), self.certificate("stranger")
+        cert, key = self.certificate("server", "ca")
+        client_cert, client_key = self.certificate("client", "ca")
+        known = {"tls_ca": ca, "tls_cert": client_cert, "tls_key": str(client_key)}
+        with Server("--tls-cert", cert, "--tls-key", key, "--tls-client-ca", ca) as server:
+            with graspd.Client(server.grpc, **known) as client:
+                self.assertTrue(client.detect(scene.volume(*CAMERAS), LOW).grasps)
+            for other in [{}, {"tls_ca": ca}, known | {"tls_ca": stranger}]:
+                client = graspd.Client(f"https://{server.grpc}", retry=graspd.Retry.NONE, **other)
+                with client, self.assertRaises(graspd.Unavailable):
+                    client.models()
+
+
+class AsyncioTest(unittest.IsolatedAsyncioTestCase):
+    def setUp(self):
+        self.server = self.enterContext(Server("--queue", 1, "--track-timeout", 1))
+
+    async def asyncSetUp(self):
+        self.client = await self.enterAsyncContext(graspd.aio.Client(self.server.grpc, retry=RetryTest.PATIENT))
+
+    async def test_it_answers_what_the_other_client_answers(self):
+        volume = scene.volume(*CAMERAS)
+        clouds = [graspd.CloudView(scene.cloud(pose), (0, 0, 0), np.linalg.inv(pose)) for pose in CAMERAS]
+        with graspd.Client(self.server.grpc) as other:
+            for ask in [
+                lambda client: client.detect(volume, LOW),
+                lambda client: client.detect_from_depth(views(), options=LOW),
+                lambda client: client.detect_from_cloud(clouds, options=LOW),
+            ]:
+                found = await ask(self.client)
+                self.assertTrue(found.grasps)
+                self.assertEqual(found.grasps, ask(other).grasps)
+            self.assertEqual(await self.client.models(), other.models())
+        self.assertTrue(await self.client.health())
+
+    async def test_calls_run_at_the_same_time_and_come_back(self):
+        volume = scene.volume(*CAMERAS)
+        found = await asyncio.gather(*(self.client.detect(volume, LOW) for _ in range(32)))
+        self.assertTrue(all(answer.grasps == found[0].grasps for answer in found))
+        self.assertGreater(self.server.metric(RetryTest.REFUSED), 0)
+
+    async def test_mistakes_are_told(self):
+        with self.assertRaises(graspd.InvalidArgument) as caught:
+            await self.client.detect(scene.volume(*CAMERAS), graspd.Options(threshold=2.0))
+        self.assertEqual(caught.exception.field, "options.threshold")
+        async with graspd.aio.Client("127.0.0.1:1", retry=graspd.Retry.NONE) as client:
+            with self.assertRaises(graspd.Unavailable):
+                await client.models()
+
+    async def test_a_stream_answers_in_order_until_it_breaks(self):
+        volume = scene.volume(*CAMERAS)
+
+        async def volumes():
+            for index in range(4):
+                yield graspd.Volume(volume if index != 1 else 2 * volume, frame_id=str(index))
+            raise OSError("the camera is unplugged")
+
+        answers = []
+        with self.assertRaisesRegex(OSError, "unplugged"):
+            async for answer in self.client.detect_stream(volumes(), LOW):
+                answers.append(answer)
+        self.assertIsInstance(answers.pop(1), graspd.InvalidArgument)
+        self.assertEqual([answer.frame_id for answer in answers], ["0", "2", "3"])
+
+    async def test_a_volume_is_tracked(self):
+        async with self.client.track(graspd.Workspace(frame_id="base")) as tracking:
+            with self.assertRaisesRegex(graspd.InvalidArgument, "views"):
+                await tracking.add([replace(views()[0], k=np.eye(3))])
+            one = await tracking.add(views()[:1], LOW)
+            both = await tracking.add(views()[1:])
+            wanted = await self.client.detect_from_depth(views(), options=LOW)
+            self.assertEqual((one.frame_id, both.grasps), ("base", wanted.grasps))
+            await asyncio.sleep(1.2)
+            for _ in range(2):
+                with self.assertRaises(graspd.Aborted):
+                    await tracking.add(views())
+
+
+class PackageTest(ServerTest):
+    def setUp(self):
+        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+
+    def run_python(self, *arguments, **environment):
+        command = [sys.executable, *map(str, arguments)]
+        environment = {**os.environ, "PYTHONPATH": INSTALLED.name, **environment}
+        result = subprocess.run(command, cwd=self.folder, env=environment, capture_output=True, text=True)
+        self.assertEqual(result.returncode, 0, result.stdout + result.stderr)
+        return result.stdout
+
+    def test_the_readme_does_what_it_says(self):
+        frame_from_camera = np.linalg.inv(CAMERAS[0])
+        frame_from_camera[:3, 3] += [0.4, -0.15, 0.0]
+        arrays = {"volume": scene.volume(*CAMERAS), "depth": scene.depth(CAMERAS[0]), "k": scene.K}
+        for name, array in {**arrays, "camera": frame_from_camera}.items():
+            np.save(self.folder / f"{name}.npy", array)
+        example = self.folder / "example.py"
+        # The page's port may be taken on this machine.
+        example.write_text(readme().replace("127.0.0.1:50051", self.server.grpc))
+        said = self.run_python(example)
+        self.assertRegex(said, r"^0\.9\d+ 0\.0\d+ \(.*\) \(.*\)\n")
+        self.assertIn("workspace.size is wrong: workspace.size is -1, must be above 0", said)
+        self.run_python("-m", "mypy", "--strict", "--cache-dir", self.folder / "cache", example)
+
+    def test_the_types_are_right(self):
+        config = ["--config-file", PACKAGE / "pyproject.toml", "--cache-dir", self.folder / "cache"]
+        self.run_python("-m", "mypy", *config, Path(INSTALLED.name) / "graspd")
+
+    def test_a_source_distribution_builds_anywhere(self):
+        build = [sys.executable, "-m", "hatchling", "build", "--target", "sdist", "--directory", self.folder]
+        subprocess.run(build, cwd=PACKAGE, check=True, capture_output=True)
+        (archive,) = self.folder.glob("graspd-*.tar.gz")
+        subprocess.run([*PIP, self.folder / "installed", archive], check=True)
+        installed, ours = (
+            {path.relative_to(root): path.read_bytes() for path in (root / "graspd").glob("*.py*")}
+            for root in [self.folder / "installed", Path(INSTALLED.name)]
+        )
+        self.assertEqual(installed, ours)
+
+    def test_everything_of_the_interface_has_its_place(self):
+        for ours, theirs in [
+            *((getattr(graspd, name), getattr(grasp_pb2, name)) for name in OPTIONS),
+            (graspd.Detection, grasp_pb2.DetectGraspsResponse),
+            (graspd.Grasp, grasp_pb2.Grasp),
+            (graspd.Latency, grasp_pb2.Latency),
+            (graspd.Dropped, grasp_pb2.Dropped),
+            (graspd.Model, grasp_pb2.Model),
+            (graspd.Workspace, grasp_pb2.Workspace),
+        ]:
+            with self.subTest(ours.__name__):
+                self.assertEqual({field.name for field in fields(ours)}, set(theirs.DESCRIPTOR.fields_by_name))
+
+
+class PoseTest(unittest.TestCase):
+    def test_a_matrix_and_back(self):
+        turns = Rotation.random(1000, rng=1).as_matrix().tolist()
+        turns += Rotation.from_rotvec(np.pi * np.vstack([np.eye(3), [0.6, 0.8, 0.0]])).as_matrix().tolist()
+        for turn in [np.eye(3), *turns]:
+            matrix = np.eye(4)
+            matrix[:3, :3], matrix[:3, 3] = turn, (0.1, -0.2, 3.0)
+            pose = graspd.Pose.from_matrix(matrix)
+            np.testing.assert_allclose(pose.matrix(), matrix, atol=1e-12)
+            np.testing.assert_allclose(Rotation.from_quat(pose.quaternion).as_matrix(), turn, atol=1e-12)
+
+    def test_what_is_no_pose_is_refused(self):
+        pose = Rotation.from_euler("xyz", [0.1, 0.2, 0.3])
+        for spoil in [
+            lambda matrix: 2 * matrix,
+            lambda matrix: matrix * np.nan,
+            lambda matrix: matrix[[1, 0, 2, 3]],
+            lambda matrix: matrix + np.eye(4)[:, [1, 2, 0, 3]],
+        ]:
+            matrix = np.eye(4)
+            matrix[:3, :3] = pose.as_matrix()
+            with self.assertRaisesRegex(ValueError, "a rotation and a shift"):
+                graspd.Pose.from_matrix(spoil(matrix))
+
+
+if __name__ == "__main__":
+    unittest.main()
