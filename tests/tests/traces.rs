@@ -17,7 +17,7 @@ use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status};
 
 /// Speaks OTLP, and hands on what it is told.
-struct Collector(mpsc::UnboundedSender<ExportTraceServiceRequest>);
+struct Collector(mpsc::Sender<ExportTraceServiceRequest>);
 
 #[tonic::async_trait]
 impl TraceService for Collector {
@@ -25,15 +25,15 @@ impl TraceService for Collector {
         &self,
         request: Request<ExportTraceServiceRequest>,
     ) -> Result<Response<ExportTraceServiceResponse>, Status> {
-        let _ = self.0.send(request.into_inner());
+        self.0.send(request.into_inner()).await.map_err(|_| Status::unavailable("the test is over"))?;
         Ok(Response::new(ExportTraceServiceResponse::default()))
     }
 }
 
-async fn collector() -> (SocketAddr, mpsc::UnboundedReceiver<ExportTraceServiceRequest>) {
+async fn collector() -> (SocketAddr, mpsc::Receiver<ExportTraceServiceRequest>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
-    let (told, exports) = mpsc::unbounded_channel();
+    let (told, exports) = mpsc::channel(16);
     let service = TraceServiceServer::new(Collector(told));
     tokio::spawn(
         tonic::transport::Server::builder().add_service(service).serve_with_incoming(TcpIncoming::from(listener)),
