@@ -15,9 +15,11 @@ RELEASE = $(CARGO_TARGET_DIR)/release
 # Put before a command. Each stops the recipe if it cannot be had.
 with_onnxruntime = ORT_DYLIB_PATH="$$($(PYTHON) deploy/native.py onnxruntime)" && export ORT_DYLIB_PATH &&
 with_python = GRASPD_PYTHON="$$($(PYTHON) deploy/native.py python)" && export GRASPD_PYTHON &&
-with_prometheus = GRASPD_PROMETHEUS="$$($(PYTHON) deploy/native.py prometheus)" && export GRASPD_PROMETHEUS && \
-	GRASPD_PROMTOOL="$$($(PYTHON) deploy/native.py promtool)" && export GRASPD_PROMTOOL &&
-with_cpp = GRASPD_CPP="$$($(PYTHON) deploy/native.py cpp)" && export GRASPD_CPP &&
+# The real ones, which tests run.
+with_programs = GRASPD_PROMETHEUS="$$($(PYTHON) deploy/native.py prometheus)" && export GRASPD_PROMETHEUS && \
+	GRASPD_PROMTOOL="$$($(PYTHON) deploy/native.py promtool)" && export GRASPD_PROMTOOL && \
+	GRASPD_CPP="$$($(PYTHON) deploy/native.py cpp)" && export GRASPD_CPP && \
+	GRASPD_CHROMIUM="$$($(PYTHON) deploy/native.py chromium)" && export GRASPD_CHROMIUM &&
 with_libtorch = LIBTORCH="$$($(PYTHON) deploy/native.py libtorch)" && export LIBTORCH && \
 	LD_LIBRARY_PATH="$$LIBTORCH/lib$${LD_LIBRARY_PATH:+:$$LD_LIBRARY_PATH}" && export LD_LIBRARY_PATH &&
 
@@ -58,13 +60,13 @@ deny: ## check licences, advisories and sources of the dependencies (needs cargo
 	$(CARGO) deny check
 
 test-rust: ## test all but training, the Python client's end-to-end tests included
-	$(with_onnxruntime) $(with_python) $(with_prometheus) $(with_cpp) $(CARGO) test $(WORKSPACE)
+	$(with_onnxruntime) $(with_python) $(with_programs) $(CARGO) test $(WORKSPACE)
 
 test-train: ## test training, in libtorch on the CPU
 	$(with_onnxruntime) $(with_libtorch) $(CARGO) test $(TRAIN)
 
 test-python: ## of test-rust, only the tests whose names say python
-	$(with_onnxruntime) $(with_python) $(with_prometheus) $(with_cpp) $(CARGO) test $(WORKSPACE) python
+	$(with_onnxruntime) $(with_python) $(with_programs) $(CARGO) test $(WORKSPACE) python
 
 test-faults: ## test what test leaves out: a replica killed behind haproxy, ten thousand connections
 	$(with_onnxruntime) $(with_haproxy) $(CARGO) test --package grasp-tests --locked \

@@ -219,7 +219,7 @@ def unpacked(name: str, packages: List[str], title: str, variable: str) -> Path:
         # PulseAudio's library has half of itself in a folder of its own.
         holding = [*part.glob("usr/lib/*-linux-gnu"), *part.glob("usr/lib/*-linux-gnu/pulseaudio")]
         libraries = os.pathsep.join(str(folder / path.relative_to(part)) for path in holding)
-        # A script for each program: the package may have several. What Chromium has in usr/bin is one that looks in /usr.
+        # A script for each program: the package may have several. Chromium's in usr/bin is one that looks in /usr.
         for program in [*part.glob("usr/bin/*"), *part.glob("usr/sbin/*"), *part.glob("usr/lib/chromium/chromium-*")]:
             script = part / program.name
             script.write_text(f'#!/bin/sh\nLD_LIBRARY_PATH="{libraries}" exec "{folder / program.relative_to(part)}" "$@"\n')

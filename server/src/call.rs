@@ -240,10 +240,11 @@ impl Call {
         let over_limit = over_limit as u32;
         let dropped = (asked.explain || grasps.is_empty()).then(|| pb::Dropped { over_limit, ..(&dropped).into() });
 
+        let finger_depth = asked.hand.map_or(grasp::FINGER_DEPTH, |hand| hand.depth);
         let total = self.started.elapsed();
         let timings = Timings { queue, preprocessing, fusion, inference, postprocessing, total };
         self.answered(&timings, grasps.len());
-        let outcome = Outcome::Answered(Box::new(Answered { timings, volume, grasps: found, collides }));
+        let outcome = Outcome::Answered(Box::new(Answered { timings, volume, grasps: found, collides, finger_depth }));
         self.recent.add(self.id.clone(), self.label.clone(), outcome);
         Ok(pb::DetectGraspsResponse {
             request_id: self.id.clone(),

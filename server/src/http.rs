@@ -63,7 +63,9 @@ async fn requests(Shared(pages): Shared<Pages>) -> Json<Value> {
 
 /// One of them, with the observed surface and the grasps.
 async fn request(Path(number): Path<u64>, Shared(pages): Shared<Pages>) -> Result<Json<Value>, StatusCode> {
-    pages.recent.get(number).map(Json).ok_or(StatusCode::NOT_FOUND)
+    // A mesh takes some milliseconds, which the threads that move messages do not have.
+    let found = tokio::task::spawn_blocking(move || pages.recent.get(number)).await;
+    found.ok().flatten().map(Json).ok_or(StatusCode::NOT_FOUND)
 }
 
 /// What is served, and what runs it.

@@ -193,7 +193,7 @@ impl Metrics {
 }
 
 /// As the gRPC specification writes it; the codes that this server ends requests with.
-fn code_name(code: Code) -> &'static str {
+pub(crate) fn code_name(code: Code) -> &'static str {
     match code {
         Code::Ok => "OK",
         Code::Cancelled => "CANCELLED",

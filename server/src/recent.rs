@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 use tokio::sync::watch;
 use tonic::Code;
 
+use crate::metrics::code_name;
 use crate::timings::Timings;
 
 /// The latest requests, for whoever looks at the page.
@@ -41,6 +42,8 @@ pub(crate) struct Answered {
     /// In the frame of the volume's pose.
     pub grasps: Vec<Grasp>,
     pub collides: Option<Vec<bool>>,
+    /// Length of the hand's fingers, metres.
+    pub finger_depth: f64,
 }
 
 impl Recent {
@@ -102,7 +105,7 @@ impl Ended {
                 "best": answered.grasps.first().map(|grasp| grasp.quality),
                 "latency": answered.timings.stages().collect::<BTreeMap<_, _>>(),
             }),
-            Outcome::Refused { code, message } => json!({ "code": format!("{code:?}"), "message": message }),
+            Outcome::Refused { code, message } => json!({ "code": code_name(*code), "message": message }),
         };
         if let (Some(value), Value::Object(more)) = (value.as_object_mut(), more) {
             value.extend(more);
@@ -115,14 +118,14 @@ impl Ended {
     fn whole(&self) -> Value {
         let mut value = self.short();
         if let (Some(object), Outcome::Answered(answered)) = (value.as_object_mut(), &self.outcome) {
-            let Answered { volume, grasps, collides, .. } = &**answered;
+            let Answered { volume, grasps, collides, finger_depth, .. } = &**answered;
             let SurfaceMesh { vertices, triangles } = Fusion::of(volume).mesh();
             let vertices = vertices.iter().flat_map(|v| [v.x, v.y, v.z].map(|number| (number * 1e4).round() / 1e4));
             let to_volume = volume.pose().inverse();
             let grasp = |(index, grasp): (usize, &Grasp)| {
                 let collides = collides.as_ref().and_then(|collides| collides.get(index));
                 let pose = parts(&(to_volume * grasp.pose));
-                json!({ "pose": pose, "width": grasp.width, "quality": grasp.quality, "collides": collides })
+                json!({ "pose": pose, "width": grasp.width, "depth": finger_depth, "quality": grasp.quality, "collides": collides })
             };
             object.insert("size".to_owned(), json!(volume.voxel_size() * volume.resolution() as f64));
             object.insert("vertices".to_owned(), vertices.collect());

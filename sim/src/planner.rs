@@ -14,6 +14,7 @@ use grasp_models::Options;
 use nalgebra::Isometry3;
 use rand_chacha::ChaCha8Rng;
 
+pub use self::server::depth_view;
 use crate::camera::{View, fuse};
 use crate::label::is_graspable;
 
@@ -58,7 +59,7 @@ pub enum PlannerSpec {
     Random,
     /// An ONNX network of VGN's signature.
     Network(PathBuf),
-    /// A running graspd.
+    /// A running graspd, which is sent the depth images.
     Server(String),
     /// The highest of the places where the hand fits.
     Highest,

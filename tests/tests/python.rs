@@ -44,6 +44,14 @@ fn prometheus_sees_what_the_dashboard_shows_seen_from_python() {
 }
 
 #[test]
+fn a_browser_shows_the_page_seen_from_python() {
+    // GRASPD_CHROMIUM is the environment's.
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo");
+    let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.as_os_str())];
+    run("test_page.py", &environment, "test_the_scene_is_drawn");
+}
+
+#[test]
 fn the_python_package_does_what_it_says() {
     let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo");
     let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.as_os_str())];

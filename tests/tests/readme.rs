@@ -16,9 +16,12 @@ fn blocks(language: &str) -> Vec<String> {
     readme.split(&fence).skip(1).map(|rest| rest.split("```").next().unwrap().to_owned()).collect()
 }
 
-/// What other recipes run: `make` itself, and training, which its own crate's tests run from this same page.
+/// What other recipes run: `make` itself, and training, which its own crate's tests run from this same page. And what needs
+/// a Docker engine.
 fn is_run_elsewhere(line: &str) -> bool {
-    ["make ", "cargo ", "export PATH", "export LIBTORCH", "grasp-train "].iter().any(|prefix| line.starts_with(prefix))
+    ["make ", "cargo ", "docker ", "export PATH", "export LIBTORCH", "grasp-train "]
+        .iter()
+        .any(|prefix| line.starts_with(prefix))
 }
 
 #[test]
@@ -36,7 +39,7 @@ fn every_make_target_of_the_readme_exists() {
 #[test]
 fn every_command_of_the_readme_works() {
     let folder = tempfile::tempdir().unwrap();
-    for name in ["models", "deploy", "proto"] {
+    for name in ["models", "deploy", "proto", "client"] {
         std::os::unix::fs::symlink(Path::new(ROOT).join(name), folder.path().join(name)).unwrap();
     }
     // The page's ports may be taken on this machine.
@@ -49,14 +52,16 @@ fn every_command_of_the_readme_works() {
             script += &format!("{} > server.log\n", line.trim_end_matches('&'));
             script = script.replace("> server.log\n", "> server.log & server=$!\ntrap 'kill $server' EXIT\n");
             script += "until grep -q ready server.log; do kill -0 $server; sleep 0.1; done\n";
+        } else if let Some(package) = line.strip_prefix("pip install ") {
+            // With what it is built by and what it needs from the interpreter of the tests, without a network.
+            let flags = "--quiet --no-index --no-build-isolation --no-deps --target site";
+            script += &format!("$GRASPD_PYTHON -m pip install {flags} {package}\n");
         } else {
             script += &format!("echo '$ {}'\n{line}\n", line.replace('\'', ""));
         }
     }
     script += &format!("cat > client.py <<'END'\n{}END\n", blocks("python").concat());
-    script +=
-        "$GRASPD_PYTHON -m grpc_tools.protoc -Iproto/proto --python_out=. --grpc_python_out=. grasp/v1/grasp.proto\n";
-    script += "$GRASPD_PYTHON client.py\n";
+    script += "PYTHONPATH=site $GRASPD_PYTHON client.py\n";
     script += "trap - EXIT; kill $server; wait $server\n";
     let script = script.replace("50051", &grpc).replace("9090", &http);
 

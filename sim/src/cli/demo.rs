@@ -3,13 +3,12 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 use comfy_table::{CellAlignment, Table, presets};
-use grasp::Intrinsics;
-use grasp_client::{Asked, Client, Depth, DepthView, Detection, Extrinsics, LocalServer, Options, Workspace};
+use grasp_client::{Asked, Client, DepthView, Detection, LocalServer, Options, Workspace};
 use grasp_picture::{Picture, quality_color};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
-use grasp_sim::camera::View;
 use grasp_sim::physics::World;
+use grasp_sim::planner::depth_view;
 use grasp_sim::trial::{Outcome, execute};
 use nalgebra::{UnitQuaternion, Vector3};
 
@@ -64,7 +63,7 @@ impl Demo {
             // Lower than anyone would execute: a picture should show what is weighed up, too.
             let asked = Asked { threshold: Some(0.5), ..Asked::default() };
             let options = Options { asked, ..Options::default() };
-            let views: Vec<DepthView> = observation.views.iter().map(view).collect();
+            let views: Vec<DepthView> = observation.views.iter().map(depth_view).collect();
             client.detect_from_depth(&views, &Workspace::default(), options).await
         })?;
         // With its runtime the client's connection closes, which the server would wait for when it is told to stop.
@@ -87,19 +86,6 @@ impl Demo {
         anyhow::ensure!(status.success(), "graspd did not stop cleanly: {status}");
         println!("graspd stopped cleanly");
         Ok(())
-    }
-}
-
-/// What the camera of the benchmark sends.
-fn view(view: &View) -> DepthView {
-    let Intrinsics { width, height, fx, fy, cx, cy } = Intrinsics::BENCHMARK;
-    DepthView {
-        depth: Depth::Metres(view.depth.clone()),
-        // 640 × 480.
-        width: width as u32,
-        height: height as u32,
-        k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
-        extrinsics: Extrinsics::CameraFromTask(view.camera_from_task),
     }
 }
 

@@ -1,10 +1,11 @@
 use anyhow::Context;
-use grasp::{DecodeParams, Grasp};
-use grasp_client::{Asked, Client, Options};
+use grasp::{DecodeParams, Grasp, Intrinsics};
+use grasp_client::{Asked, Client, Depth, DepthView, Extrinsics, Options, Workspace};
 use rand_chacha::ChaCha8Rng;
 use tokio::runtime::Runtime;
 
 use super::{Observation, Planner};
+use crate::camera::View;
 
 pub(super) struct Server {
     runtime: Runtime,
@@ -26,7 +27,23 @@ impl Planner for Server {
         let DecodeParams { threshold, force, .. } = self.params;
         let asked = Asked { threshold: Some(threshold), force, ..Asked::default() };
         let options = Options { asked, ..Options::default() };
-        let detection = self.runtime.block_on(self.client.detect(&observation.volume, options))?;
+        let views: Vec<DepthView> = observation.views.iter().map(depth_view).collect();
+        let workspace = Workspace::default();
+        let detection = self.runtime.block_on(self.client.detect_from_depth(&views, &workspace, options))?;
         Ok(detection.grasps.iter().map(Into::into).collect())
+    }
+}
+
+/// What the camera of the benchmark sends to a server.
+#[must_use]
+pub fn depth_view(view: &View) -> DepthView {
+    let Intrinsics { width, height, fx, fy, cx, cy } = Intrinsics::BENCHMARK;
+    DepthView {
+        depth: Depth::Metres(view.depth.clone()),
+        // 640 × 480.
+        width: width as u32,
+        height: height as u32,
+        k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+        extrinsics: Extrinsics::CameraFromTask(view.camera_from_task),
     }
 }
