@@ -72,9 +72,9 @@ test-faults: ## test what test leaves out: a replica killed behind haproxy, ten 
 	$(with_onnxruntime) $(with_haproxy) $(CARGO) test --package grasp-tests --locked \
 		--test replicas --test faults -- --ignored --nocapture
 
-fuzz: ## send twenty million made-up requests to the decoder (needs cargo-fuzz)
-	RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run --fuzz-dir tests/fuzz --target-dir $(CARGO_TARGET_DIR)/fuzz --sanitizer none \
-		request -- -runs=20000000 -max_len=4096
+fuzz: ## send twenty million made-up volumes and as many views to their decoders (needs cargo-fuzz)
+	for target in request views; do RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run --fuzz-dir tests/fuzz \
+		--target-dir $(CARGO_TARGET_DIR)/fuzz --sanitizer none $$target -- -runs=20000000 -max_len=4096 || exit; done
 
 bench-sim: ## how fast scenes are made, seen and labelled on one core
 	$(CARGO) run --release --package grasp-sim --example speed --locked

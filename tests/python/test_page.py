@@ -295,7 +295,7 @@ class PageTest(unittest.TestCase):
         counts = np.histogram(qualities, len(heights), (0, 1))[0]
         np.testing.assert_allclose(heights, 100 * counts / counts.max(), atol=0.1)
         self.assertEqual(len(self.browser.texts("#grasps button")), len(qualities))
-        self.assertIn("vgn-packed 2 cpu fp32", self.browser.texts("#models li"))
+        self.assertIn(f"{reply.model} {reply.version} cpu fp32", self.browser.texts("#models li"))
 
     def test_a_grasp_is_highlighted_from_the_table_and_from_the_scene(self):
         reply = self.open(name="looked at")

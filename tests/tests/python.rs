@@ -4,7 +4,8 @@ use std::ffi::OsStr;
 use std::path::Path;
 use std::process::Command;
 
-use grasp_tests::{Server, TestModel, grasp_sim, graspd};
+use grasp_tests::{Server, TestModel, grasp, grasp_sim, graspd};
+use tempfile::TempDir;
 
 /// Runs the tests of a file; `expected` is one of them, for unittest is content when it finds none at all.
 fn run(file: &str, environment: &[(&str, &OsStr)], expected: &str) {
@@ -19,6 +20,16 @@ fn run(file: &str, environment: &[(&str, &OsStr)], expected: &str) {
         .unwrap();
     let report = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success() && report.contains(expected), "{report}");
+}
+
+/// A folder with one network of the zoo and its classifier, however many there are by then.
+fn models() -> TempDir {
+    let zoo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo").canonicalize().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["vgn-packed.onnx", "classifiers"] {
+        std::os::unix::fs::symlink(zoo.join(name), folder.path().join(name)).unwrap();
+    }
+    folder
 }
 
 #[test]
@@ -38,38 +49,50 @@ fn the_deployment_fits_the_server_seen_from_python() {
 #[test]
 fn prometheus_sees_what_the_dashboard_shows_seen_from_python() {
     // GRASPD_PROMETHEUS and GRASPD_PROMTOOL are the environment's.
-    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo");
-    let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.as_os_str())];
+    let models = models();
+    let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.path().as_os_str())];
     run("test_monitoring.py", &environment, "test_panels_show_data");
 }
 
 #[test]
 fn a_browser_shows_the_page_seen_from_python() {
     // GRASPD_CHROMIUM is the environment's.
-    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo");
-    let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.as_os_str())];
+    let models = models();
+    let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.path().as_os_str())];
     run("test_page.py", &environment, "test_the_scene_is_drawn");
 }
 
 #[test]
 fn the_python_package_does_what_it_says() {
-    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo");
-    let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.as_os_str())];
+    let models = models();
+    let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.path().as_os_str())];
     run("test_package.py", &environment, "test_the_grasps_are_at_the_block");
 }
 
 #[test]
 fn tritonclient_gets_the_maps_seen_from_python() {
-    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo");
-    let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.as_os_str())];
+    let models = models();
+    let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.path().as_os_str())];
     run("test_inference.py", &environment, "test_calls_run_at_the_same_time");
+}
+
+#[test]
+fn the_documents_are_true_seen_from_python() {
+    let models = models();
+    let environment = [
+        ("GRASPD", graspd().as_os_str()),
+        ("GRASP", grasp().as_os_str()),
+        ("GRASP_SIM", grasp_sim().as_os_str()),
+        ("GRASPD_MODELS", models.path().as_os_str()),
+    ];
+    run("test_docs.py", &environment, "test_what_is_linked_exists");
 }
 
 #[test]
 fn a_client_in_cpp_is_built_and_gets_grasps_seen_from_python() {
     // GRASPD_CPP is the environment's.
-    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo");
-    let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.as_os_str())];
+    let models = models();
+    let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.path().as_os_str())];
     run("test_cpp.py", &environment, "test_the_grasps_are_at_the_block");
 }
 

@@ -6,4 +6,4 @@ mod raster;
 
 pub use mesh::Mesh;
 pub use picture::{Color, Picture, PictureError, object_color, quality_color, save_sheet};
-pub use raster::{Frame, Instance, render};
+pub use raster::{Frame, Instance, NOTHING, TABLE, render};

@@ -1,0 +1,91 @@
+//! Depth images, point clouds and wishes as anybody may send them: decoded, checked, fused, and answered about.
+
+#![no_main]
+
+use grasp::{DepthImage, Fusion, seen_from};
+use grasp_proto::{Asked, Workspace, cloud_view, depth_view, pb};
+use libfuzzer_sys::fuzz_target;
+use nalgebra::Isometry3;
+use prost::Message;
+
+fuzz_target!(|bytes: &[u8]| {
+    let Some((&kind, bytes)) = bytes.split_first() else { return };
+    match kind % 4 {
+        0 => asked(bytes),
+        1 => depth(bytes),
+        2 => cloud(bytes),
+        _ => fitting(bytes),
+    }
+});
+
+/// Whatever was taken can be told in poses that are finite.
+fn asked(bytes: &[u8]) {
+    let Ok(options) = pb::Options::decode(bytes) else { return };
+    let Ok(asked) = Asked::try_from(&options) else { return };
+    let grasp = Isometry3::translation(0.1, 0.2, 0.3);
+    for pose in asked.poses(&grasp) {
+        assert!(pose.translation.vector.iter().all(|c| c.is_finite()), "{pose}");
+    }
+    let _ = asked.constraints.violation(&grasp, &asked.clearance().hand);
+}
+
+fn depth(bytes: &[u8]) {
+    let Ok(request) = pb::DetectGraspsFromDepthRequest::decode(bytes) else { return };
+    let Ok(workspace) = Workspace::try_from(request.workspace.unwrap_or_default()) else { return };
+    for (index, view) in request.views.iter().enumerate() {
+        look(view, index, &workspace.frame_from_task);
+    }
+}
+
+fn cloud(bytes: &[u8]) {
+    let Ok(request) = pb::DetectGraspsFromCloudRequest::decode(bytes) else { return };
+    for (index, view) in request.views.iter().enumerate() {
+        if let Ok(points) = cloud_view(view, index, &Isometry3::identity())
+            && let Some(view) = seen_from(&points.points, &points.eye, 0.3)
+        {
+            assert!(view.depth.iter().all(|depth| depth.is_finite() && *depth >= 0.0));
+            integrate(&view);
+        }
+    }
+}
+
+/// An image whose data fits its size: too rare among bytes left to chance.
+fn fitting(mut bytes: &[u8]) {
+    let mut number = || Some(f64::from_le_bytes(*bytes.split_off(..8)?.first_chunk()?));
+    let mut view = || {
+        let k = [number()?, 0.0, number()?, 0.0, number()?, number()?, 0.0, 0.0, 1.0].to_vec();
+        let position = pb::Vector3 { x: number()?, y: number()?, z: number()? };
+        let orientation = pb::Quaternion { x: number()?, y: number()?, z: number()?, w: number()? };
+        let pose = pb::Pose { position: Some(position), orientation: Some(orientation) };
+        Some((k, pose))
+    };
+    let Some((k, pose)) = view() else { return };
+    let data: Vec<u8> = bytes.iter().copied().cycle().take(if bytes.is_empty() { 0 } else { 12 * 9 * 4 }).collect();
+    let view = pb::DepthView {
+        data: data.into(),
+        unit: pb::DepthUnit::F32Metres.into(),
+        camera: Some(pb::Camera { width: 12, height: 9, k }),
+        extrinsics: Some(pb::depth_view::Extrinsics::CameraFromTask(pose)),
+    };
+    look(&view, 0, &Isometry3::identity());
+}
+
+fn look(view: &pb::DepthView, index: usize, frame_from_task: &Isometry3<f64>) {
+    match depth_view(view, index, frame_from_task) {
+        Ok(view) => integrate(&view),
+        Err(error) => assert!(error.message.starts_with(&*error.field), "{error:?}"),
+    }
+}
+
+/// Whatever a camera says, a volume has values that volumes may have, or there is a reason for none.
+fn integrate(view: &grasp::View) {
+    let image = DepthImage::new(view.intrinsics, &view.depth).expect("it was checked");
+    let mut fusion = Fusion::new(8, 0.3);
+    if fusion.integrate(&image, &view.camera_from_task) == 0 {
+        assert!(!fusion.blind(&image, &view.camera_from_task).to_string().is_empty());
+    }
+    if let Ok(volume) = fusion.volume(Isometry3::identity()) {
+        let mesh = Fusion::of(&volume).mesh();
+        assert!(mesh.triangles.iter().flatten().all(|&corner| (corner as usize) < mesh.vertices.len()));
+    }
+}

@@ -1,0 +1,259 @@
+"""What docs/ tells people to type, typed: each document's blocks in their order, in a folder with models/zoo, beside a
+graspd that stands for the one on port 50051. What a block prints must be what the document has below it, as `text`.
+grpcurl is not needed: what it would do is done here.
+
+    GRASPD=target/release/graspd GRASP=target/release/grasp GRASP_SIM=target/release/grasp-sim GRASPD_MODELS=models/zoo \\
+    ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
+    $(python3 deploy/native.py python) -m unittest discover --start-directory tests/python --pattern test_docs.py
+"""
+
+import argparse
+import contextlib
+import copy
+import io
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import unittest
+from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
+
+import grpc
+import numpy as np
+import onnx
+from google.protobuf import json_format
+from google.protobuf.descriptor_pb2 import DescriptorProto
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+from grpc_reflection.v1alpha.proto_reflection_descriptor_database import ProtoReflectionDescriptorDatabase
+from server import Server
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+PORT = "127.0.0.1:50051"
+# A fence's language and what is in it.
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def setUpModule():
+    """Installs the package as a user would, but with those that are here."""
+    folder = unittest.enterModuleContext(tempfile.TemporaryDirectory())
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*pip, "--target", folder, ROOT / "client/python"], check=True)
+    unittest.enterModuleContext(mock.patch.object(sys, "path", [folder, *sys.path]))
+    unittest.enterModuleContext(mock.patch.dict(os.environ, {"PYTHONPATH": folder}))
+
+
+def grpcurl(*arguments):
+    """What grpcurl does, as far as the documents use it: it knows of messages what the server tells."""
+    parser = argparse.ArgumentParser("grpcurl")
+    parser.add_argument("-plaintext", action="store_true", required=True)
+    parser.add_argument("-d", default="{}", metavar="JSON")
+    parser.add_argument("address")
+    parser.add_argument("verb")
+    parser.add_argument("symbol", nargs="?")
+    asked = parser.parse_args(arguments)
+    with grpc.insecure_channel(asked.address) as channel:
+        database = ProtoReflectionDescriptorDatabase(channel)
+        pool = DescriptorPool(database)
+        if asked.verb == "list":
+            print(*sorted(database.get_services()), sep="\n")
+        elif asked.verb == "describe":
+            message = DescriptorProto()
+            pool.FindMessageTypeByName(asked.symbol).CopyToProto(message)
+            print(message)
+        else:
+            service, name = asked.verb.split("/")
+            method = pool.FindServiceByName(service).methods_by_name[name]
+            kinds = [GetMessageClass(kind) for kind in (method.input_type, method.output_type)]
+            request = json_format.Parse(sys.stdin.read() if asked.d == "@" else asked.d, kinds[0]())
+            call = channel.unary_unary(f"/{asked.verb}", kinds[0].SerializeToString, kinds[1].FromString)
+            print(json_format.MessageToJson(call(request)))
+
+
+class Page:
+    """A document, and what the examples in it have made so far."""
+
+    def __init__(self, name, server, folder):
+        self.path, self.server, self.folder = DOCS / name, server, folder
+        self.text = self.path.read_text()
+        self.names = {"__name__": "__main__"}
+        self.environment = {
+            **os.environ,
+            "PATH": f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}",
+            "GRASPD_SERVER": server,
+        }
+
+    def blocks(self):
+        """Language, text, first line, and what must be printed: None where the document does not say."""
+        found = list(BLOCK.finditer(self.text))
+        for block, following in zip(found, [*found[1:], None]):
+            said = None
+            if following and following[1] == "text" and not self.text[block.end() : following.start()].strip():
+                said = following[2]
+            yield block[1], block[2], self.text.count("\n", 0, block.start(2)) + 1, said
+
+    def run(self, language, code, line):
+        """What a block prints. In Python one goes on where the last one ended."""
+        code = code.replace(PORT, self.server)
+        if language == "sh":
+            command = ["sh", "-euc", code]
+            result = subprocess.run(command, cwd=self.folder, env=self.environment, capture_output=True, text=True)
+            if result.returncode:
+                raise AssertionError(f"{self.path}:{line}: {result.stdout}{result.stderr}")
+            return result.stdout
+        printed = io.StringIO()
+        # With the lines of the document, should it fail.
+        program = compile("\n" * (line - 1) + code, self.path, "exec")
+        with contextlib.chdir(self.folder), contextlib.redirect_stdout(printed):
+            exec(program, self.names)
+        return printed.getvalue()
+
+
+def pattern(said):
+    """… is anything, and a space any space."""
+    return r"\s+".join(".*".join(map(re.escape, word.split("…"))) for word in said.split()) + r"\s*"
+
+
+class DocsTest(unittest.TestCase):
+    def page(self, name):
+        """The document once all of its blocks have been run."""
+        folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        shutil.copytree(os.environ["GRASPD_MODELS"], folder / "models/zoo")
+        (folder / "bin").mkdir()
+        programs = {name.lower().replace("_", "-"): [os.path.abspath(os.environ[name])] for name in ["GRASP", "GRASP_SIM"]}
+        programs |= {"python3": [sys.executable], "grpcurl": [sys.executable, __file__, "grpcurl"]}
+        for program, command in programs.items():
+            script = folder / "bin" / program
+            script.write_text(f'#!/bin/sh\nexec {shlex.join(map(str, command))} "$@"\n')
+            script.chmod(0o755)
+        with mock.patch.dict(os.environ, {"GRASPD_MODELS": str(folder / "models/zoo")}):
+            server = self.enterContext(Server("--watch", 0.2))
+        page = Page(name, server.grpc, folder)
+        for language, code, line, said in page.blocks():
+            if language not in ["sh", "python"]:
+                continue
+            printed = page.run(language, code, line)
+            if said is not None:
+                self.assertRegex(printed, rf"\A{pattern(said)}\Z", f"{page.path}:{line}")
+        # Clients and their channels go before the server does.
+        self.addCleanup(page.names.clear)
+        return page
+
+    def test_api(self):
+        page = self.page("api.md")
+        options = re.findall(r"^\| `(\w+=.*?)` \|", page.text, re.MULTILINE)
+        self.assertEqual(len(options), 14)
+        for option in options:
+            with self.subTest(option):
+                page.run("python", f"client.detect(volume, graspd.Options({option}))", 1)
+
+    def test_conventions(self):
+        self.page("conventions.md")
+
+    def test_own_model(self):
+        self.page("own-model.md")
+
+    def test_networks_are_refused_as_own_model_says(self):
+        """Each row of its table by an example of its own."""
+        zoo = onnx.load(Path(os.environ["GRASPD_MODELS"], "vgn-packed.onnx"))
+
+        def changed(change):
+            model = copy.deepcopy(zoo)
+            change(model)
+            return [model]
+
+        def with_properties(**properties):
+            there = {property.key: property.value for property in zoo.metadata_props}
+            there |= {f"graspd.{key}": value for key, value in properties.items()}
+            return lambda model: onnx.helper.set_model_props(model, there)
+
+        def rename(model, old, new):
+            for node in model.graph.node:
+                for names in (node.input, node.output):
+                    names[:] = [new if name == old else name for name in names]
+            for value in (*model.graph.input, *model.graph.output):
+                value.name = new if value.name == old else value.name
+
+        def fix_batch(model):
+            [dimension, *_] = model.graph.input[0].type.tensor_type.shape.dim
+            dimension.dim_value = 1
+
+        def spoil(model):
+            rename(model, "quality", "spoilt")
+            model.graph.output[0].name = "quality"
+            nan = onnx.helper.make_tensor("nan", onnx.TensorProto.FLOAT, [], [np.nan])
+            model.graph.initializer.append(nan)
+            model.graph.node.append(onnx.helper.make_node("Add", ["spoilt", "nan"], ["quality"]))
+
+        mine = with_properties(name="mine", version="1.0")
+        examples = [
+            changed(lambda model: rename(model, "width", "opening")),
+            changed(lambda model: rename(model, "tsdf", "input")),
+            changed(fix_batch),
+            changed(with_properties(resolution="32")),
+            changed(with_properties(camera_azimuth="east")),
+            2 * changed(mine),
+            [b"version https://git-lfs.github.com/spec/v1\n"],
+            changed(lambda model: model.opset_import[0].MergeFrom(onnx.helper.make_opsetid("", 999))),
+            changed(spoil),
+        ]
+        table = (DOCS / "own-model.md").read_text().partition("| it says | |")[2]
+        rows = re.findall(r"^\| `+ ?(.*?) ?`+ \|", table, re.MULTILINE)
+        self.assertEqual(len(rows), len(examples))
+        for row, files in zip(rows, examples):
+            with self.subTest(row), tempfile.TemporaryDirectory() as folder:
+                for index, file in enumerate(files):
+                    content = file if isinstance(file, bytes) else file.SerializeToString()
+                    Path(folder, f"{index}.onnx").write_bytes(content)
+                where = ["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"]
+                command = [os.environ["GRASPD"], "--models", folder, "--provider", "cpu", "--threads", "1", *where]
+                result = subprocess.run(command, capture_output=True, text=True, timeout=30)
+                self.assertNotEqual(result.returncode, 0)
+                self.assertIn(row, result.stderr[-2000:])
+
+    def test_own_gripper(self):
+        self.page("own-gripper.md")
+
+    def test_own_camera(self):
+        page = self.page("own-camera.md")
+        for encoding, kind, big in [("16UC1", "<u2", 0), ("16UC1", ">u2", 1), ("32FC1", "<f4", 0)]:
+            depth = page.names["depths"][0] / (1 if kind.endswith("u2") else 1000)
+            height, width = depth.shape
+            padded = np.pad(depth.astype(kind), [(0, 0), (0, 6)])
+            pose = page.names["graspd"].Pose.from_matrix(page.names["cameras"][0])
+            at = [SimpleNamespace(**dict(zip("xyzw", numbers))) for numbers in (pose.position, pose.quaternion)]
+            view = page.names["from_ros"](
+                SimpleNamespace(encoding=encoding, is_bigendian=big, height=height, width=width, data=padded.tobytes()),
+                SimpleNamespace(k=page.names["k"].ravel()),
+                SimpleNamespace(transform=SimpleNamespace(translation=at[0], rotation=at[1])),
+            )
+            found = page.names["client"].detect_from_depth([view], page.names["workspace"])
+            np.testing.assert_allclose(found.grasps[0].pose.position, page.names["one"].grasps[0].pose.position)
+
+
+class LinksTest(unittest.TestCase):
+    def test_what_is_linked_exists(self):
+        for page in DOCS.glob("*.md"):
+            for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+                if link.startswith("http"):
+                    continue
+                path, _, heading = link.partition("#")
+                target = (page.parent / path).resolve() if path else page
+                with self.subTest(f"{page.name}: {link}"):
+                    self.assertTrue(target.exists())
+                    if heading:
+                        headings = re.findall(r"^#+ (.*)$", target.read_text(), re.MULTILINE)
+                        self.assertIn(heading, [re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in headings])
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["grpcurl"]:
+        grpcurl(*sys.argv[2:])
+    else:
+        unittest.main()
