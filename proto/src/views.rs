@@ -11,6 +11,9 @@ pub const MAX_VIEWS: usize = 64;
 /// Longest edge of an image, pixels.
 const MAX_EDGE: u32 = 16_384;
 
+/// The share of an image at each of its borders where no principal point is, but of another resolution's.
+const MIDDLE: f64 = 0.15;
+
 const WORKSPACE: PoseFields =
     PoseFields { position: "workspace.pose.position", orientation: "workspace.pose.orientation" };
 const CAMERA_FROM_TASK: PoseFields =
@@ -162,6 +165,17 @@ fn intrinsics(camera: &pb::Camera) -> Result<Intrinsics, FieldError> {
     if !(fx > 0.0 && fy > 0.0) {
         return wrong("must have focal lengths above 0 (its first and fifth number)");
     }
+    for (point, edge) in [(cx, camera.width), (cy, camera.height)] {
+        let middle = MIDDLE * f64::from(edge)..=(1.0 - MIDDLE) * f64::from(edge);
+        if !middle.contains(&point) {
+            let needed = format_args!(
+                "must have its principal point (its third and sixth number) near the middle of {} × {} pixels: is it of \
+                 another resolution?",
+                camera.width, camera.height
+            );
+            return Err(FieldError::new("camera.k", format_args!("{k:?}"), needed));
+        }
+    }
     // Both fit: they are at most MAX_EDGE.
     Ok(Intrinsics { width: camera.width as usize, height: camera.height as usize, fx, fy, cx, cy })
 }
@@ -259,6 +273,8 @@ mod tests {
         assert!(refused(|v| v.camera = camera(&skewed)).ends_with("rectify the image"));
         assert!(refused(|v| v.camera = camera(&[0.0; 9])).contains("must be nine numbers"));
         assert!(refused(|v| v.camera = camera(&[f64::NAN; 9])).ends_with("must be finite"));
+        let twice = [10.0, 0.0, 4.0, 0.0, 10.0, 3.0, 0.0, 0.0, 1.0];
+        assert!(refused(|v| v.camera = camera(&twice)).ends_with("is it of another resolution?"));
         let negative = [-5.0, 0.0, 2.0, 0.0, 5.0, 1.5, 0.0, 0.0, 1.0];
         assert!(refused(|v| v.camera = camera(&negative)).contains("focal lengths above 0"));
         assert_eq!(
