@@ -265,6 +265,7 @@ fn outcome(response: pb::DetectGraspsStreamResponse) -> Result<Detection, Error>
             code: Code::Internal,
             message: "a reply with neither a response nor an error".to_owned(),
             retry_after: None,
+            field: None,
         }),
     }
 }

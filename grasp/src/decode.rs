@@ -1,40 +1,8 @@
-use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
-use thiserror::Error;
+use nalgebra::{Isometry3, Translation3, Vector3};
 
 use crate::filter::{dilate, gaussian, is_window_maximum};
-use crate::{Clearance, Constraints, FINGER_DEPTH, Grasp, Hand, Obstacles, Violation, Volume, before};
-
-/// A network's output over a volume of N³ voxels, each array indexed `[channel][x][y][z]`, z fastest.
-#[derive(Clone, Copy, Debug)]
-pub struct Maps<'a> {
-    /// Probability that a grasp here succeeds, `[N, N, N]`, in [0, 1].
-    pub quality: &'a [f32],
-    /// Orientation of the grasp, `[4, N, N, N]`, unit quaternion x, y, z, w in the volume's axes.
-    pub rotation: &'a [f32],
-    /// Opening, `[N, N, N]`, in voxels.
-    pub width: &'a [f32],
-}
-
-/// Where in its voxel a network's grasp stands.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum VoxelOrigin {
-    /// At index · voxel size, the convention of VGN's data and weights.
-    #[default]
-    Corner,
-    /// At (index + 0.5) · voxel size, where the TSDF is sampled: mirror images and turns of a volume stay exact.
-    Center,
-}
-
-impl VoxelOrigin {
-    /// The offset from a voxel's index to its grasp's position, in voxels.
-    #[must_use]
-    pub fn offset(self) -> f64 {
-        match self {
-            Self::Corner => 0.0,
-            Self::Center => 0.5,
-        }
-    }
-}
+use crate::selection::{Decoded, Dropped, Selection};
+use crate::{Clearance, Constraints, DecodeError, FINGER_DEPTH, Grasp, Hand, Maps, Volume, VoxelOrigin, before};
 
 /// Every step and constant between a network's maps and a list of grasps.
 ///
@@ -112,65 +80,11 @@ impl DecodeParams {
     pub fn benchmark() -> Self {
         Self { outside_above: 0.1, border: Some(Border { sides: 2, bottom: 7 }), force: Some(0.5), ..Self::default() }
     }
-}
 
-/// How many voxels were dropped, each counted once, under the first reason that applied in this order.
-///
-/// Together with the grasps they make up every voxel of the volume.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Dropped {
-    /// The smoothed quality is below the threshold.
-    pub below_threshold: usize,
-    /// Inside an object, or too far from any observed surface.
-    pub mask: usize,
-    /// The width is not one that is believed.
-    pub width: usize,
-    /// At the border of the cube.
-    pub border: usize,
-    /// Outside of the region that was asked for.
-    pub region: usize,
-    /// From where the hand was not asked to come.
-    pub approach: usize,
-    /// The hand would be too low.
-    pub height: usize,
-    /// A better grasp is near.
-    pub suppressed: usize,
-    /// The open hand would meet what was observed.
-    pub collision: usize,
-}
-
-/// What [`decode`] found.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Decoded {
-    /// In the volume's frame, best first.
-    pub grasps: Vec<Grasp>,
-    /// Why the other voxels hold none.
-    pub dropped: Dropped,
-}
-
-/// Why maps could not be decoded: the network is not what it should be.
-#[derive(Clone, Debug, Error, PartialEq)]
-pub enum DecodeError {
-    /// A map has the wrong size.
-    #[error("the map `{map}` holds {got} values, {expected} needed")]
-    Length {
-        /// Which map.
-        map: &'static str,
-        /// Values that came.
-        got: usize,
-        /// Values needed.
-        expected: usize,
-    },
-    /// A map holds NaN or infinity.
-    #[error("the map `{map}` holds {value} at {index}")]
-    NotFinite {
-        /// Which map.
-        map: &'static str,
-        /// Flat index.
-        index: usize,
-        /// The value.
-        value: f32,
-    },
+    /// What is asked when nothing reaches the threshold, if anything is.
+    pub(crate) fn floor(&self) -> Option<f32> {
+        self.force.map(|force| force.min(self.threshold))
+    }
 }
 
 /// Turns a network's maps over `volume` into grasps, best first (VGN's `process` and `select`, with GIGA's additions).
@@ -179,67 +93,17 @@ pub enum DecodeError {
 /// [`DecodeError`] when a map has the wrong size, or is not finite where it is used.
 pub fn decode(volume: &Volume, maps: &Maps, params: &DecodeParams) -> Result<Decoded, DecodeError> {
     let n = volume.resolution();
-    check(maps, n)?;
+    maps.check_quality(n)?;
 
     let smooth = gaussian(maps.quality, n, params.sigma, params.radius);
     let near_surface = near_surface(volume, params);
 
-    let select = |threshold| {
-        let (mut grasps, mut dropped) = candidates(volume, maps, &smooth, &near_surface, threshold, params)?;
-        if let Some(clearance) = params.clearance {
-            let obstacles = Obstacles::observed(volume, clearance);
-            let all = grasps.len();
-            grasps.retain(|grasp| !obstacles.meet(&grasp.pose));
-            dropped.collision = all - grasps.len();
-        }
-        Ok(Decoded { grasps, dropped })
-    };
-
-    // Only when nothing reaches the threshold is the floor asked, and then for the best voxel alone.
-    let mut decoded = select(params.threshold)?;
-    if let (true, Some(floor)) = (decoded.grasps.is_empty(), params.force) {
-        decoded = select(floor.min(params.threshold))?;
-        decoded.dropped.suppressed += decoded.grasps.len().saturating_sub(1);
-        decoded.grasps.truncate(1);
-    }
-    Ok(decoded)
-}
-
-/// Of grasps that a planner without a network found in the frame of `volume`'s pose, best first, those that are asked
-/// for. The hand is theirs already.
-#[must_use]
-pub fn select(grasps: &[Grasp], volume: &Volume, params: &DecodeParams) -> Decoded {
-    let hand = params.hand.unwrap_or(Hand::PANDA);
-    let obstacles = params.clearance.map(|clearance| Obstacles::observed(volume, clearance));
-    let above = |threshold: f32| {
-        let mut decoded = Decoded::default();
-        for grasp in grasps {
-            let count = match params.constraints.violation(&grasp.pose, &hand) {
-                _ if grasp.quality < threshold => &mut decoded.dropped.below_threshold,
-                Some(Violation::Region) => &mut decoded.dropped.region,
-                Some(Violation::Approach) => &mut decoded.dropped.approach,
-                Some(Violation::Height) => &mut decoded.dropped.height,
-                None if obstacles.as_ref().is_some_and(|obstacles| obstacles.meet(&grasp.pose)) => {
-                    &mut decoded.dropped.collision
-                }
-                None => {
-                    decoded.grasps.push(*grasp);
-                    continue;
-                }
-            };
-            *count += 1;
-        }
-        decoded
-    };
-    let decoded = above(params.threshold);
-    match params.force {
-        Some(floor) if decoded.grasps.is_empty() => {
-            let mut decoded = above(floor.min(params.threshold));
-            decoded.dropped.suppressed += decoded.grasps.len().saturating_sub(1);
-            decoded.grasps.truncate(1);
-            decoded
-        }
-        _ => decoded,
+    let selection = Selection::new(volume, params);
+    let above = |threshold| candidates(volume, maps, &smooth, &near_surface, &selection, threshold, params);
+    let decoded = above(params.threshold)?;
+    match params.floor() {
+        Some(floor) if decoded.grasps.is_empty() => Ok(above(floor)?.best_alone()),
+        _ => Ok(decoded),
     }
 }
 
@@ -249,70 +113,43 @@ fn candidates(
     maps: &Maps,
     smooth: &[f32],
     near_surface: &[bool],
+    selection: &Selection,
     threshold: f32,
     params: &DecodeParams,
-) -> Result<(Vec<Grasp>, Dropped), DecodeError> {
+) -> Result<Decoded, DecodeError> {
     let n = volume.resolution();
-    let hand = params.hand.unwrap_or(Hand::PANDA);
     // Of the hand's own opening; the width that was learnt from is narrower than the hand by a margin of its own.
     let opening = params.hand.map_or(f64::INFINITY, |hand| 2.0 * hand.half_opening());
     let mut dropped = Dropped::default();
     let mut quality = vec![0.0; smooth.len()];
     let mut passed = Vec::new();
     for (index, &q) in smooth.iter().enumerate() {
-        if q < threshold || q <= 0.0 {
-            dropped.below_threshold += 1;
-            continue;
-        }
-        if !near_surface[index] {
-            dropped.mask += 1;
-            continue;
-        }
-        if !(maps.width[index] >= params.min_width && maps.width[index] <= params.max_width)
-            || f64::from(maps.width[index]) * volume.voxel_size() > opening
+        let width = maps.width[index];
+        let count = if q < threshold || q <= 0.0 {
+            &mut dropped.below_threshold
+        } else if !near_surface[index] {
+            &mut dropped.mask
+        } else if !(width >= params.min_width && width <= params.max_width)
+            || f64::from(width) * volume.voxel_size() > opening
         {
-            dropped.width += 1;
-            continue;
-        }
-        if params.border.is_some_and(|border| border.holds(index, n)) {
-            dropped.border += 1;
-            continue;
-        }
-        let grasp = grasp_at(volume, maps, index, q, params)?;
-        match params.constraints.violation(&grasp.pose, &hand) {
-            Some(Violation::Region) => dropped.region += 1,
-            Some(Violation::Approach) => dropped.approach += 1,
-            Some(Violation::Height) => dropped.height += 1,
-            None => {
+            &mut dropped.width
+        } else if params.border.is_some_and(|border| border.holds(index, n)) {
+            &mut dropped.border
+        } else {
+            let grasp = grasp_at(volume, maps, index, q, params)?;
+            if selection.keeps(&grasp.pose, &mut dropped) {
                 quality[index] = q;
                 passed.push((index, grasp));
             }
-        }
+            continue;
+        };
+        *count += 1;
     }
     let all = passed.len();
     passed.retain(|&(index, _)| is_window_maximum(&quality, n, index, params.nms_size));
     dropped.suppressed = all - passed.len();
     passed.sort_by(|(a, _), (b, _)| quality[*b].total_cmp(&quality[*a]).then(a.cmp(b)));
-    Ok((passed.into_iter().map(|(_, grasp)| grasp).collect(), dropped))
-}
-
-fn check(maps: &Maps, n: usize) -> Result<(), DecodeError> {
-    let voxels = n.pow(3);
-    for (map, values, expected) in
-        [("quality", maps.quality, voxels), ("rotation", maps.rotation, 4 * voxels), ("width", maps.width, voxels)]
-    {
-        if values.len() != expected {
-            return Err(DecodeError::Length { map, got: values.len(), expected });
-        }
-    }
-    // One NaN would spread through the smoothing and silently empty a region.
-    // Without looking for where it is, which takes longer.
-    if !maps.quality.iter().fold(true, |finite, q| finite & q.is_finite())
-        && let Some(index) = maps.quality.iter().position(|q| !q.is_finite())
-    {
-        return Err(DecodeError::NotFinite { map: "quality", index, value: maps.quality[index] });
-    }
-    Ok(())
+    Ok(Decoded { grasps: passed.into_iter().map(|(_, grasp)| grasp).collect(), dropped })
 }
 
 /// The voxels in front of surfaces, grown a little, but not into objects.
@@ -339,11 +176,7 @@ fn grasp_at(
     params: &DecodeParams,
 ) -> Result<Grasp, DecodeError> {
     let n = volume.resolution();
-    let voxels = n.pow(3);
-    let [x, y, z, w] = [0, 1, 2, 3].map(|channel| f64::from(maps.rotation[channel * voxels + index]));
-    let rotation = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-6)
-        .filter(|q| q.coords.iter().all(|c| c.is_finite()))
-        .ok_or(DecodeError::NotFinite { map: "rotation", index, value: maps.rotation[index] })?;
+    let rotation = maps.rotation(index)?;
     let cell = Vector3::new(index / (n * n), index / n % n, index % n);
     let position = cell.map(|c| c as f64 + params.origin.offset()) * volume.voxel_size();
     let pose = volume.pose() * Isometry3::from_parts(Translation3::from(position), rotation);
@@ -496,6 +329,13 @@ mod tests {
         // The best of those that are free, when nothing reaches the threshold.
         let forced = DecodeParams { clearance, threshold: 1.0, force: Some(0.5), ..sharp() };
         assert_eq!(grasps(&forced), [0.95]);
+
+        // Nor does it stand in the way of its neighbour.
+        arrays.quality[index(9, 8, 9)] = 0.93;
+        down(&mut arrays, index(9, 8, 9));
+        let free = arrays.decode(&DecodeParams { clearance, ..sharp() });
+        assert_eq!(free.grasps.iter().map(|grasp| grasp.quality).collect::<Vec<_>>(), [0.95, 0.93]);
+        assert_eq!((free.dropped.collision, free.dropped.suppressed), (1, 0));
     }
 
     #[test]
@@ -519,10 +359,18 @@ mod tests {
         let mut arrays = Arrays::new();
         arrays.quality[7] = f32::NAN;
         let maps = Maps { quality: &arrays.quality, rotation: &arrays.rotation, width: &arrays.width };
-        assert!(matches!(
-            decode(&slab(), &maps, &sharp()),
-            Err(DecodeError::NotFinite { map: "quality", index: 7, .. })
-        ));
+        assert!(matches!(maps.check(N), Err(DecodeError::Value { map: "quality", index: 7, .. })));
+        let fine = Arrays::new();
+        let check = |rotation: &[f32], width: &[f32]| {
+            Maps { quality: &fine.quality, rotation, width }.check(N).map_err(|error| error.to_string())
+        };
+        assert_eq!(check(&fine.rotation, &fine.width), Ok(()));
+        assert!(check(&vec![0.0; 4 * N.pow(3)], &fine.width).unwrap_err().contains("has no length here"));
+        assert!(check(&fine.rotation, &vec![f32::INFINITY; N.pow(3)]).unwrap_err().contains("width` holds inf at 0"));
+        assert!(matches!(decode(&slab(), &maps, &sharp()), Err(DecodeError::Value { map: "quality", index: 7, .. })));
+        let logits = vec![37.2; N.pow(3)];
+        let error = decode(&slab(), &Maps { quality: &logits, ..maps }, &sharp()).unwrap_err().to_string();
+        assert!(error.starts_with("the map `quality` holds 37.2 at 0, must be a probability"), "{error}");
         let short = Maps { width: &arrays.width[1..], ..maps };
         assert!(matches!(decode(&slab(), &short, &sharp()), Err(DecodeError::Length { map: "width", .. })));
     }

@@ -38,10 +38,13 @@ struct Voxel {
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 pub enum Blind {
     /// All of the cube has negative depth.
-    #[error("the workspace lies behind the camera; is the pose inverted?")]
+    #[error("the workspace lies behind the camera; is the pose inverted, or of a frame that does not look along z?")]
     Behind,
     /// None of it is projected onto the image.
-    #[error("the workspace is outside of the image: its centre would be at pixel ({u:.0}, {v:.0})")]
+    #[error(
+        "the workspace is outside of the image: its centre would be at pixel ({u:.0}, {v:.0}); is the pose inverted, in \
+         millimetres, or of a frame that does not look along z?"
+    )]
     Outside {
         /// Column of its centre.
         u: f64,
@@ -291,7 +294,7 @@ mod tests {
             let (measured, reason) = blind(depth, pose);
             assert!(measured == 0 && reason.contains(says), "{measured}: {reason}");
         };
-        nothing(0.65, facing().inverse(), "behind the camera; is the pose inverted?");
+        nothing(0.65, facing().inverse(), "behind the camera; is the pose inverted");
         nothing(0.65, Isometry3::translation(2.0, -0.15, 0.5), "its centre would be at pixel (2106, 240)");
         nothing(f32::NAN, facing(), "no pixel on the workspace has a depth from 0 to 2 m; it is 0.650 m away");
         nothing(0.000_65, facing(), "before the workspace, at most 0.0007 m away");

@@ -17,7 +17,9 @@ mod fusion;
 pub mod gpd;
 mod grasp;
 mod hand;
+mod maps;
 mod obstacles;
+mod selection;
 mod surface;
 mod volume;
 
@@ -25,11 +27,13 @@ pub use camera::{CameraError, DepthImage, Intrinsics, Unit};
 pub use cloud::{View, seen_from};
 pub use constraints::{Cone, Constraints, Region, Violation};
 pub use convention::{ClosingAxis, Convention, Origin, Retreat, before};
-pub use decode::{Border, DecodeError, DecodeParams, Decoded, Dropped, Maps, VoxelOrigin, decode, select};
+pub use decode::{Border, DecodeParams, decode};
 pub use fusion::{Blind, DEPTH_MAX, Fusion, TRUNCATION_VOXELS};
 pub use grasp::{FINGER_DEPTH, Grasp, MAX_OPENING};
 pub use hand::{Hand, HandError};
+pub use maps::{DecodeError, Maps, VoxelOrigin};
 pub use obstacles::{Clearance, Obstacles};
+pub use selection::{Decoded, Dropped, select};
 pub use surface::{SurfaceMesh, SurfacePoint};
 pub use volume::{Volume, VolumeError};
 

@@ -57,7 +57,10 @@ impl Obstacles {
         if low(pose) || low(&before(pose, from)) {
             return true;
         }
-        self.points.iter().any(|point| hand.meets(&pose.inverse_transform_point(point), from))
+        // As a matrix: there are thousands of points.
+        let turn = pose.rotation.inverse().to_rotation_matrix();
+        let in_hand = |point: &Point3<f64>| Point3::from(turn * (point.coords - pose.translation.vector));
+        self.points.iter().any(|point| hand.meets(&in_hand(point), from))
     }
 }
 

@@ -148,16 +148,12 @@ impl Metadata {
             model.metadata_props.push(StringStringEntryProto { key, value: Some(value) });
         };
         let ValueConvention::Vgn = self.value_convention;
-        let origin = match self.voxel_origin {
-            VoxelOrigin::Corner => "corner",
-            VoxelOrigin::Center => "center",
-        };
         put("name", self.name.clone());
         put("version", self.version.clone());
         put("resolution", self.resolution.to_string());
         put("voxel_size", self.voxel_size.to_string());
         put("value_convention", "vgn".to_owned());
-        put("voxel_origin", origin.to_owned());
+        put("voxel_origin", self.voxel_origin.name().to_owned());
         if let Some(azimuth) = self.camera_azimuth {
             put("camera_azimuth", azimuth.to_string());
         }

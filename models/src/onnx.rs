@@ -171,6 +171,9 @@ pub struct TensorProto {
     /// The values' bytes, little-endian.
     #[prost(bytes = "vec", optional, tag = "9")]
     pub raw_data: Option<Vec<u8>>,
+    /// Where in another file the values lie, as `location`, `offset` and `length`.
+    #[prost(message, repeated, tag = "13")]
+    pub external_data: Vec<StringStringEntryProto>,
     /// 1 when the values lie in another file, which is not supported.
     #[prost(int32, optional, tag = "14")]
     pub data_location: Option<i32>,
@@ -474,9 +477,16 @@ impl TensorProto {
         self.raw_data = Some(values.iter().flat_map(|value| value.to_le_bytes()).collect());
     }
 
+    /// The other file that the values lie in, if they do.
+    #[must_use]
+    pub fn external_file(&self) -> Option<&str> {
+        let file = self.external_data.iter().find(|entry| entry.key() == "location");
+        (self.data_location == Some(1)).then(|| file.map_or("", StringStringEntryProto::value))
+    }
+
     /// The raw bytes, if the values are stored so.
     fn raw(&self) -> Result<Option<&[u8]>, TensorError> {
-        if self.data_location == Some(1) {
+        if self.external_file().is_some() {
             return Err(TensorError::External { name: self.name().to_owned() });
         }
         Ok(self.raw_data.as_deref())

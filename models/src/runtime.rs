@@ -116,6 +116,12 @@ pub enum LoadReason {
     /// ONNX Runtime refuses it.
     #[error("ONNX Runtime refuses it: {0}; if the file was cut short, fetch or export it again")]
     Model(String),
+    /// Its weights are elsewhere.
+    #[error(
+        "keeps its weights in a second file, `{0}`; save both as one, with `onnx.save_model(onnx.load(path), path, \
+         save_as_external_data=False)`"
+    )]
+    Split(String),
     /// It cannot be run as was asked.
     #[error(transparent)]
     Backend(#[from] BackendError),
@@ -276,6 +282,9 @@ impl Network {
 
     /// The first way to run it, of those that may, that gives its answers.
     fn choose(model: &Model, options: &Options) -> Result<Self, LoadReason> {
+        if let Some(file) = &model.weights_elsewhere {
+            return Err(LoadReason::Split(file.clone()));
+        }
         let backends = Machine::here().backends(options.provider, options.precision, model.is_int8)?;
         let (&last, others) = backends.split_last().ok_or(RuntimeError::EmptyBatch)?;
         for &backend in others {
@@ -429,9 +438,9 @@ fn check_tensor(
     channels: usize,
     fixed: Option<i64>,
 ) -> Result<Option<usize>, LoadReason> {
-    let wrong = |what: String| LoadReason::Signature { what };
+    let wrong = |what: String| Err(LoadReason::Signature { what });
     let outlet = outlets.iter().find(|outlet| outlet.name() == name);
-    let dtype = outlet.ok_or_else(|| wrong(format!("it has no `{name}`")))?.dtype();
+    let Some(dtype) = outlet.map(Outlet::dtype) else { return wrong(format!("it has no `{name}`")) };
     let fits = |dim: i64, size: usize| dim < 0 || dim == size as i64;
     match dtype.tensor_shape().map(|shape| &**shape) {
         Some(&[batch, c, x, y, z])
@@ -442,7 +451,10 @@ fn check_tensor(
         {
             Ok([x, y, z].into_iter().find_map(|edge| usize::try_from(edge).ok()))
         }
-        _ => Err(wrong(format!("its `{name}` is {dtype}"))),
+        Some(&[batch, _, _, _, _]) if batch >= 0 && Some(batch) != fixed => {
+            wrong(format!("its `{name}` takes batches of {batch} alone; export it with a dynamic first axis"))
+        }
+        _ => wrong(format!("its `{name}` is {dtype}")),
     }
 }
 

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use grasp::gpd::{Candidate, Cloud, Image};
 use grasp::{SurfacePoint, Volume};
-use grasp_models::onnx::{Dimension, ModelProto, ValueInfoProto};
+use grasp_models::onnx::{Dimension, ModelProto, StringStringEntryProto, ValueInfoProto};
 use grasp_models::{
     Architecture, Backend, Classifier, Network, Options, Orientation, Precision, Provider, RuntimeError, TurnsError,
     averaged_over_turns, build, gpd, init, with_published_heads,
@@ -267,6 +267,18 @@ fn a_file_that_is_no_grasp_network_is_refused() {
         }
     };
     assert!(refusal(large).contains("resolution is 264, it must be from 1 to 256"));
+    let one_by_one = |model: &mut ModelProto| {
+        let graph = model.graph.as_mut().unwrap();
+        graph.input[0] = ValueInfoProto::tensor("tsdf", [1, 1, 8, 8, 8].map(Dimension::size).to_vec());
+    };
+    assert!(refusal(one_by_one).contains("its `tsdf` takes batches of 1 alone"));
+    let split = |model: &mut ModelProto| {
+        let tensor = &mut model.graph.as_mut().unwrap().initializer[0];
+        tensor.data_location = Some(1);
+        let (key, value) = (Some("location".to_owned()), Some("network.onnx.data".to_owned()));
+        tensor.external_data = vec![StringStringEntryProto { key, value }];
+    };
+    assert!(refusal(split).contains("keeps its weights in a second file, `network.onnx.data`; save both as one"));
 }
 
 #[test]

@@ -21,6 +21,13 @@ impl FieldError {
         Self { field, message }
     }
 
+    /// `{field}: {reason}`.
+    pub fn refused(field: impl Into<Cow<'static, str>>, reason: impl Display) -> Self {
+        let field = field.into();
+        let message = format!("{field}: {reason}");
+        Self { field, message }
+    }
+
     /// The same of a field inside of `outer`.
     #[must_use]
     pub fn inside(self, outer: impl Display) -> Self {

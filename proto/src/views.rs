@@ -11,8 +11,9 @@ pub const MAX_VIEWS: usize = 64;
 /// Longest edge of an image, pixels.
 const MAX_EDGE: u32 = 16_384;
 
-/// The share of an image at each of its borders where no principal point is, but of another resolution's.
-const MIDDLE: f64 = 0.15;
+/// How far from the middle of an image, as a share of its edges, a principal point may lie on both axes alike: that of
+/// another resolution does, that of an image cut out of a larger one may lie anywhere else.
+const OFF_CENTRE: f64 = 0.1;
 
 const WORKSPACE: PoseFields =
     PoseFields { position: "workspace.pose.position", orientation: "workspace.pose.orientation" };
@@ -116,8 +117,7 @@ fn try_depth_view(view: &pb::DepthView, frame_from_task: &Isometry3<f64>) -> Res
         }
         _ => view.data.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect(),
     };
-    let image =
-        DepthImage::new(intrinsics, &depth).map_err(|error| FieldError::new("camera", error, "must be mended"))?;
+    let image = DepthImage::new(intrinsics, &depth).map_err(|error| FieldError::refused("camera", error))?;
     match (image.unit(), view.unit()) {
         (Unit::Millimetres, _) => {
             let needed =
@@ -165,16 +165,14 @@ fn intrinsics(camera: &pb::Camera) -> Result<Intrinsics, FieldError> {
     if !(fx > 0.0 && fy > 0.0) {
         return wrong("must have focal lengths above 0 (its first and fifth number)");
     }
-    for (point, edge) in [(cx, camera.width), (cy, camera.height)] {
-        let middle = MIDDLE * f64::from(edge)..=(1.0 - MIDDLE) * f64::from(edge);
-        if !middle.contains(&point) {
-            let needed = format_args!(
-                "must have its principal point (its third and sixth number) near the middle of {} × {} pixels: is it of \
-                 another resolution?",
-                camera.width, camera.height
-            );
-            return Err(FieldError::new("camera.k", format_args!("{k:?}"), needed));
-        }
+    let [u, v] = [cx / f64::from(camera.width) - 0.5, cy / f64::from(camera.height) - 0.5];
+    if u.abs().min(v.abs()) > OFF_CENTRE && (u - v).abs() <= OFF_CENTRE {
+        let needed = format_args!(
+            "must be of an image of {} × {} pixels, and has its principal point (its third and sixth number) far from \
+             the middle: is it of another resolution? If the image was cut out of a larger one, send that",
+            camera.width, camera.height
+        );
+        return Err(FieldError::new("camera.k", format_args!("{k:?}"), needed));
     }
     // Both fit: they are at most MAX_EDGE.
     Ok(Intrinsics { width: camera.width as usize, height: camera.height as usize, fx, fy, cx, cy })
@@ -273,8 +271,10 @@ mod tests {
         assert!(refused(|v| v.camera = camera(&skewed)).ends_with("rectify the image"));
         assert!(refused(|v| v.camera = camera(&[0.0; 9])).contains("must be nine numbers"));
         assert!(refused(|v| v.camera = camera(&[f64::NAN; 9])).ends_with("must be finite"));
-        let twice = [10.0, 0.0, 4.0, 0.0, 10.0, 3.0, 0.0, 0.0, 1.0];
-        assert!(refused(|v| v.camera = camera(&twice)).ends_with("is it of another resolution?"));
+        for scale in [2.0, 0.75, 0.5] {
+            let k = [5.0 * scale, 0.0, 2.0 * scale, 0.0, 5.0 * scale, 1.5 * scale, 0.0, 0.0, 1.0];
+            assert!(refused(|v| v.camera = camera(&k)).contains("is it of another resolution?"));
+        }
         let negative = [-5.0, 0.0, 2.0, 0.0, 5.0, 1.5, 0.0, 0.0, 1.0];
         assert!(refused(|v| v.camera = camera(&negative)).contains("focal lengths above 0"));
         assert_eq!(
@@ -292,6 +292,13 @@ mod tests {
             refused(|v| v.extrinsics = Some(Extrinsics::FrameFromCamera(nowhere))),
             "views[1].frame_from_camera.position is absent, must be given"
         );
+    }
+
+    #[test]
+    fn an_image_may_be_cut_out_of_a_larger_one() {
+        let camera = pb::Camera { width: 4, height: 3, k: vec![5.0, 0.0, -1.0, 0.0, 5.0, 1.2, 0.0, 0.0, 1.0] };
+        let view = pb::DepthView { camera: Some(camera), ..view() };
+        assert_eq!(depth_view(&view, 0, &Isometry3::identity()).unwrap().intrinsics.cx, -1.0);
     }
 
     #[test]

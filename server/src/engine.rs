@@ -100,10 +100,12 @@ pub(crate) struct Tensors {
 pub(crate) enum EngineError {
     #[error(transparent)]
     Run(#[from] RuntimeError),
-    #[error("the model's output is unusable: {0}")]
+    #[error(transparent)]
     Decode(#[from] DecodeError),
     #[error("the session panicked: {0}")]
     Panic(String),
+    #[error("this planner has no network whose output could be told")]
+    NoNetwork,
     #[error("the session is gone")]
     Gone,
     #[error("the deadline has passed before a session was free")]
@@ -293,7 +295,9 @@ struct Taken {
 
 impl Session {
     fn run(mut self) {
-        while let Some(mut jobs) = self.queue.take(self.batching) {
+        let alone = Batching { max: 1, delay: Duration::ZERO };
+        let batching = if matches!(self.planner, Planner::Classical(_)) { alone } else { self.batching };
+        while let Some(mut jobs) = self.queue.take(batching) {
             let now = Instant::now();
             let expired = |job: &mut Job| job.deadline.is_some_and(|Deadline(deadline)| deadline <= now);
             for job in jobs.extract_if(.., expired) {
@@ -316,7 +320,12 @@ impl Session {
             };
             match planner {
                 Planner::Network(network) => infer(network, jobs, done),
-                Planner::Classical(classical) => plan(classical, jobs, done),
+                // One at a time: there is nothing to share.
+                Planner::Classical(classical) => {
+                    if let Some(job) = jobs.pop() {
+                        plan(classical, job, done);
+                    }
+                }
             }
         }
     }
@@ -349,31 +358,20 @@ fn infer(network: &mut Network, jobs: Vec<Job>, done: impl FnOnce(Duration, usiz
     }
 }
 
-/// Has a planner without a network look at one scene after the other.
-fn plan(classical: &mut Classical, jobs: Vec<Job>, done: impl FnOnce(Duration, usize) -> Taken) {
-    let started = Instant::now();
-    let own = classical.decode_params();
-    let count = jobs.len();
-    let decoded: Vec<_> = jobs
-        .iter()
-        .map(|Job { scene, task, .. }| match task {
-            Task::Grasps(asked, _) => caught(|| classical.plan(scene, asked, &asked.decode_params(own))),
-            // Only networks are asked for theirs.
-            Task::Maps(_) => Err(EngineError::Gone),
-        })
-        .collect();
-    let taken = done(started.elapsed(), count);
-    for (Job { scene, task, span, submitted, .. }, decoded) in jobs.into_iter().zip(decoded) {
-        let _entered = span.enter();
-        match (task, decoded) {
-            (Task::Grasps(asked, reply), Ok(decoded)) => {
-                answer(reply, submitted, taken, || Ok(found(decoded, scene.volume, &asked)));
-            }
-            (task, Err(error)) => {
-                error!(%error, "the session failed");
-                task.fail(error);
-            }
-            (task @ Task::Maps(_), Ok(_)) => task.fail(EngineError::Gone),
+/// Has a planner without a network look at a scene.
+fn plan(classical: &mut Classical, job: Job, done: impl FnOnce(Duration, usize) -> Taken) {
+    let Job { scene, task, span, submitted, .. } = job;
+    let _entered = span.enter();
+    match task {
+        Task::Grasps(asked, reply) => {
+            let started = Instant::now();
+            let decoded = caught(|| classical.plan(&scene, &asked, &asked.decode_params(classical.decode_params())));
+            let taken = done(started.elapsed(), 1);
+            answer(reply, submitted, taken, || Ok(found(decoded?, scene.volume, &asked)));
+        }
+        Task::Maps(_) => {
+            done(Duration::ZERO, 1);
+            task.fail(EngineError::NoNetwork);
         }
     }
 }
@@ -415,12 +413,11 @@ fn warm_up(network: &mut Network) -> Result<Duration, EngineError> {
     let metadata = network.metadata();
     let values = vec![0.5; metadata.resolution.pow(3)];
     let volume = Volume::new(metadata.resolution, metadata.voxel_size, Isometry3::identity(), values);
-    let params = metadata.decode_params();
+    let resolution = metadata.resolution;
     let volume = volume.expect("metadata has a positive resolution and voxel size, and 0.5 is a surface");
     let started = Instant::now();
     caught(|| {
-        let output = network.infer(&[&volume])?;
-        decode(&volume, &output.maps(0), &params)?;
+        network.infer(&[&volume])?.maps(0).check(resolution)?;
         Ok(started.elapsed())
     })
 }

@@ -103,6 +103,8 @@ impl From<&Engine> for pb::Model {
             provider: engine.backend.provider.to_string(),
             precision: engine.backend.precision.to_string(),
             provenance: source.provenance().into_iter().collect(),
+            voxel_origin: network.map_or("", |metadata| metadata.voxel_origin.name()).to_owned(),
+            camera_azimuth: network.and_then(|metadata| metadata.camera_azimuth),
         }
     }
 }

@@ -160,11 +160,11 @@ fn response(
         if !request.outputs.is_empty() && !request.outputs.iter().any(|output| output.name == name) {
             continue;
         }
-        let part = |tensors: &Tensors| match name {
-            "quality" => tensors.quality.clone(),
-            "rotation" => tensors.rotation.clone(),
-            _ => tensors.width.clone(),
-        };
+        let parts = maps.iter().map(|tensors| match name {
+            "quality" => &*tensors.quality,
+            "rotation" => &tensors.rotation,
+            _ => &tensors.width,
+        });
         let shape = vec![maps.len() as i64, channels, n, n, n];
         outputs.push(InferOutputTensor {
             name: name.to_owned(),
@@ -172,7 +172,7 @@ fn response(
             shape,
             ..Default::default()
         });
-        raw_output_contents.push(Bytes::from(maps.iter().flat_map(part).collect::<Vec<u8>>()));
+        raw_output_contents.push(Bytes::from(parts.collect::<Vec<_>>().concat()));
     }
     let parameters = timings.stages().map(|(stage, seconds)| {
         let parameter = oip::InferParameter { parameter_choice: Some(ParameterChoice::DoubleParam(seconds)) };

@@ -78,11 +78,12 @@ impl Grid {
         let mut sights = Vec::new();
         for (index, view) in views.iter().enumerate() {
             let image = DepthImage::new(view.intrinsics, &view.depth);
-            let image = image.map_err(|error| FieldError::new(format!("views[{index}]"), error, "must be mended"))?;
+            let image = image.map_err(|error| FieldError::refused(format!("views[{index}]"), error))?;
             let camera_from_grid = view.camera_from_task * self.task_from_grid;
             if fusion.integrate(&image, &camera_from_grid) == 0 {
                 let reason = fusion.blind(&image, &camera_from_grid);
-                return Err(FieldError::new(format!("views[{index}]"), "blind", reason));
+                let eye = view.camera_from_task.inverse().translation;
+                return Err(FieldError::new(format!("views[{index}]"), blind(&eye.vector.into()), reason));
             }
             if self.sights {
                 sights.extend(image.points(&view.camera_from_task));
@@ -95,11 +96,10 @@ impl Grid {
     pub fn scene(&self, fusion: &Fusion, sights: Option<Vec<SurfacePoint>>) -> Result<Scene, FieldError> {
         let volume = fusion.volume(self.frame_from_task * self.task_from_grid).map_err(|error| match error {
             VolumeError::Empty => {
-                let needed =
-                    "in none of which a surface lies in the workspace; check its pose, and those of the cameras";
-                FieldError::new("views", "a list of views", needed)
+                let reason = "none shows a surface in the workspace; check workspace.pose and the poses of the cameras";
+                FieldError::refused("views", reason)
             }
-            error => FieldError::new("workspace", error, "must be another"),
+            error => FieldError::refused("workspace", error),
         })?;
         Ok(Scene { volume, sights: sights.filter(|_| self.sights) })
     }
@@ -109,14 +109,17 @@ impl Grid {
 pub(crate) fn rendered(clouds: &[Points], size: f64) -> Result<Vec<View>, FieldError> {
     let view = |(index, cloud): (usize, &Points)| {
         seen_from(&cloud.points, &cloud.eye, size).ok_or_else(|| {
-            let eye = cloud.eye;
-            let value = format_args!("blind from ({:.3}, {:.3}, {:.3}) of the workspace", eye.x, eye.y, eye.z);
             let needed =
                 "no point is in sight there, or the camera stands inside of it; check camera_position and the poses";
-            FieldError::new(format!("views[{index}]"), value, needed)
+            FieldError::new(format!("views[{index}]"), blind(&cloud.eye), needed)
         })
     };
     clouds.iter().enumerate().map(view).collect()
+}
+
+/// A view that sees nothing of the cube, with where its camera is said to stand: who reads it knows better.
+fn blind(eye: &Point3<f64>) -> String {
+    format!("blind from ({:.3}, {:.3}, {:.3}) of the task frame", eye.x, eye.y, eye.z)
 }
 
 /// The edge of the cube that clouds are looked at in before a planner is known to want another.

@@ -1,3 +1,4 @@
+use std::borrow::Cow;
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -155,9 +156,12 @@ impl Classical {
         let volume = &scene.volume;
         let size = volume.resolution() as f64 * volume.voxel_size();
         let table = asked.table.unwrap_or(0.0);
-        let coarse = || Fusion::of(volume).surface();
-        let sights = scene.sights.as_ref().map_or_else(coarse, Clone::clone);
-        let cloud = Cloud::new(sights.into_iter().filter(|point| is_on_an_object(&point.position, size, table)));
+        let sights = match &scene.sights {
+            Some(sights) => Cow::Borrowed(sights),
+            None => Cow::Owned(Fusion::of(volume).surface()),
+        };
+        let on_objects = sights.iter().filter(|point| is_on_an_object(&point.position, size, table));
+        let cloud = Cloud::new(on_objects.copied());
         let hand = asked.hand.unwrap_or(Hand::GPD);
         let aperture = PLAY..=(2.0 * hand.half_opening() - PLAY);
         let params_of_hands = Params { hand, aperture, ..Params::above(table + ABOVE_TABLE) };

@@ -48,6 +48,15 @@ impl Refusal {
         }
     }
 
+    /// The field of the request that is not what it must be.
+    fn field(&self) -> Option<&str> {
+        match self {
+            Self::Field(error) => Some(&error.field),
+            Self::UnknownModel { field, .. } => Some(field),
+            _ => None,
+        }
+    }
+
     /// When it is worth coming back, where it is.
     fn retry_after(&self) -> Option<Duration> {
         match self {
@@ -66,8 +75,8 @@ impl Refusal {
     pub fn status(self, request_id: &str) -> Status {
         let mut details = ErrorDetails::new();
         details.set_request_info(request_id, "");
-        if let Self::Field(error) = &self {
-            details.add_bad_request_violation(&*error.field, &error.message);
+        if let Some(field) = self.field() {
+            details.add_bad_request_violation(field, self.to_string());
         }
         let mut metadata = MetadataMap::new();
         if let Some(after) = self.retry_after() {
@@ -88,6 +97,7 @@ impl From<Refusal> for pb::Error {
         Self {
             code: refusal.code().into(),
             retry_after: refusal.retry_after().map(|after| after.as_secs_f64()),
+            field: refusal.field().unwrap_or_default().to_owned(),
             message: refusal.to_string(),
         }
     }

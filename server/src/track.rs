@@ -1,7 +1,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use grasp::Fusion;
+use grasp::{Fusion, View};
 use grasp_proto::{Asked, FieldError, MAX_VIEWS, Workspace, depth_view, pb};
 use nalgebra::Isometry3;
 use prometheus::IntGauge;
@@ -83,12 +83,13 @@ impl Track {
                 (None, Err(missing.into()))
             }
             (Some(mut track), None) => {
-                let fused = track.add(engine, asked, views);
+                let views = converted(views, &track.frame_from_task);
+                let fused = views.map_err(Refusal::from).and_then(|views| track.add(engine, asked, &views));
                 (Some(track), fused)
             }
             (track, Some(workspace)) => match Self::start(engine, &asked, workspace, views) {
-                Ok(mut track) => {
-                    let fused = track.add(engine, asked, views);
+                Ok((mut track, views)) => {
+                    let fused = track.add(engine, asked, &views);
                     (Some(track), fused)
                 }
                 Err(refusal) => (track, Err(refusal)),
@@ -96,25 +97,25 @@ impl Track {
         }
     }
 
+    /// An empty one, and the views that it begins with.
     fn start(
         engine: &Engine,
         asked: &Asked,
         workspace: pb::Workspace,
         views: &[pb::DepthView],
-    ) -> Result<Self, Refusal> {
+    ) -> Result<(Self, Vec<View>), Refusal> {
         let mut workspace = Workspace::try_from(workspace)?;
         let origin = Origin::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
         let frame_from_task = workspace.frame_from_task;
         let views = converted(views, &frame_from_task)?;
         let grid = Grid::of(&engine.source, &workspace, &eyes(&views))?;
-        Ok(Self { fusion: grid.fusion(), grid, frame_from_task, origin, asked: asked.clone() })
+        Ok((Self { fusion: grid.fusion(), grid, frame_from_task, origin, asked: asked.clone() }, views))
     }
 
-    fn add(&mut self, engine: &Engine, asked: Asked, views: &[pb::DepthView]) -> Result<Fused, Refusal> {
+    fn add(&mut self, engine: &Engine, asked: Asked, views: &[View]) -> Result<Fused, Refusal> {
         let started = Instant::now();
         self.grid.check(&engine.source)?;
-        let views = converted(views, &self.frame_from_task)?;
-        self.grid.integrate(&mut self.fusion, &views)?;
+        self.grid.integrate(&mut self.fusion, views)?;
         // Of a view long ago the volume has kept all there is.
         let scene = self.grid.scene(&self.fusion, None)?;
         self.asked = Asked { constraints: self.grid.within(asked.constraints), ..asked };
@@ -122,7 +123,7 @@ impl Track {
     }
 }
 
-fn converted(views: &[pb::DepthView], frame_from_task: &Isometry3<f64>) -> Result<Vec<grasp::View>, FieldError> {
+fn converted(views: &[pb::DepthView], frame_from_task: &Isometry3<f64>) -> Result<Vec<View>, FieldError> {
     if views.len() > MAX_VIEWS {
         let needed = format_args!("must have at most {MAX_VIEWS}");
         return Err(FieldError::new("views", format_args!("a list of {}", views.len()), needed));

@@ -35,8 +35,8 @@ def flags():
 
 
 def instructions():
-    """The Dockerfile's, by stage: the stage's base, then pairs of an instruction and its text."""
-    stages = {}
+    """The Dockerfile's, by stage: the stage's base, then pairs of an instruction and its text. Before the first: ""."""
+    stage, stages = "", {"": []}
     text = re.sub(r"^#.*\n", "", (DEPLOY / "Dockerfile").read_text(), flags=re.MULTILINE).replace("\\\n", " ")
     for word, rest in re.findall(r"^([A-Z]+) +(.*)$", text, flags=re.MULTILINE):
         if word == "FROM":
@@ -45,6 +45,12 @@ def instructions():
         else:
             stages[stage].append((word, " ".join(rest.split())))
     return stages
+
+
+def image(device):
+    """What makes the image for a device: its own base, then what all have."""
+    stages = instructions()
+    return stages[device] + stages["graspd"]
 
 
 def variables(stage):
@@ -59,15 +65,15 @@ def port(address):
 class DockerfileTest(unittest.TestCase):
     def setUp(self):
         self.stages = instructions()
-        self.images = [self.stages["cpu"], self.stages["cuda"]]
+        self.images = [image("cpu"), image("cuda")]
 
-    def test_the_first_image_is_built_if_none_is_named(self):
-        self.assertEqual(list(self.stages)[-1], "cpu")
+    def test_the_image_for_cpus_is_built_if_none_is_named(self):
+        self.assertIn(("ARG", "DEVICE=cpu"), self.stages[""])
+        *_, (name, steps) = self.stages.items()
+        self.assertEqual((name, steps[0]), ("graspd", ("FROM", "${DEVICE}")))
 
-    def test_both_images_are_run_alike(self):
-        cpu, cuda = (stage[stage.index(("COPY", "--from=graspd / /")) + 1 :] for stage in self.images)
-        self.assertEqual([step for step in cuda if step != ("ENV", "GRASPD_PROVIDER=cuda")], cpu)
-        user = dict(cpu)["USER"]
+    def test_nobody_is_root(self):
+        user = dict(self.stages["graspd"])["USER"]
         self.assertTrue(all(int(number) > 0 for number in user.split(":")), f"{user}: Kubernetes wants numbers, not root")
 
     def test_what_is_set_are_flags(self):
@@ -143,13 +149,12 @@ class ComposeTest(unittest.TestCase):
         (prometheus,) = load(DEPLOY / "prometheus/prometheus.yml")
         ((target,),) = [config["targets"] for job in prometheus["scrape_configs"] for config in job["static_configs"]]
         self.assertIn(target.split(":")[0], self.services)
-        self.assertEqual(port(target), port(variables(instructions()["cpu"])["GRASPD_HTTP"]))
+        self.assertEqual(port(target), port(variables(image("cpu"))["GRASPD_HTTP"]))
 
     def test_graspd_is_built_from_the_dockerfile_and_may_drain(self):
         graspd = self.services["graspd"]
         build = DEPLOY / graspd["build"]["context"] / graspd["build"]["dockerfile"]
         self.assertEqual(build.resolve(), DEPLOY / "Dockerfile")
-        self.assertIn(graspd["build"]["target"], instructions())
         self.assertGreater(float(graspd["stop_grace_period"].removesuffix("s")), float(flags()["GRASPD_DRAIN_TIMEOUT"]))
 
     def test_all_are_locked_in_watched_and_pinned(self):
@@ -159,7 +164,7 @@ class ComposeTest(unittest.TestCase):
             for published in service["ports"]:
                 self.assertTrue(published.startswith("127.0.0.1:"), f"{name}: {published}")
             if "build" in service:
-                self.assertIn("HEALTHCHECK", dict(instructions()[service["build"]["target"]]))
+                self.assertIn("HEALTHCHECK", dict(image("cpu")))
             else:
                 self.assertIn("healthcheck", service, name)
                 self.assertRegex(service["image"], r":v?\d+\.\d+\.\d+$")
@@ -209,8 +214,8 @@ class KubernetesTest(unittest.TestCase):
         self.assertIn(labels[self.objects["PodMonitor"]["spec"]["jobLabel"]], jobs)
 
     def test_the_ports_are_those_of_the_image(self):
-        image = variables(instructions()["cpu"])
-        self.assertEqual(self.ports, {"grpc": port(image["GRASPD_LISTEN"]), "http": port(image["GRASPD_HTTP"])})
+        own = variables(image("cpu"))
+        self.assertEqual(self.ports, {"grpc": port(own["GRASPD_LISTEN"]), "http": port(own["GRASPD_HTTP"])})
         for entry in self.objects["Service"]["spec"]["ports"]:
             self.assertEqual(entry["port"], self.ports[entry["targetPort"]])
         named = [entry["port"] for rule in self.objects["NetworkPolicy"]["spec"]["ingress"] for entry in rule["ports"]]
@@ -257,7 +262,7 @@ class KubernetesTest(unittest.TestCase):
         (patch,) = load(KUBERNETES / "options/models/kustomization.yaml")[0]["patches"]
         pod = yaml.safe_load(patch["patch"])["spec"]["template"]["spec"]
         (mount,) = pod["containers"][0]["volumeMounts"]
-        self.assertEqual(mount["mountPath"], variables(instructions()["cpu"])["GRASPD_MODELS"])
+        self.assertEqual(mount["mountPath"], variables(image("cpu"))["GRASPD_MODELS"])
         self.assertEqual([volume["name"] for volume in pod["volumes"]], [mount["name"]])
 
     def test_kserve_runs_the_same(self):

@@ -184,24 +184,42 @@ class DocsTest(unittest.TestCase):
             [dimension, *_] = model.graph.input[0].type.tensor_type.shape.dim
             dimension.dim_value = 1
 
-        def spoil(model):
-            rename(model, "quality", "spoilt")
-            model.graph.output[0].name = "quality"
-            nan = onnx.helper.make_tensor("nan", onnx.TensorProto.FLOAT, [], [np.nan])
-            model.graph.initializer.append(nan)
-            model.graph.node.append(onnx.helper.make_node("Add", ["spoilt", "nan"], ["quality"]))
+        def halve(model):
+            model.graph.input[0].type.tensor_type.elem_type = onnx.TensorProto.FLOAT16
+            model.graph.input[0].name = "half"
+            model.graph.node.insert(0, onnx.helper.make_node("Cast", ["half"], ["tsdf"], to=onnx.TensorProto.FLOAT))
+            rename(model, "tsdf", "full")
+            rename(model, "half", "tsdf")
+
+        def split(model):
+            tensor = next(tensor for tensor in model.graph.initializer if tensor.raw_data)
+            onnx.external_data_helper.set_external_data(tensor, "mine.onnx.data")
+            tensor.ClearField("raw_data")
+
+        def add(offset):
+            def change(model):
+                rename(model, "quality", "before")
+                model.graph.output[0].name = "quality"
+                tensor = onnx.helper.make_tensor("offset", onnx.TensorProto.FLOAT, [], [offset])
+                model.graph.initializer.append(tensor)
+                model.graph.node.append(onnx.helper.make_node("Add", ["before", "offset"], ["quality"]))
+
+            return change
 
         mine = with_properties(name="mine", version="1.0")
         examples = [
             changed(lambda model: rename(model, "width", "opening")),
             changed(lambda model: rename(model, "tsdf", "input")),
             changed(fix_batch),
+            changed(halve),
             changed(with_properties(resolution="32")),
             changed(with_properties(camera_azimuth="east")),
             2 * changed(mine),
             [b"version https://git-lfs.github.com/spec/v1\n"],
+            changed(split),
             changed(lambda model: model.opset_import[0].MergeFrom(onnx.helper.make_opsetid("", 999))),
-            changed(spoil),
+            changed(add(-2.0)),
+            changed(add(np.nan)),
         ]
         table = (DOCS / "own-model.md").read_text().partition("| it says | |")[2]
         rows = re.findall(r"^\| `+ ?(.*?) ?`+ \|", table, re.MULTILINE)

@@ -36,7 +36,7 @@ sys.path.insert(0, INSTALLED.name)
 
 import graspd
 import graspd.aio
-from graspd import grasp_pb2
+from graspd import grasp_pb2, wire
 
 CAMERAS = [scene.camera(30, -90), scene.camera(40, 90)]
 LOW = graspd.Options(threshold=0.5)
@@ -136,6 +136,8 @@ class DetectTest(ServerTest):
         self.assertEqual([network.name, gpd.name, shaf.name], ["vgn-packed", "gpd", "shaf"])
         self.assertEqual((network.resolution, network.provider, shaf.resolution), (scene.RESOLUTION, "cpu", 0))
         self.assertAlmostEqual(network.voxel_size, 0.0075)
+        self.assertIn(network.voxel_origin, ["corner", "center"])
+        self.assertEqual((shaf.voxel_origin, network.camera_azimuth, shaf.camera_azimuth), ("", None, None))
         self.assertTrue(network.sha256 and network.provenance and self.client.health())
 
 
@@ -167,8 +169,9 @@ class OptionsTest(ServerTest):
         free = [grasp for grasp in flagged.grasps if not grasp.collides]
         self.assertTrue(0 < len(free) < len(flagged.grasps))
         self.assertEqual([replace(grasp, collides=None) for grasp in flagged.grasps], list(off.grasps))
-        self.assertEqual(positions(filtered).tolist(), [list(grasp.pose.position) for grasp in free])
-        self.assertEqual(filtered.dropped.collision, len(flagged.grasps) - len(free))
+        left = {grasp.pose.position for grasp in filtered.grasps}
+        self.assertLessEqual({grasp.pose.position for grasp in free}, left, "more, where neighbours take their place")
+        self.assertGreaterEqual(filtered.dropped.collision, len(flagged.grasps) - len(free))
         self.assertTrue(all(grasp.collides for grasp in buried.grasps), "under a table")
 
     def test_poses_are_told_as_the_robot_wants_them(self):
@@ -224,9 +227,18 @@ class MistakesTest(ServerTest):
             self.assertEqual(vars(pickle.loads(pickle.dumps(error))), vars(error))
 
     def test_a_model_that_is_not_there(self):
-        with self.assertRaisesRegex(graspd.NotFound, "NOT_FOUND: .* there are vgn-packed [0-9.]+, .*gpd 1, shaf 1") as caught:
-            self.client.detect(scene.volume(*CAMERAS), graspd.Options(model="nobody"), request_id="mine")
-        self.assertEqual(caught.exception.request_id, "mine")
+        volume, there_are = scene.volume(*CAMERAS), "NOT_FOUND: .* there are vgn-packed [0-9.]+, .*gpd 1, shaf 1"
+        for field, options in [
+            ("options.model", graspd.Options(model="nobody")),
+            ("options.version", graspd.Options(model="shaf", version="0")),
+        ]:
+            with self.subTest(field), self.assertRaisesRegex(graspd.NotFound, there_are) as caught:
+                self.client.detect(volume, options, request_id="mine")
+            (in_a_stream,) = self.client.detect_stream([volume], options)
+            self.assertIsInstance(in_a_stream, graspd.NotFound)
+            for error in [caught.exception, in_a_stream]:
+                self.assertEqual(error.field, field)
+            self.assertEqual(caught.exception.request_id, "mine")
 
     def test_what_cannot_be_asked_is_a_value_error(self):
         volume, depth, pose = scene.volume(*CAMERAS), scene.depth(CAMERAS[0]), np.eye(4)
@@ -266,6 +278,7 @@ class StreamTest(ServerTest):
         refused = answers.pop(3)
         self.assertIsInstance(refused, graspd.InvalidArgument)
         self.assertTrue(refused.message.startswith("volume.data[") and refused.request_id)
+        self.assertEqual(refused.field, "volume.data")
         self.assertEqual([answer.frame_id for answer in answers], [str(i) for i in range(8) if i != 3])
         self.assertTrue(all(answer.grasps == answers[0].grasps for answer in answers))
 
@@ -321,8 +334,9 @@ class TrackTest(ServerTest):
         bad = replace(good, camera_from_task=behind)
         with self.client.track() as tracking:
             for _ in range(2):
-                with self.assertRaisesRegex(graspd.InvalidArgument, r"views\[0\] is blind"):
+                with self.assertRaisesRegex(graspd.InvalidArgument, r"views\[0\] is blind") as caught:
                     tracking.add([bad], LOW)
+                self.assertEqual(caught.exception.field, "views[0]")
                 kept = tracking.add([good], LOW)
             self.assertEqual(tracking.add().grasps, kept.grasps)
         self.wait_until_none_is_tracked()
@@ -561,6 +575,19 @@ class PackageTest(ServerTest):
         ]:
             with self.subTest(ours.__name__):
                 self.assertEqual({field.name for field in fields(ours)}, set(theirs.DESCRIPTOR.fields_by_name))
+
+
+class WireTest(unittest.TestCase):
+    def test_what_is_absent_is_none_and_zero_is_not(self):
+        for azimuth in [None, 0.0, -90.0]:
+            self.assertEqual(wire.model(grasp_pb2.Model(camera_azimuth=azimuth)).camera_azimuth, azimuth)
+
+    def test_errors_of_streams_name_the_field_if_it_is_one(self):
+        for field in [None, "options.model"]:
+            error = grasp_pb2.Error(code=grpc.StatusCode.NOT_FOUND.value[0], message="there is no such", field=field)
+            told = wire.outcome(grasp_pb2.DetectGraspsStreamResponse(request_id="mine", error=error))
+            wanted = graspd.NotFound(grpc.StatusCode.NOT_FOUND, error.message, field, request_id="mine")
+            self.assertEqual((type(told), vars(told)), (type(wanted), vars(wanted)))
 
 
 class PoseTest(unittest.TestCase):

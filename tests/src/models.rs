@@ -12,7 +12,8 @@ pub const RESOLUTION: usize = 16;
 /// The width that they predict everywhere, voxels.
 pub const WIDTH: f32 = 5.0;
 
-/// ONNX's number for the element type.
+/// ONNX's numbers for the element types.
+const FLOAT: i64 = 1;
 const INT64: i64 = 7;
 
 /// Channels of the convolutions that make a model slow.
@@ -28,6 +29,7 @@ pub struct TestModel {
     resolution: usize,
     convolutions: usize,
     rotation: [f32; 4],
+    breaks_at: Option<f32>,
     fails_at_zero: bool,
 }
 
@@ -41,6 +43,7 @@ impl TestModel {
             resolution: RESOLUTION,
             convolutions: 0,
             rotation: [0.0, 0.0, 0.0, 1.0],
+            breaks_at: None,
             fails_at_zero: false,
         }
     }
@@ -63,10 +66,10 @@ impl TestModel {
         Self { convolutions, ..self }
     }
 
-    /// Its quaternions are 0: where it finds a grasp, its output is unusable.
+    /// Its quaternions are 0 where the volume is at least `value`: a grasp there is none.
     #[must_use]
-    pub fn broken(self) -> Self {
-        Self { rotation: [0.0; 4], ..self }
+    pub fn breaks_at(self, value: f32) -> Self {
+        Self { breaks_at: Some(value), ..self }
     }
 
     /// Every grasp has this orientation, a unit quaternion x, y, z, w.
@@ -99,9 +102,12 @@ impl TestModel {
 
         constant(&mut graph, "nought", 0.0);
         node(&mut graph, "Mul", &["tsdf", "nought"], "zeros", vec![]);
+        constant(&mut graph, "breaks_at", self.breaks_at.unwrap_or(f32::INFINITY));
+        node(&mut graph, "Less", &["tsdf", "breaks_at"], "is_sound", vec![]);
+        node(&mut graph, "Cast", &["is_sound"], "sound", vec![AttributeProto::int("to", FLOAT)]);
         for (index, component) in self.rotation.into_iter().enumerate() {
             constant(&mut graph, &format!("component_{index}"), component);
-            node(&mut graph, "Add", &["zeros", &format!("component_{index}")], &format!("channel_{index}"), vec![]);
+            node(&mut graph, "Mul", &["sound", &format!("component_{index}")], &format!("channel_{index}"), vec![]);
         }
         let channels = ["channel_0", "channel_1", "channel_2", "channel_3"];
         node(&mut graph, "Concat", &channels, "rotation", vec![AttributeProto::int("axis", 1)]);

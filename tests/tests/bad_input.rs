@@ -228,7 +228,7 @@ async fn the_parameters_must_be_in_range() {
 
 #[tokio::test]
 async fn a_model_that_fails_on_a_volume_fails_that_request_alone() {
-    let server = Server::run(&[TestModel::new("broken").broken()], &[]);
+    let server = Server::run(&[TestModel::new("broken").breaks_at(0.6)], &[]);
     let mut client = server.raw().await;
     for _ in 0..3 {
         let status = client.detect_grasps(request()).await.unwrap_err();

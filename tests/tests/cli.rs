@@ -2,15 +2,19 @@
 
 use std::fs::File;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
+use foxglove::Decode;
+use foxglove::messages::{PointCloud, SceneUpdate};
 use grasp::Volume;
+use grasp_client::{Asked, Client, Error, Options};
 use grasp_tests::scene::{CAMERA, camera, depth};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs, grasp};
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use npyz::WriterBuilder;
 use serde_json::Value;
 use tempfile::TempDir;
+use tokio_stream::StreamExt;
 
 fn volume() -> Volume {
     blobs(RESOLUTION, Isometry3::identity(), &[[4, 5, 6], [11, 10, 9]])
@@ -104,6 +108,8 @@ fn models_and_health_say_what_there_is() {
     assert_eq!(models[0]["resolution"], RESOLUTION);
     assert_eq!(models[0]["sha256"].as_str().unwrap().len(), 64);
     assert_eq!(models[0]["provenance"]["data"], "none");
+    assert_eq!(models[0]["voxel_origin"], "corner");
+    assert!(models[0].as_object().unwrap()["camera_azimuth"].is_null());
     let output = run(&server, &["health"]);
     assert!(output.status.success());
     assert_eq!(text(&output.stdout), "serving\n");
@@ -130,6 +136,110 @@ fn mistakes_are_explained() {
     assert!(refused(&["detect", whole.to_str().unwrap()]).contains("f64, f32, f16 or u8 is needed"));
     let error = refused(&["detect", file, "--voxel-size", "7.5"]);
     assert!(error.contains("volume.voxel_size is 7.5, the model mirror 1 takes 0.01875 m"), "{error}");
+}
+
+/// Flags that cannot be given together, or not alone.
+#[test]
+fn wrong_combinations_are_refused_before_anything_is_read() {
+    let refused = |flags: &str| {
+        let output = Command::new(grasp()).arg("detect").args(flags.split(' ')).output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{flags}");
+        text(&output.stderr).to_owned()
+    };
+    assert!(refused("a.npy --camera-position 0,0,0 --intrinsics k.npy").contains("cannot be used with"));
+    assert!(refused("a.npy --camera-position 0,0,0 --voxel-size 0.01").contains("cannot be used with"));
+    assert!(refused("a.npy --camera-position 0,0").contains("3 numbers with commas between them are needed"));
+    assert!(refused("a.npy --frame-from-cloud pose.npy").contains("--camera-position <X,Y,Z>"));
+    assert!(refused("a.npy --palm 0,0,0,1,1,1").contains("--gripper <OPENING,DEPTH,WIDTH,BREADTH>"));
+    assert!(refused("a.npy --origin parent").contains("--parent-from-grasp <FILE>"));
+}
+
+#[tokio::test]
+async fn the_library_names_the_field_that_is_wrong() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let client = Client::connect(server.grpc().to_string()).await.unwrap();
+    let wrong = || Options { asked: Asked { threshold: Some(7.0), ..Asked::default() }, ..Options::default() };
+    let unary = client.detect(&volume(), wrong()).await.unwrap_err();
+    let volumes = tokio_stream::iter([(volume(), wrong())]);
+    let streamed = client.detect_stream(volumes).await.unwrap().next().await.unwrap().unwrap_err();
+    for error in [unary, streamed] {
+        assert_eq!(error.field(), Some("options.threshold"), "{error:?}");
+        assert!(matches!(error, Error::Refused { .. }) && error.to_string().contains("options.threshold is 7"));
+    }
+    let named = Options { asked: Asked { model: "vgn".to_owned(), ..Asked::default() }, ..Options::default() };
+    assert_eq!(client.detect(&volume(), named).await.unwrap_err().field(), Some("options.model"));
+}
+
+fn pose(value: &Value) -> Isometry3<f64> {
+    let numbers = |key: &str| -> Vec<f64> {
+        value[key]
+            .as_array()
+            .unwrap_or_else(|| panic!("no {key} in {value}"))
+            .iter()
+            .filter_map(Value::as_f64)
+            .collect()
+    };
+    let (position, rotation) = (numbers("position"), numbers("orientation_xyzw"));
+    let rotation = Quaternion::new(rotation[3], rotation[0], rotation[1], rotation[2]);
+    Isometry3::from_parts(
+        Translation3::new(position[0], position[1], position[2]),
+        UnitQuaternion::new_unchecked(rotation),
+    )
+}
+
+#[test]
+fn the_hand_its_frame_and_its_ways_are_asked_for() {
+    let server = Server::run(&[TestModel::new("mirror").rotation([0.6, 0.0, 0.0, 0.8])], &[]);
+    let (folder, files) = files();
+    let file = files[0].to_str().unwrap();
+    let best = |flags: &str| -> Value {
+        let output =
+            run(&server, &[&["detect", file, "--json"][..], &flags.split_whitespace().collect::<Vec<_>>()].concat());
+        assert!(output.status.success(), "{flags}: {}", text(&output.stderr));
+        serde_json::from_slice::<Value>(&output.stdout).unwrap()["grasps"][0].take()
+    };
+    let same = |a: Isometry3<f64>, b: Isometry3<f64>| (a.to_homogeneous() - b.to_homogeneous()).norm() < 1e-9;
+    let own = best("");
+    let back = |distance: f64| pose(&own) * Translation3::new(0.0, 0.0, -distance);
+    assert!(same(pose(&own["pregrasp"]), back(0.05)) && same(pose(&own["retreat"]), back(0.1)), "{own}");
+
+    let far = best("--pregrasp 0.12 --retreat 0.2");
+    assert!(same(pose(&far["pregrasp"]), back(0.12)) && same(pose(&far["retreat"]), back(0.2)), "{far}");
+    let up = best("--retreat-direction 0,-0,2");
+    assert!(same(pose(&up["retreat"]), Translation3::new(0.0, 0.0, 0.1) * pose(&own)), "{up}");
+
+    let parent_from_grasp = Isometry3::new(Vector3::new(0.0, 0.01, 0.0584), Vector3::new(0.0, 0.0, 0.785));
+    let path = folder.path().join("hand.json");
+    let matrix: Vec<f64> = parent_from_grasp.to_homogeneous().transpose().iter().copied().collect();
+    std::fs::write(&path, serde_json::to_string(&matrix).unwrap()).unwrap();
+    let parent = best(&format!("--origin parent --parent-from-grasp {}", path.display()));
+    assert!(same(pose(&parent) * parent_from_grasp, pose(&own)), "{parent}");
+    let output = run(&server, &["detect", file, "--parent-from-grasp", path.to_str().unwrap()]);
+    assert!(text(&output.stderr).contains("--parent-from-grasp needs --origin parent"), "{}", text(&output.stderr));
+
+    let hand = ["--gripper", "0.08,0.05,0.02,0.02", "--palm"];
+    assert!(run(&server, &[&["detect", file][..], &hand, &["-0.03,-0.1,-0.1,0.03,0.1,0"]].concat()).status.success());
+    let output = run(&server, &[&["detect", file][..], &hand, &["-0.03,-0.1,-0.1,0.03,0.1,0.06"]].concat());
+    assert!(text(&output.stderr).contains("palm is 0.06 m, must be behind the fingertips"), "{}", text(&output.stderr));
+}
+
+#[test]
+fn nobody_has_to_read_to_the_end() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let (_folder, files) = files();
+    let file = files[0].to_str().unwrap();
+    for args in [&["models"][..], &["health", "--json"], &["detect", file], &["watch", file]] {
+        let mut process = Command::new(grasp())
+            .args(args)
+            .env("GRASPD_SERVER", server.grpc().to_string())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        drop(process.stdout.take());
+        let output = process.wait_with_output().unwrap();
+        assert!(output.status.success() && output.stderr.is_empty(), "{args:?}: {}", text(&output.stderr));
+    }
 }
 
 #[test]
@@ -237,6 +347,83 @@ fn depth_images_are_read_in_every_form() {
     assert!(text(&output.stderr).contains("holds 2 poses for 1 images"), "{}", text(&output.stderr));
 }
 
+/// What the same cameras see as point clouds: in the cameras' own frames, and in that of the task.
+fn cloud_files(folder: &Path) -> [Vec<String>; 2] {
+    let path = |name: &str| folder.join(name).to_str().unwrap().to_owned();
+    let cameras = [camera(30.0, -90.0), camera(45.0, 60.0)].map(|pose| pose.inverse());
+    let [mut own, mut placed] = [["--camera-position", "0,0,0"].map(str::to_owned).to_vec(), Vec::new()];
+    for (index, task_from_camera) in cameras.iter().enumerate() {
+        let point = |(index, depth): (usize, f32)| {
+            let (u, v) = ((index % CAMERA.width) as f64, (index / CAMERA.width) as f64);
+            Point3::new((u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, 1.0) * f64::from(depth)
+        };
+        let points: Vec<_> = depth(&task_from_camera.inverse()).into_iter().enumerate().map(point).collect();
+        let shape = [points.len() as u64, 3];
+        own.push(path(&format!("own{index}.npy")));
+        let mut writer = npyz::WriteOptions::new().default_dtype().shape(&shape);
+        writer = writer.order(npyz::Order::C);
+        let mut writer = writer.writer(File::create(&own[2 + index]).unwrap()).begin_nd().unwrap();
+        writer
+            .extend(points.iter().flat_map(|point| point.coords.iter().map(|&c| c as f32).collect::<Vec<_>>()))
+            .unwrap();
+        writer.finish().unwrap();
+
+        // As numpy writes `np.stack([x, y, z]).T`.
+        let name = path(&format!("placed{index}.npz"));
+        let mut archive = npyz::npz::NpzWriter::create(&name).unwrap();
+        for (array, shape) in [("colors", [1, 3]), ("points", shape)] {
+            let writer = archive.array(array, Default::default()).unwrap().default_dtype();
+            let mut writer = writer.order(npyz::Order::Fortran).shape(&shape).begin_nd().unwrap();
+            let coordinate = |axis: usize| points.iter().map(move |point| (task_from_camera * point)[axis]);
+            writer.extend((0..3).flat_map(coordinate).take(3 * shape[0] as usize)).unwrap();
+            writer.finish().unwrap();
+        }
+        let eye = task_from_camera.translation;
+        placed.extend([name, "--camera-position".to_owned(), format!("{},{},{}", eye.x, eye.y, eye.z)]);
+    }
+    let matrices = cameras.map(|pose| pose.to_homogeneous().transpose().as_slice().to_vec());
+    std::fs::write(path("poses.json"), serde_json::to_string(&matrices).unwrap()).unwrap();
+    own.extend(["--frame-from-cloud".to_owned(), path("poses.json")]);
+    [own, placed]
+}
+
+#[test]
+fn point_clouds_are_read_in_every_form() {
+    let server = Server::run(&[TestModel::new("mirror").resolution(40)], &[]);
+    let folder = tempfile::tempdir().unwrap();
+    let clouds = cloud_files(folder.path());
+    let found = clouds.each_ref().map(|flags| {
+        let output = run(&server, &command(&["detect", "--threshold", "0.6", "--json", "--frame-id", "base"], flags));
+        assert!(output.status.success(), "{flags:?}: {}", text(&output.stderr));
+        let reply: Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert_eq!(reply["frame_id"], "base");
+        assert!(reply["latency_seconds"]["fusion"].as_f64().unwrap() > 0.0);
+        reply["grasps"].as_array().unwrap().len()
+    });
+    // Points on the border between two pixels fall to either side.
+    assert!(found[0] > 5 && found[0].abs_diff(found[1]) <= 1 + found[0] / 4, "{found:?}");
+
+    let refused = |args: &[&str]| {
+        let output = run(&server, args);
+        assert_eq!(output.status.code(), Some(1), "{args:?}");
+        text(&output.stderr).to_owned()
+    };
+    let [own, _] = &clouds;
+    let (cloud, poses) = (own[2].as_str(), own[5].as_str());
+    let here = ["--camera-position", "0,0,0"];
+    let error = refused(&["detect", cloud]);
+    assert!(error.contains("N×N×N is needed; points need --camera-position"), "{error}");
+    let error = refused(&[&["detect", cloud][..], &here, &["--frame-from-cloud", poses]].concat());
+    assert!(error.contains("holds 2 poses for 1 point clouds"), "{error}");
+    let error = refused(&[&["detect", cloud][..], &here, &here].concat());
+    assert!(error.contains("is given 2 times for 1 point clouds"), "{error}");
+    let error = refused(&[&["detect", cloud][..], &["--camera-position", "0.1,0.1,0.1"]].concat());
+    assert!(error.contains("views[0]") && error.contains("check camera_position"), "{error}");
+    let (_folder, volumes) = files();
+    let error = refused(&[&["detect", volumes[0].to_str().unwrap()][..], &here].concat());
+    assert!(error.contains("N×3 is needed"), "{error}");
+}
+
 #[test]
 fn grasps_are_written_as_others_read_them() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
@@ -250,6 +437,7 @@ fn grasps_are_written_as_others_read_them() {
     let lines: Vec<&str> = csv.lines().collect();
     assert_eq!(lines.len(), 3);
     assert!(lines[0].starts_with("quality,width,x,y,z,qx,qy,qz,qw,"), "{csv}");
+    assert!(lines[0].ends_with(",collides,retreat_x,retreat_y,retreat_z"), "{csv}");
     assert!(lines[1..].iter().all(|line| line.split(',').count() == lines[0].split(',').count()));
     assert!(moveit.contains("- id: grasp_1\n") && moveit.contains(r#""frame_id":"base""#), "{moveit}");
     assert!(isaac.starts_with("format: isaac_grasp\n") && isaac.contains("  grasp_1:\n"), "{isaac}");
@@ -259,30 +447,39 @@ fn grasps_are_written_as_others_read_them() {
 fn what_was_seen_is_drawn_and_recorded() {
     let server = Server::run(&[TestModel::new("mirror").resolution(40)], &[]);
     let folder = tempfile::tempdir().unwrap();
-    let flags = depth_files(folder.path()).remove(0);
-    let view = |name: &str| {
+    let images = depth_files(folder.path()).remove(0);
+    let [clouds, _] = cloud_files(folder.path());
+    let view = |name: &str, flags: &[String]| {
         let path = folder.path().join(name);
-        let output = run(&server, &command(&["view", "--threshold", "0.6", "--out", path.to_str().unwrap()], &flags));
+        let output = run(&server, &command(&["view", "--threshold", "0.6", "--out", path.to_str().unwrap()], flags));
         assert!(output.status.success(), "{}", text(&output.stderr));
         std::fs::read(path).unwrap()
     };
-    let png = view("grasps.png");
-    let mut reader = png::Decoder::new(std::io::Cursor::new(png)).read_info().unwrap();
-    let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
-    reader.next_frame(&mut pixels).unwrap();
-    // Coloured grippers before a grey surface.
-    let is_coloured = |pixel: &[u8]| pixel.iter().max().zip(pixel.iter().min()).is_some_and(|(a, b)| a - b > 60);
-    assert!(pixels.chunks_exact(3).filter(|pixel| is_coloured(pixel)).count() > 500);
+    for flags in [&images, &clouds] {
+        let png = view("grasps.png", flags);
+        let mut reader = png::Decoder::new(std::io::Cursor::new(png)).read_info().unwrap();
+        let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+        reader.next_frame(&mut pixels).unwrap();
+        let count = |is: fn([i16; 3]) -> bool| {
+            pixels.as_chunks().0.iter().filter(|pixel: &&[u8; 3]| is(pixel.map(i16::from))).count()
+        };
+        // Yellow and green grippers before a grey surface, and the axes x and z, which alone are red and blue.
+        assert!(count(|[red, green, blue]| green - blue > 60 && green + 60 > red) > 500);
+        assert!(count(|[red, green, blue]| red - green > 80 && red - blue > 80) > 100);
+        assert!(count(|[red, green, blue]| blue - red > 80 && blue - green > 60) > 100);
+    }
 
-    let recording = view("grasps.mcap");
+    let recording = view("grasps.mcap", &images);
     let messages: Vec<_> = mcap::MessageStream::new(&recording).unwrap().map(Result::unwrap).collect();
     let topics: Vec<_> = messages.iter().map(|message| message.channel.topic.as_str()).collect();
-    assert_eq!(topics, ["/surface", "/grasps"]);
+    assert_eq!(topics, ["/surface", "/grasps", "/hands"]);
     let schemas = messages.iter().map(|message| message.channel.schema.as_ref().unwrap().name.clone());
-    assert_eq!(schemas.collect::<Vec<_>>(), ["foxglove.PointCloud", "foxglove.SceneUpdate"]);
-    let scene: Value = serde_json::from_slice(&messages[1].data).unwrap();
-    assert!(scene["entities"].as_array().unwrap().len() > 5);
-    assert_eq!(scene["entities"][0]["lines"][0]["points"].as_array().unwrap().len(), 8);
+    assert_eq!(schemas.collect::<Vec<_>>(), ["foxglove.PointCloud", "foxglove.SceneUpdate", "foxglove.PointCloud"]);
+    let clouds = [0, 2].map(|index: usize| PointCloud::decode(&*messages[index].data).unwrap());
+    assert!(clouds.iter().all(|cloud| cloud.data.len() > 1000 * cloud.point_stride as usize));
+    let scene = SceneUpdate::decode(&*messages[1].data).unwrap();
+    assert!(scene.entities.len() > 5);
+    assert_eq!(scene.entities[0].lines[0].points.len(), 8);
 }
 
 #[test]
@@ -293,7 +490,7 @@ fn a_file_is_watched() {
     let mut watch = Command::new(grasp())
         .args(["watch", watched, "--json", "--every", "0.02", "--count", "2"])
         .env("GRASPD_SERVER", server.grpc().to_string())
-        .stdout(std::process::Stdio::piped())
+        .stdout(Stdio::piped())
         .spawn()
         .unwrap();
     // Again and again, for it may not have looked yet.

@@ -82,10 +82,15 @@ async fn what_cannot_be_served_changes_nothing_and_is_told() {
         assert_eq!(newest(&client).await, "1");
         assert_eq!(client.list_models().await.unwrap(), before);
     }
+    // A network that is one, and whose every answer is none.
+    TestModel::new("mirror").breaks_at(0.0).write(server.models());
+    server.reload().unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 4.0).await;
+    assert_eq!(newest(&client).await, "1");
     // What is good beside it is served all the same.
     TestModel::new("mirror").version("2").write(server.models());
     server.reload().unwrap();
-    server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 4.0).await;
+    server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 5.0).await;
     assert_eq!(served(&client).await, ["mirror 2", "mirror 1"]);
 
     // And all is well again.

@@ -24,6 +24,8 @@ pub(super) struct Model<'a> {
     threads: usize,
     /// Whether it computes in 8 bits.
     pub is_int8: bool,
+    /// Another file that its weights are in.
+    pub weights_elsewhere: Option<String>,
     /// What it calls the size of its batch.
     batch: Option<String>,
 }
@@ -55,13 +57,15 @@ impl<'a> Model<'a> {
         let graph = model.graph.unwrap_or_default();
         let is_int8 = graph.node.iter().any(|node| node.op_type() == "QuantizeLinear");
         let batch = graph.input.iter().find(|input| input.name() == INPUT).and_then(|input| input.free(0));
-        Self { path, bytes, cheaper, threads: options.threads, is_int8, batch: batch.map(str::to_owned) }
+        let batch = batch.map(str::to_owned);
+        let weights_elsewhere = graph.initializer.iter().find_map(|tensor| tensor.external_file()).map(str::to_owned);
+        Self { path, bytes, cheaper, threads: options.threads, is_int8, weights_elsewhere, batch }
     }
 
     /// The file as it is, if it was to be run at less cost.
     pub fn original(&self) -> Option<Self> {
         self.cheaper.as_ref()?;
-        Some(Self { cheaper: None, batch: self.batch.clone(), ..*self })
+        Some(Self { cheaper: None, weights_elsewhere: None, batch: self.batch.clone(), ..*self })
     }
 
     /// Loads it, for batches of one size, if one is given.

@@ -75,6 +75,10 @@ struct Training {
     /// Go on from the .state beside the model.
     #[arg(long)]
     resume: bool,
+    /// Write what is needed to resume no more often than this, seconds, but at the end and at Ctrl-C. By default after every
+    /// epoch: a large network takes seconds to write, a fast card no more for an epoch.
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.0)]
+    save_every: f64,
     /// Times every scene is seen [default: 30 for vgn, 21 for the transformers].
     #[arg(long)]
     epochs: Option<u64>,

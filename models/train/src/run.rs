@@ -5,6 +5,7 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
 use grasp::{RESOLUTION, VoxelOrigin};
@@ -25,6 +26,7 @@ pub(crate) fn train(training: &Training) -> Result<()> {
         tch::set_num_threads(i32::try_from(threads).context("--threads")?);
     }
     ensure!((0.0..1.0).contains(&training.val), "--val is {}, must be at least 0 and below 1", training.val);
+    ensure!(training.save_every >= 0.0, "--save-every is {}, must be at least 0 seconds", training.save_every);
     ensure!(training.weight_decay >= 0.0, "--weight-decay is {}, must be at least 0", training.weight_decay);
     ensure!(training.rotation_weight >= 0.0, "--rotation-weight is {}, must be at least 0", training.rotation_weight);
     if let Some(decay) = training.ema {
@@ -62,7 +64,10 @@ pub(crate) fn train(training: &Training) -> Result<()> {
     let signal = Arc::clone(&stop);
     ctrlc::set_handler(move || signal.store(true, Ordering::Relaxed)).context("cannot listen for Ctrl-C")?;
 
-    while trainer.epochs() < settings.epochs && training.patience.is_none_or(|patience| progress.worse < patience) {
+    let mut saved = Instant::now();
+    let goes_on =
+        |epochs: u64, worse: u64| epochs < settings.epochs && training.patience.is_none_or(|patience| worse < patience);
+    while goes_on(trainer.epochs(), progress.worse) {
         if training.follow && trainer.follow()? > 0 {
             report(&trainer);
         }
@@ -87,12 +92,17 @@ pub(crate) fn train(training: &Training) -> Result<()> {
             files.write_log(&records)?;
             curves::draw(&files.curves, &records)?;
         }
-        if training.keep == Keep::Last || better {
+        let Progress { best, worse } = progress;
+        let ends = interrupted || !goes_on(trainer.epochs(), worse);
+        let due = ends || saved.elapsed().as_secs_f64() >= training.save_every;
+        if better || training.keep == Keep::Last && due {
             describe(training, &settings, trainer.dataset(), &mut metadata);
             write_model(&mut trainer, &metadata, records.last(), &training.out)?;
         }
-        let Progress { best, worse } = progress;
-        Checkpoint { best, worse, ..trainer.checkpoint() }.write(&files.state)?;
+        if due {
+            Checkpoint { best, worse, ..trainer.checkpoint() }.write(&files.state)?;
+            saved = Instant::now();
+        }
         if interrupted {
             eprintln!("stopped after step {}; go on with --resume", trainer.steps());
             return Ok(());

@@ -89,7 +89,7 @@ fn fine_tuning_follows_the_network_it_starts_from() {
 fn a_run_goes_on_where_it_stopped() {
     let folder = prepare();
     assert!(train(folder.path(), "--out whole.onnx --epochs 3 --name x").status.success());
-    assert!(train(folder.path(), "--out parts.onnx --epochs 1 --name x").status.success());
+    assert!(train(folder.path(), "--out parts.onnx --epochs 1 --name x --save-every 1000").status.success());
     let output = train(folder.path(), "--out parts.onnx --epochs 3 --name x --resume");
     assert!(output.status.success(), "{}", said(&output));
     let weights = |name: &str| ModelProto::read(&folder.path().join(name)).unwrap().graph.unwrap().initializer;
@@ -124,17 +124,18 @@ fn a_run_ends_when_the_simulator_says_so() {
 #[test]
 fn ctrl_c_leaves_a_checkpoint() {
     let folder = prepare();
-    let arguments = "train --from start.onnx --data data --batch 1 --threads 1 --epochs 100000 --out out.onnx";
+    let arguments =
+        "train --from start.onnx --data data --batch 1 --threads 1 --epochs 100000 --save-every 0.5 --out out.onnx";
     let mut run = command(folder.path(), arguments).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     let start = Instant::now();
     while !folder.path().join("out.state").exists() {
-        assert!(start.elapsed() < Duration::from_secs(60), "no checkpoint after the first epoch");
+        assert!(start.elapsed() < Duration::from_secs(60), "no checkpoint after half a second");
         sleep(Duration::from_millis(20));
     }
     assert!(Command::new("kill").args(["-INT", &run.id().to_string()]).status().unwrap().success());
     assert_eq!(run.wait().unwrap().code(), Some(0));
     let checkpoint = Checkpoint::read(&folder.path().join("out.state")).unwrap();
-    assert!(checkpoint.epoch >= 1 && checkpoint.epoch < 100_000);
+    assert!(checkpoint.epoch > 1 && checkpoint.epoch < 100_000);
     let path = folder.path().join("out.onnx");
     let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
     assert_eq!(metadata.provenance["steps"], checkpoint.steps.to_string(), "both are of the same step");

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterable, AsyncIterator, Callable, Iterable
+from collections.abc import AsyncIterable, AsyncIterator, Iterable
 from contextlib import suppress
-from typing import Any, TypeVar
+from typing import Any
 
 import grpc
 import grpc.aio
@@ -13,27 +13,14 @@ from grpc_health.v1.health_pb2 import HealthCheckRequest
 from numpy.typing import NDArray
 
 from graspd import grasp_pb2 as pb
-from graspd import wire
+from graspd import methods, wire
 from graspd.connection import OPTIONS, Connection
 from graspd.detection import Detection, Model
 from graspd.errors import Error, from_status
-from graspd.methods import (
-    CHECK,
-    DETECT,
-    DETECT_FROM_CLOUD,
-    DETECT_FROM_DEPTH,
-    DETECT_STREAM,
-    LIST_MODELS,
-    TRACK,
-    Method,
-    Request,
-    Response,
-)
+from graspd.methods import Answer, Method, Request, Response
 from graspd.options import Options
 from graspd.seen import CloudView, DepthView, Volume, Workspace
 from graspd.streams import Adding, Detecting
-
-Answer = TypeVar("Answer")
 
 
 class Client(Connection[grpc.aio.Channel]):
@@ -56,7 +43,7 @@ class Client(Connection[grpc.aio.Channel]):
         self, volume: Volume | NDArray[Any], options: Options | None = None, *, request_id: str = ""
     ) -> Detection:
         """The grasps in a volume."""
-        return await self._ask(DETECT, wire.detect_request(volume, options, request_id), wire.detection)
+        return await self._ask(methods.DETECT, wire.detect_request(volume, options, request_id))
 
     async def detect_from_depth(
         self,
@@ -67,8 +54,7 @@ class Client(Connection[grpc.aio.Channel]):
         request_id: str = "",
     ) -> Detection:
         """The grasps in what depth cameras see."""
-        request = wire.depth_request(views, workspace, options, request_id)
-        return await self._ask(DETECT_FROM_DEPTH, request, wire.detection)
+        return await self._ask(methods.DETECT_FROM_DEPTH, wire.depth_request(views, workspace, options, request_id))
 
     async def detect_from_cloud(
         self,
@@ -79,8 +65,7 @@ class Client(Connection[grpc.aio.Channel]):
         request_id: str = "",
     ) -> Detection:
         """The grasps in point clouds."""
-        request = wire.cloud_request(views, workspace, options, request_id)
-        return await self._ask(DETECT_FROM_CLOUD, request, wire.detection)
+        return await self._ask(methods.DETECT_FROM_CLOUD, wire.cloud_request(views, workspace, options, request_id))
 
     async def detect_stream(
         self, volumes: AsyncIterable[Volume | NDArray[Any]], options: Options | None = None
@@ -93,7 +78,7 @@ class Client(Connection[grpc.aio.Channel]):
                 async for volume in volumes:
                     yield detecting.request(volume)
 
-        replies = self._stream(DETECT_STREAM, requests())
+        replies = self._stream(methods.DETECT_STREAM, requests())
         try:
             async for reply in replies:
                 yield detecting.answer(reply)
@@ -105,29 +90,27 @@ class Client(Connection[grpc.aio.Channel]):
 
     def track(self, workspace: Workspace = Workspace()) -> Tracking:
         """Has the server keep a volume for a camera that moves."""
-        return Tracking(self._stream(TRACK), workspace)
+        return Tracking(self._stream(methods.TRACK), workspace)
 
     async def models(self) -> tuple[Model, ...]:
         """What can be asked for by name, the default first."""
-        return await self._ask(LIST_MODELS, pb.ListModelsRequest(), wire.models)
+        return await self._ask(methods.LIST_MODELS, pb.ListModelsRequest())
 
     async def health(self) -> bool:
         """Whether the server answers; it does not while it is warming up or shutting down."""
-        return await self._ask(CHECK, HealthCheckRequest(), wire.is_serving)
+        return await self._ask(methods.CHECK, HealthCheckRequest())
 
     def _open(self, target: str, credentials: grpc.ChannelCredentials | None) -> grpc.aio.Channel:
         if credentials is None:
             return grpc.aio.insecure_channel(target, OPTIONS)
         return grpc.aio.secure_channel(target, credentials, OPTIONS)
 
-    async def _ask(
-        self, method: Method[Request, Response], request: Request, answer: Callable[[Response], Answer]
-    ) -> Answer:
+    async def _ask(self, method: Method[Request, Response, Answer], request: Request) -> Answer:
         ask = self._channel.unary_unary(method.path, method.serialize, method.parse)
         attempts = 0
         while True:
             try:
-                return answer(await ask(request, timeout=self._timeout, metadata=self._metadata))
+                return method.answer(await ask(request, timeout=self._timeout, metadata=self._metadata))
             except grpc.RpcError as status:
                 error = from_status(status)
             attempts += 1
@@ -137,7 +120,7 @@ class Client(Connection[grpc.aio.Channel]):
             await asyncio.sleep(pause)
 
     def _stream(
-        self, method: Method[Request, Response], requests: AsyncIterator[Request] | None = None
+        self, method: Method[Request, Response, Any], requests: AsyncIterator[Request] | None = None
     ) -> grpc.aio.StreamStreamCall[Request, Response]:
         stream = self._channel.stream_stream(method.path, method.serialize, method.parse)
         return stream(requests, metadata=self._metadata)

@@ -5,37 +5,24 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import grpc
 from grpc_health.v1.health_pb2 import HealthCheckRequest
 from numpy.typing import NDArray
 
 from graspd import grasp_pb2 as pb
-from graspd import wire
+from graspd import methods, wire
 from graspd.connection import OPTIONS, Connection
 from graspd.detection import Detection, Model
 from graspd.errors import Error, from_status
-from graspd.methods import (
-    CHECK,
-    DETECT,
-    DETECT_FROM_CLOUD,
-    DETECT_FROM_DEPTH,
-    DETECT_STREAM,
-    LIST_MODELS,
-    TRACK,
-    Method,
-    Request,
-    Response,
-)
+from graspd.methods import Answer, Method, Request, Response
 from graspd.options import Options
 from graspd.seen import CloudView, DepthView, Volume, Workspace
 from graspd.streams import Adding, Detecting
 
 if TYPE_CHECKING:
     from grpc import _CallIterator as Replies
-
-Answer = TypeVar("Answer")
 
 
 class Client(Connection[grpc.Channel]):
@@ -60,7 +47,7 @@ class Client(Connection[grpc.Channel]):
         self, volume: Volume | NDArray[Any], options: Options | None = None, *, request_id: str = ""
     ) -> Detection:
         """The grasps in a volume; an array alone is a `Volume` of a cube of 0.3 m."""
-        return self._ask(DETECT, wire.detect_request(volume, options, request_id), wire.detection)
+        return self._ask(methods.DETECT, wire.detect_request(volume, options, request_id))
 
     def detect_from_depth(
         self,
@@ -71,8 +58,7 @@ class Client(Connection[grpc.Channel]):
         request_id: str = "",
     ) -> Detection:
         """The grasps in what depth cameras see, from 1 to 64 images."""
-        request = wire.depth_request(views, workspace, options, request_id)
-        return self._ask(DETECT_FROM_DEPTH, request, wire.detection)
+        return self._ask(methods.DETECT_FROM_DEPTH, wire.depth_request(views, workspace, options, request_id))
 
     def detect_from_cloud(
         self,
@@ -83,8 +69,7 @@ class Client(Connection[grpc.Channel]):
         request_id: str = "",
     ) -> Detection:
         """The grasps in point clouds, from 1 to 64, each of one camera."""
-        request = wire.cloud_request(views, workspace, options, request_id)
-        return self._ask(DETECT_FROM_CLOUD, request, wire.detection)
+        return self._ask(methods.DETECT_FROM_CLOUD, wire.cloud_request(views, workspace, options, request_id))
 
     def detect_stream(
         self, volumes: Iterable[Volume | NDArray[Any]], options: Options | None = None
@@ -98,7 +83,7 @@ class Client(Connection[grpc.Channel]):
                 for volume in volumes:
                     yield detecting.request(volume)
 
-        replies = self._stream(DETECT_STREAM, requests())
+        replies = self._stream(methods.DETECT_STREAM, requests())
         try:
             for reply in replies:
                 yield detecting.answer(reply)
@@ -110,27 +95,27 @@ class Client(Connection[grpc.Channel]):
 
     def track(self, workspace: Workspace = Workspace()) -> Tracking:
         """Has the server keep a volume for a camera that moves."""
-        return Tracking(lambda requests: self._stream(TRACK, requests), workspace)
+        return Tracking(lambda requests: self._stream(methods.TRACK, requests), workspace)
 
     def models(self) -> tuple[Model, ...]:
         """What can be asked for by name, the default first."""
-        return self._ask(LIST_MODELS, pb.ListModelsRequest(), wire.models)
+        return self._ask(methods.LIST_MODELS, pb.ListModelsRequest())
 
     def health(self) -> bool:
         """Whether the server answers; it does not while it is warming up or shutting down."""
-        return self._ask(CHECK, HealthCheckRequest(), wire.is_serving)
+        return self._ask(methods.CHECK, HealthCheckRequest())
 
     def _open(self, target: str, credentials: grpc.ChannelCredentials | None) -> grpc.Channel:
         if credentials is None:
             return grpc.insecure_channel(target, OPTIONS)
         return grpc.secure_channel(target, credentials, OPTIONS)
 
-    def _ask(self, method: Method[Request, Response], request: Request, answer: Callable[[Response], Answer]) -> Answer:
+    def _ask(self, method: Method[Request, Response, Answer], request: Request) -> Answer:
         ask = self._channel.unary_unary(method.path, method.serialize, method.parse)
         attempts = 0
         while True:
             try:
-                return answer(ask(request, self._timeout, self._metadata))
+                return method.answer(ask(request, self._timeout, self._metadata))
             except grpc.RpcError as status:
                 error = from_status(status)
             attempts += 1
@@ -139,7 +124,7 @@ class Client(Connection[grpc.Channel]):
                 raise error
             time.sleep(pause)
 
-    def _stream(self, method: Method[Request, Response], requests: Iterator[Request]) -> Replies[Response]:
+    def _stream(self, method: Method[Request, Response, Any], requests: Iterator[Request]) -> Replies[Response]:
         stream = self._channel.stream_stream(method.path, method.serialize, method.parse)
         return stream(requests, metadata=self._metadata)
 

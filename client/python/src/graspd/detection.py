@@ -67,10 +67,10 @@ class Dropped:
     """From outside of the approach cone."""
     height: int
     """The hand would be lower than `min_height`."""
+    collision: int
+    """The open hand would meet what was observed, where ``CollisionCheck("filter")`` asked for that."""
     suppressed: int
     """Next to a better grasp."""
-    collision: int
-    """The open hand would meet what was observed."""
     over_limit: int
     """A grasp, but past `max_grasps`."""
 
@@ -115,3 +115,9 @@ class Model:
     """What runs it: cpu, openvino, cuda or tensorrt."""
     precision: str
     """In which numbers: fp32, bf16, fp16 or int8."""
+    voxel_origin: str
+    """Where in its voxel a network's grasp stands: ``corner``, at index · `voxel_size`, or ``center``, half a voxel
+    further; empty if it is none."""
+    camera_azimuth: float | None
+    """Where the camera always stood in training, degrees about the vertical axis through the middle of the volume, from
+    x towards y; None: anywhere. Depth images and points are fused in a cube that is turned so; a volume should be."""

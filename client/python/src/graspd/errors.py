@@ -20,7 +20,7 @@ class Error(Exception):
     message: str
     """What is wrong, with the value, and what is needed."""
     field: str | None = None
-    """The path of the field that is not what it must be, such as ``options.region.max.z``; streams do not tell it."""
+    """The path of the field that is not what it must be, such as ``options.region.max.z``."""
     retry_after: float | None = None
     """Seconds after which it is worth coming back, where the server says so."""
     request_id: str | None = None
@@ -35,7 +35,7 @@ class InvalidArgument(Error):
 
 
 class NotFound(Error):
-    """No such model or version; the message lists those there are."""
+    """No such model or version, as `field` says; the message lists those there are."""
 
 
 class ResourceExhausted(Error):
@@ -96,6 +96,7 @@ def from_status(status: RpcError) -> Error:
 def from_reply(reply: pb.DetectGraspsStreamResponse) -> Error:
     """Why one request of a stream is refused."""
     error = make(CODES[reply.error.code], reply.error.message)
+    error.field = reply.error.field or None
     error.request_id = reply.request_id
     if reply.error.HasField("retry_after"):
         error.retry_after = reply.error.retry_after

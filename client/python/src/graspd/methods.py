@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -9,16 +10,20 @@ from google.protobuf.message import Message
 from grpc_health.v1.health_pb2 import HealthCheckRequest, HealthCheckResponse
 
 from graspd import grasp_pb2 as pb
+from graspd import wire
 
 Request = TypeVar("Request", bound=Message)
 Response = TypeVar("Response", bound=Message)
+Answer = TypeVar("Answer")
 
 
 @dataclass(frozen=True)
-class Method(Generic[Request, Response]):
+class Method(Generic[Request, Response, Answer]):
     path: str
     request: type[Request]
     response: type[Response]
+    answer: Callable[[Response], Answer]
+    """What users get of a response."""
 
     def serialize(self, request: Request) -> bytes:
         return request.SerializeToString()
@@ -27,16 +32,17 @@ class Method(Generic[Request, Response]):
         return self.response.FromString(data)
 
 
-DETECT = Method("/grasp.v1.GraspService/DetectGrasps", pb.DetectGraspsRequest, pb.DetectGraspsResponse)
+GRASPS = "/grasp.v1.GraspService/"
+DETECT = Method(GRASPS + "DetectGrasps", pb.DetectGraspsRequest, pb.DetectGraspsResponse, wire.detection)
 DETECT_FROM_DEPTH = Method(
-    "/grasp.v1.GraspService/DetectGraspsFromDepth", pb.DetectGraspsFromDepthRequest, pb.DetectGraspsResponse
+    GRASPS + "DetectGraspsFromDepth", pb.DetectGraspsFromDepthRequest, pb.DetectGraspsResponse, wire.detection
 )
 DETECT_FROM_CLOUD = Method(
-    "/grasp.v1.GraspService/DetectGraspsFromCloud", pb.DetectGraspsFromCloudRequest, pb.DetectGraspsResponse
+    GRASPS + "DetectGraspsFromCloud", pb.DetectGraspsFromCloudRequest, pb.DetectGraspsResponse, wire.detection
 )
 DETECT_STREAM = Method(
-    "/grasp.v1.GraspService/DetectGraspsStream", pb.DetectGraspsRequest, pb.DetectGraspsStreamResponse
+    GRASPS + "DetectGraspsStream", pb.DetectGraspsRequest, pb.DetectGraspsStreamResponse, wire.outcome
 )
-TRACK = Method("/grasp.v1.GraspService/TrackGrasps", pb.TrackGraspsRequest, pb.DetectGraspsStreamResponse)
-LIST_MODELS = Method("/grasp.v1.GraspService/ListModels", pb.ListModelsRequest, pb.ListModelsResponse)
-CHECK = Method("/grpc.health.v1.Health/Check", HealthCheckRequest, HealthCheckResponse)
+TRACK = Method(GRASPS + "TrackGrasps", pb.TrackGraspsRequest, pb.DetectGraspsStreamResponse, wire.outcome)
+LIST_MODELS = Method(GRASPS + "ListModels", pb.ListModelsRequest, pb.ListModelsResponse, wire.models)
+CHECK = Method("/grpc.health.v1.Health/Check", HealthCheckRequest, HealthCheckResponse, wire.is_serving)

@@ -10,7 +10,7 @@ from grpc import StatusCode
 from numpy.typing import NDArray
 
 from graspd import grasp_pb2 as pb
-from graspd import wire
+from graspd import methods, wire
 from graspd.detection import Detection
 from graspd.errors import Error, Unavailable
 from graspd.options import Options
@@ -43,7 +43,7 @@ class Detecting:
 
     def answer(self, reply: pb.DetectGraspsStreamResponse) -> Detection | Error:
         self._unanswered -= 1
-        return wire.outcome(reply)
+        return methods.DETECT_STREAM.answer(reply)
 
     def end(self) -> None:
         """After the last answer."""
@@ -66,7 +66,7 @@ class Adding:
     def answer(self, reply: pb.DetectGraspsStreamResponse | None) -> Detection:
         if reply is None:
             raise ended()
-        outcome = wire.outcome(reply)
+        outcome = methods.TRACK.answer(reply)
         if isinstance(outcome, Error):
             raise outcome
         self._workspace = None

@@ -294,6 +294,8 @@ def model(message: pb.Model) -> Model:
         provenance=dict(message.provenance),
         provider=message.provider,
         precision=message.precision,
+        voxel_origin=message.voxel_origin,
+        camera_azimuth=message.camera_azimuth if message.HasField("camera_azimuth") else None,
     )
 
 

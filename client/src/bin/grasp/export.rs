@@ -8,13 +8,19 @@ use serde_json::json;
 
 /// A row for each grasp; metres, quaternions x y z w.
 pub(crate) fn csv(detection: &Detection) -> String {
-    let mut text = "quality,width,x,y,z,qx,qy,qz,qw,pregrasp_x,pregrasp_y,pregrasp_z,collides\n".to_owned();
-    for Proposal { pose, width, quality, pregrasp, collides, .. } in &detection.grasps {
+    let mut text =
+        "quality,width,x,y,z,qx,qy,qz,qw,pregrasp_x,pregrasp_y,pregrasp_z,collides,retreat_x,retreat_y,retreat_z\n"
+            .to_owned();
+    for Proposal { pose, width, quality, pregrasp, retreat, collides } in &detection.grasps {
         let ([x, y, z], [qx, qy, qz, qw]) = parts(pose);
         let ([px, py, pz], _) = parts(pregrasp);
+        let ([rx, ry, rz], _) = parts(retreat);
         let collides = collides.map(|collides| collides.to_string()).unwrap_or_default();
         // Writing to a string does not fail.
-        let _ = writeln!(text, "{quality},{width},{x},{y},{z},{qx},{qy},{qz},{qw},{px},{py},{pz},{collides}");
+        let _ = writeln!(
+            text,
+            "{quality},{width},{x},{y},{z},{qx},{qy},{qz},{qw},{px},{py},{pz},{collides},{rx},{ry},{rz}"
+        );
     }
     text
 }

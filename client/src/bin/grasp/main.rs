@@ -1,6 +1,11 @@
 //! The command line of graspd.
 
+mod cloud;
 mod export;
+mod files;
+mod image;
+mod numbers;
+mod pose;
 mod record;
 mod scene;
 mod show;
@@ -19,7 +24,7 @@ use std::time::{Duration, Instant, SystemTime};
 use anyhow::{Context, anyhow};
 use clap::{Args, Parser, Subcommand};
 use grasp_client::{
-    Access, Arrivals, Certificate, Client, Detection, Health, Identity, Options, Retry, Token, Until, load,
+    Access, Arrivals, Asked, Certificate, Client, Detection, Health, Identity, Options, Retry, Token, Until, load,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 use tonic::Code;
@@ -68,7 +73,7 @@ struct AccessArgs {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Finds the grasps in a volume or in depth images.
+    /// Finds the grasps in a volume, depth images or point clouds.
     Detect(Detect),
     /// Finds them again whenever one of the files changes, until it is stopped.
     Watch(Watch),
@@ -186,21 +191,21 @@ async fn main() -> ExitCode {
     }
 }
 
-fn options(scene: &SceneArgs, wishes: &WishArgs) -> Options {
-    Options { asked: wishes.asked(), frame_id: scene.frame_id(), stamp: Some(SystemTime::now()), ..Options::default() }
+fn options(scene: &SceneArgs, asked: Asked) -> Options {
+    Options { asked, frame_id: scene.frame_id(), stamp: Some(SystemTime::now()), ..Options::default() }
 }
 
 async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitCode> {
     let connect = async || anyhow::Ok(Client::connect_with(server.clone(), access.read()?).await?);
     let print = |detection: &Detection| {
-        println!("{}", if json { show::detection_json(detection) } else { show::detection(detection) });
+        show::print(&if json { show::detection_json(detection) } else { show::detection(detection) })
     };
     match command {
         Command::Detect(Detect { scene: args, wishes, csv, moveit, isaac }) => {
             // The files first: a mistake in them needs no server to be found.
-            let scene = args.read()?;
-            let detection = scene.detect(&connect().await?, options(&args, &wishes)).await?;
-            print(&detection);
+            let (scene, asked) = (args.read()?, wishes.read()?);
+            let detection = scene.detect(&connect().await?, options(&args, asked)).await?;
+            print(&detection)?;
             let write = |path: Option<PathBuf>, text: fn(&Detection) -> String| match path {
                 Some(path) => fs::write(&path, text(&detection)).with_context(|| path.display().to_string()),
                 None => Ok(()),
@@ -210,6 +215,7 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             write(isaac, export::isaac)?;
         }
         Command::Watch(Watch { scene: args, wishes, every, count }) => {
+            let asked = wishes.read()?;
             let client = connect().await?;
             let stamps =
                 || args.files().iter().map(|path| fs::metadata(path)?.modified()).collect::<io::Result<Vec<_>>>();
@@ -220,7 +226,9 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
                 if now.is_some() && now != seen {
                     match args.read() {
                         Ok(scene) => {
-                            print(&scene.detect(&client, options(&args, &wishes)).await?);
+                            if !print(&scene.detect(&client, options(&args, asked.clone())).await?)? {
+                                break;
+                            }
                             answers += 1;
                         }
                         Err(error) => eprintln!("grasp: {error:#}; waiting for it to change"),
@@ -231,14 +239,16 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             }
         }
         Command::View(View { scene: args, wishes, view }) => {
-            let scene = args.read()?;
-            let detection = scene.detect(&connect().await?, options(&args, &wishes)).await?;
-            let path = view.write(&scene.volume()?, &detection)?;
-            println!("{} grasps in {}", detection.grasps.len(), path.display());
+            // Hands are drawn by their finger base, whatever frame of them is asked for.
+            let (scene, asked) = (args.read()?, Asked { convention: None, ..wishes.read()? });
+            let table = asked.collision.and_then(|collision| collision.table_height);
+            let detection = scene.detect(&connect().await?, options(&args, asked)).await?;
+            let path = view.write(&scene.volume()?, table, &detection)?;
+            show::print(&format!("{} grasps in {}", detection.grasps.len(), path.display()))?;
         }
         Command::Bench(Bench { scene: args, wishes, callers, rate, seconds }) => {
             let scene = Arc::new(args.read()?);
-            let options = options(&args, &wishes);
+            let options = options(&args, wishes.read()?);
             // What is refused is to be seen, not to be tried again.
             let access = Access { retry: Retry::NONE, ..access.read()? };
             let client = Client::connect_with(server, access).await?;
@@ -254,15 +264,15 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
                 }
             });
             let report = with_progress(seconds, !json, report).await;
-            println!("{}", if json { show::report_json(&report) } else { show::report(&report) });
+            show::print(&if json { show::report_json(&report) } else { show::report(&report) })?;
         }
         Command::Models => {
             let models = connect().await?.list_models().await?;
-            println!("{}", if json { show::models_json(&models) } else { show::models(&models) });
+            show::print(&if json { show::models_json(&models) } else { show::models(&models) })?;
         }
         Command::Health => {
             let serving = connect().await?.health().await? == Health::Serving;
-            println!("{}", if json { show::health_json(serving) } else { show::health(serving) });
+            show::print(&if json { show::health_json(serving) } else { show::health(serving) })?;
             if !serving {
                 return Ok(ExitCode::FAILURE);
             }

@@ -1,177 +1,128 @@
-//! A recording that Foxglove opens (MCAP, JSON messages of Foxglove's own schemas), and Rerun, too.
+//! A recording that Foxglove and Rerun open: MCAP, messages of Foxglove's own types in protobuf, which Rerun needs.
 
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::SystemTime;
 
 use anyhow::Context;
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
+use foxglove::Encode;
+use foxglove::messages::line_primitive::Type;
+use foxglove::messages::packed_element_field::NumericType;
+use foxglove::messages::{
+    Color, KeyValuePair, LinePrimitive, PackedElementField, Point3, PointCloud, Pose, Quaternion, SceneEntity,
+    SceneUpdate, Timestamp, Vector3,
+};
 use grasp::{FINGER_DEPTH, SurfacePoint};
 use grasp_client::{Detection, Proposal};
 use grasp_picture::quality_color;
 use mcap::Writer;
 use mcap::records::MessageHeader;
-use nalgebra::Point3;
-use serde_json::{Value, json};
+use nalgebra::Point3 as Point;
+
+/// How many points stand for a stroke of a hand.
+const DOTS: u32 = 32;
 
 /// Writes what was seen and the grasps in it, in the frame of the grasps.
 pub(crate) fn write(path: &Path, surface: &[SurfacePoint], detection: &Detection) -> anyhow::Result<()> {
     let file = File::create(path).with_context(|| path.display().to_string())?;
     let mut writer = Writer::new(BufWriter::new(file))?;
-    let now = detection.stamp.unwrap_or_else(SystemTime::now).duration_since(UNIX_EPOCH).unwrap_or_default();
-    let log_time = u64::try_from(now.as_nanos()).unwrap_or(u64::MAX);
+    let timestamp = Timestamp::try_from(detection.stamp.unwrap_or_else(SystemTime::now)).unwrap_or_default();
     let frame = if detection.frame_id.is_empty() { "task" } else { &detection.frame_id };
-    let timestamp = json!({ "sec": now.as_secs(), "nsec": now.subsec_nanos() });
-    let messages = [
-        ("/surface", "foxglove.PointCloud", cloud_schema(), cloud(surface, frame, &timestamp)),
-        ("/grasps", "foxglove.SceneUpdate", scene_schema(), scene(&detection.grasps, frame, &timestamp)),
-    ];
-    for (topic, name, schema, message) in messages {
-        let schema = writer.add_schema(name, "jsonschema", schema.to_string().as_bytes())?;
-        let channel_id = writer.add_channel(schema, topic, "json", &BTreeMap::new())?;
-        let header = MessageHeader { channel_id, sequence: 0, log_time, publish_time: log_time };
-        writer.write_to_known_channel(&header, message.to_string().as_bytes())?;
-    }
+    let surface: Vec<_> = surface.iter().map(|point| (point.position, [90, 160, 200])).collect();
+    add(&mut writer, "/surface", timestamp, &cloud(&surface, frame, timestamp))?;
+    add(&mut writer, "/grasps", timestamp, &scene(&detection.grasps, frame, timestamp))?;
+    // Once more as points: Rerun draws no scenes.
+    let dots: Vec<_> = detection.grasps.iter().flat_map(dots).collect();
+    add(&mut writer, "/hands", timestamp, &cloud(&dots, frame, timestamp))?;
     writer.finish()?;
     Ok(())
 }
 
-fn cloud(surface: &[SurfacePoint], frame: &str, timestamp: &Value) -> Value {
-    let data: Vec<u8> = surface
-        .iter()
-        .flat_map(|point| <[f64; 3]>::from(point.position.coords))
-        .flat_map(|coordinate| (coordinate as f32).to_le_bytes())
-        .collect();
-    // 7 is FLOAT32.
-    let field = |(index, name): (u32, &str)| json!({ "name": name, "offset": 4 * index, "type": 7 });
-    json!({
-        "timestamp": timestamp,
-        "frame_id": frame,
-        "pose": { "position": { "x": 0, "y": 0, "z": 0 }, "orientation": { "x": 0, "y": 0, "z": 0, "w": 1 } },
-        "point_stride": 12,
-        "fields": (0..).zip(["x", "y", "z"]).map(field).collect::<Vec<_>>(),
-        "data": STANDARD.encode(data),
-    })
+fn add<M: Encode>(
+    writer: &mut Writer<BufWriter<File>>,
+    topic: &str,
+    timestamp: Timestamp,
+    message: &M,
+) -> anyhow::Result<()>
+where
+    M::Error: Send + Sync + 'static,
+{
+    let schema = M::get_schema().context("Foxglove's types have schemas")?;
+    let schema = writer.add_schema(&schema.name, &schema.encoding, &schema.data)?;
+    let channel_id = writer.add_channel(schema, topic, &M::get_message_encoding(), &BTreeMap::new())?;
+    let mut data = Vec::new();
+    message.encode(&mut data)?;
+    let time = timestamp.total_nanos();
+    writer.write_to_known_channel(
+        &MessageHeader { channel_id, sequence: 0, log_time: time, publish_time: time },
+        &data,
+    )?;
+    Ok(())
 }
 
-fn scene(grasps: &[Proposal], frame: &str, timestamp: &Value) -> Value {
+fn cloud(points: &[(Point<f64>, [u8; 3])], frame: &str, timestamp: Timestamp) -> PointCloud {
+    let mut data = Vec::with_capacity(16 * points.len());
+    for (point, [red, green, blue]) in points {
+        data.extend(point.iter().flat_map(|&coordinate| (coordinate as f32).to_le_bytes()));
+        data.extend([*red, *green, *blue, 255]);
+    }
+    let field =
+        |name: &str, offset, kind: NumericType| PackedElementField { name: name.into(), offset, r#type: kind.into() };
+    let coordinates = (0..).step_by(4).zip(["x", "y", "z"]).map(|(at, name)| field(name, at, NumericType::Float32));
+    let colors = (12..).zip(["red", "green", "blue", "alpha"]).map(|(at, name)| field(name, at, NumericType::Uint8));
+    PointCloud {
+        timestamp: Some(timestamp),
+        frame_id: frame.into(),
+        pose: Some(pose([0.0; 3], [0.0, 0.0, 0.0, 1.0])),
+        point_stride: 16,
+        fields: coordinates.chain(colors).collect(),
+        data: data.into(),
+    }
+}
+
+fn scene(grasps: &[Proposal], frame: &str, timestamp: Timestamp) -> SceneUpdate {
     let entity = |(index, grasp): (usize, &Proposal)| {
-        let ([x, y, z], [qx, qy, qz, qw]) =
-            (grasp.pose.translation.vector.into(), <[f64; 4]>::from(grasp.pose.rotation.coords));
-        let [red, green, blue] = quality_color(f64::from(grasp.quality)).map(|channel| f64::from(channel) / 255.0);
-        json!({
-            "timestamp": timestamp,
-            "frame_id": frame,
-            "id": format!("grasp {index}"),
-            "lifetime": { "sec": 0, "nsec": 0 },
-            "frame_locked": false,
-            "metadata": [
-                { "key": "quality", "value": grasp.quality.to_string() },
-                { "key": "width", "value": grasp.width.to_string() },
-            ],
-            "arrows": [], "cubes": [], "spheres": [], "cylinders": [], "triangles": [], "texts": [], "models": [],
-            "lines": [{
-                // 2 is a list of segments.
-                "type": 2,
-                "pose": { "position": { "x": x, "y": y, "z": z }, "orientation": { "x": qx, "y": qy, "z": qz, "w": qw } },
-                "thickness": 0.003,
-                "scale_invariant": false,
-                "points": hand(grasp.width).map(|Point3 { coords, .. }| json!({ "x": coords.x, "y": coords.y, "z": coords.z })),
-                "color": { "r": red, "g": green, "b": blue, "a": 1 },
-                "colors": [],
-                "indices": [],
+        let [r, g, b] = quality_color(f64::from(grasp.quality)).map(|channel| f64::from(channel) / 255.0);
+        let note = |key: &str, value: String| KeyValuePair { key: key.into(), value };
+        SceneEntity {
+            timestamp: Some(timestamp),
+            frame_id: frame.into(),
+            id: format!("grasp {index}"),
+            metadata: vec![note("quality", grasp.quality.to_string()), note("width", grasp.width.to_string())],
+            lines: vec![LinePrimitive {
+                r#type: Type::LineList.into(),
+                pose: Some(pose(grasp.pose.translation.vector.into(), grasp.pose.rotation.coords.into())),
+                thickness: 0.003,
+                points: hand(grasp.width).map(|p| Point3 { x: p.x, y: p.y, z: p.z }).into(),
+                color: Some(Color { r, g, b, a: 1.0 }),
+                ..LinePrimitive::default()
             }],
-        })
+            ..SceneEntity::default()
+        }
     };
-    json!({ "deletions": [], "entities": grasps.iter().enumerate().map(entity).collect::<Vec<_>>() })
+    SceneUpdate { deletions: vec![], entities: grasps.iter().enumerate().map(entity).collect() }
+}
+
+/// The strokes of a hand as points.
+fn dots(grasp: &Proposal) -> Vec<(Point<f64>, [u8; 3])> {
+    let (hand, color) = (hand(grasp.width), quality_color(f64::from(grasp.quality)));
+    let along =
+        |[from, to]: [Point<f64>; 2]| (0..=DOTS).map(move |dot| from + (to - from) * f64::from(dot) / f64::from(DOTS));
+    hand.as_chunks().0.iter().copied().flat_map(along).map(|dot| (grasp.pose * dot, color)).collect()
+}
+
+fn pose([x, y, z]: [f64; 3], [qx, qy, qz, qw]: [f64; 4]) -> Pose {
+    Pose { position: Some(Vector3 { x, y, z }), orientation: Some(Quaternion { x: qx, y: qy, z: qz, w: qw }) }
 }
 
 /// Two fingers, the bar between them, and the wrist: pairs of points of the grasp frame.
-fn hand(width: f64) -> [Point3<f64>; 8] {
+fn hand(width: f64) -> [Point<f64>; 8] {
     let (y, tip) = (width / 2.0, FINGER_DEPTH);
     [[-y, 0.0, -y, tip], [y, 0.0, y, tip], [-y, 0.0, y, 0.0], [0.0, 0.0, 0.0, -0.04]]
-        .map(|[y, z, to_y, to_z]| [Point3::new(0.0, y, z), Point3::new(0.0, to_y, to_z)])
+        .map(|[y, z, to_y, to_z]| [Point::new(0.0, y, z), Point::new(0.0, to_y, to_z)])
         .as_flattened()
         .try_into()
-        .unwrap_or([Point3::origin(); 8])
-}
-
-fn number() -> Value {
-    json!({ "type": "number" })
-}
-
-fn object(properties: &[(&str, Value)]) -> Value {
-    let properties: serde_json::Map<_, _> =
-        properties.iter().map(|(name, schema)| ((*name).to_owned(), schema.clone())).collect();
-    json!({ "type": "object", "properties": properties })
-}
-
-fn list(items: &Value) -> Value {
-    json!({ "type": "array", "items": items })
-}
-
-fn time() -> Value {
-    object(&[("sec", json!({ "type": "integer" })), ("nsec", json!({ "type": "integer" }))])
-}
-
-fn vector() -> Value {
-    object(&[("x", number()), ("y", number()), ("z", number())])
-}
-
-fn pose() -> Value {
-    let orientation = object(&[("x", number()), ("y", number()), ("z", number()), ("w", number())]);
-    object(&[("position", vector()), ("orientation", orientation)])
-}
-
-fn text() -> Value {
-    json!({ "type": "string" })
-}
-
-/// What of Foxglove's schema the messages use.
-fn cloud_schema() -> Value {
-    let field = object(&[("name", text()), ("offset", number()), ("type", number())]);
-    object(&[
-        ("timestamp", time()),
-        ("frame_id", text()),
-        ("pose", pose()),
-        ("point_stride", number()),
-        ("fields", list(&field)),
-        ("data", json!({ "type": "string", "contentEncoding": "base64" })),
-    ])
-}
-
-/// The same.
-fn scene_schema() -> Value {
-    let color = object(&[("r", number()), ("g", number()), ("b", number()), ("a", number())]);
-    let line = object(&[
-        ("type", number()),
-        ("pose", pose()),
-        ("thickness", number()),
-        ("scale_invariant", json!({ "type": "boolean" })),
-        ("points", list(&vector())),
-        ("color", color.clone()),
-        ("colors", list(&color)),
-        ("indices", list(&number())),
-    ]);
-    let none = || list(&json!({ "type": "object" }));
-    let entity = object(&[
-        ("timestamp", time()),
-        ("frame_id", text()),
-        ("id", text()),
-        ("lifetime", time()),
-        ("frame_locked", json!({ "type": "boolean" })),
-        ("metadata", list(&object(&[("key", text()), ("value", text())]))),
-        ("arrows", none()),
-        ("cubes", none()),
-        ("spheres", none()),
-        ("cylinders", none()),
-        ("lines", list(&line)),
-        ("triangles", none()),
-        ("texts", none()),
-        ("models", none()),
-    ]);
-    object(&[("deletions", none()), ("entities", list(&entity))])
+        .unwrap_or([Point::origin(); 8])
 }

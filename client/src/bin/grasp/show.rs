@@ -1,9 +1,21 @@
+use std::io::{self, Write};
 use std::time::Duration;
 
+use anyhow::Context;
 use comfy_table::{Cell, CellAlignment, Table, presets};
 use grasp_client::{Detection, Dropped, Latency, Model, Report};
+use nalgebra::Isometry3;
 use serde_json::{Value, json};
 use tonic::Code;
+
+/// Prints a text and ends its line. False where nobody reads it any more, as after `| head`: that is no mistake.
+pub(crate) fn print(text: &str) -> anyhow::Result<bool> {
+    match writeln!(io::stdout().lock(), "{text}") {
+        Ok(()) => Ok(true),
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
+        Err(error) => Err(error).context("cannot print"),
+    }
+}
 
 pub(crate) fn detection(detection: &Detection) -> String {
     let mut text = String::new();
@@ -36,8 +48,8 @@ pub(crate) fn detection_json(detection: &Detection) -> String {
             "position": position.as_slice(),
             "orientation_xyzw": rotation.as_slice(),
             "width": grasp.width,
-            "pregrasp_position": grasp.pregrasp.translation.vector.as_slice(),
-            "retreat_position": grasp.retreat.translation.vector.as_slice(),
+            "pregrasp": pose(&grasp.pregrasp),
+            "retreat": pose(&grasp.retreat),
             "collides": grasp.collides,
         })
     });
@@ -53,6 +65,10 @@ pub(crate) fn detection_json(detection: &Detection) -> String {
         "dropped": detection.dropped.as_ref().map(|d| object(&reasons(d).map(|(reason, n)| (reason, json!(n))))),
     });
     format!("{value:#}")
+}
+
+fn pose(pose: &Isometry3<f64>) -> Value {
+    json!({ "position": pose.translation.vector.as_slice(), "orientation_xyzw": pose.rotation.coords.as_slice() })
 }
 
 const QUANTILES: [(&str, f64); 4] = [("p50", 0.5), ("p90", 0.9), ("p99", 0.99), ("max", 1.0)];
@@ -90,10 +106,20 @@ pub(crate) fn report_json(report: &Report) -> String {
 }
 
 pub(crate) fn models(models: &[Model]) -> String {
-    let mut table =
-        numbers(&["model", "version", "resolution", "voxel m", "threshold", "provider", "precision", "sha256"]);
+    let mut table = numbers(&[
+        "model",
+        "version",
+        "resolution",
+        "voxel m",
+        "camera",
+        "threshold",
+        "provider",
+        "precision",
+        "sha256",
+    ]);
     for model in models {
         let Model { name, version, resolution, voxel_size, threshold, sha256, provider, precision, .. } = model;
+        let camera = model.camera_azimuth.map_or_else(|| "any".to_owned(), |azimuth| format!("{azimuth}°"));
         let sha256 = sha256.get(..12).unwrap_or(sha256).to_owned();
         let any = |number: String| if number == "0" { "any".to_owned() } else { number };
         let [resolution, voxel_size] = [resolution.to_string(), voxel_size.to_string()].map(any);
@@ -103,6 +129,7 @@ pub(crate) fn models(models: &[Model]) -> String {
             version.clone(),
             resolution,
             voxel_size,
+            camera,
             threshold,
             provider.clone(),
             precision.clone(),
@@ -119,6 +146,8 @@ pub(crate) fn models_json(models: &[Model]) -> String {
             "version": model.version,
             "resolution": model.resolution,
             "voxel_size": model.voxel_size,
+            "voxel_origin": model.voxel_origin,
+            "camera_azimuth": model.camera_azimuth,
             "threshold": model.threshold,
             "provider": model.provider,
             "precision": model.precision,
@@ -157,8 +186,8 @@ fn reasons(dropped: &Dropped) -> [(&'static str, u32); 10] {
         ("region", dropped.region),
         ("approach", dropped.approach),
         ("height", dropped.height),
-        ("suppressed", dropped.suppressed),
         ("collision", dropped.collision),
+        ("suppressed", dropped.suppressed),
         ("over_limit", dropped.over_limit),
     ]
 }
@@ -171,4 +200,33 @@ fn numbers(header: &[&str]) -> Table {
 
 fn right<T: ToString>(cells: impl IntoIterator<Item = T>) -> Vec<Cell> {
     cells.into_iter().map(|cell| Cell::new(cell.to_string()).set_alignment(CellAlignment::Right)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_models_fit_a_terminal_and_say_where_the_camera_stood() {
+        let model = Model {
+            name: "vgn-packed".to_owned(),
+            version: "2.0.1".to_owned(),
+            resolution: 40,
+            voxel_size: 0.0075,
+            threshold: 0.9,
+            sha256: "0123456789abcdef".repeat(4),
+            provider: "tensorrt".to_owned(),
+            precision: "fp32".to_owned(),
+            voxel_origin: "center".to_owned(),
+            camera_azimuth: Some(-90.0),
+            ..Model::default()
+        };
+        let list = [model.clone(), Model { camera_azimuth: None, ..model }];
+        let table = models(&list);
+        assert!(table.lines().all(|line| line.chars().count() <= 110), "{table}");
+        assert!(table.contains("-90°") && table.contains("any"), "{table}");
+        let json: Value = serde_json::from_str(&models_json(&list)).unwrap();
+        assert_eq!(json[0]["camera_azimuth"], -90.0);
+        assert_eq!((&json[1]["camera_azimuth"], &json[1]["voxel_origin"]), (&Value::Null, &json!("center")));
+    }
 }

@@ -4,8 +4,9 @@ use anyhow::bail;
 use clap::Args;
 use grasp::{Fusion, SurfaceMesh, SurfacePoint, Volume};
 use grasp_client::Detection;
-use grasp_picture::{Mesh, Picture, quality_color};
-use nalgebra::{Isometry3, Point3};
+use grasp_picture::{Color, Mesh, Picture, quality_color};
+use grasp_proto::TABLE_HEIGHT;
+use nalgebra::{Isometry3, Point3, Translation3};
 
 use crate::record;
 
@@ -14,6 +15,15 @@ const SIZE: [usize; 2] = [1200, 900];
 
 /// Grasps in a picture, the best: more hide each other.
 const SHOWN: usize = 40;
+
+/// Edges of the cube.
+const EDGE: Color = [170, 170, 170];
+
+/// The height at which the table is taken to be.
+const TABLE: Color = [205, 150, 70];
+
+/// x, y and z.
+const AXES: [Color; 3] = [[214, 48, 49], [38, 166, 91], [41, 98, 255]];
 
 /// Where what was seen goes.
 #[derive(Args)]
@@ -24,11 +34,12 @@ pub(crate) struct ViewArgs {
 }
 
 impl ViewArgs {
-    /// Draws or records the observed surface and the grasps.
-    pub fn write(&self, volume: &Volume, detection: &Detection) -> anyhow::Result<&Path> {
+    /// Draws or records the observed surface and the grasps. `table` is its height above the volume's bottom, where it is
+    /// not the usual one.
+    pub fn write(&self, volume: &Volume, table: Option<f64>, detection: &Detection) -> anyhow::Result<&Path> {
         let field = Fusion::of(volume);
         match self.out.extension().and_then(|extension| extension.to_str()) {
-            Some("png") => draw(volume, field.mesh(), detection).save(&self.out)?,
+            Some("png") => draw(volume, field.mesh(), table.unwrap_or(TABLE_HEIGHT), detection).save(&self.out)?,
             Some("mcap") => record::write(&self.out, &placed(&field.surface(), volume.pose()), detection)?,
             _ => bail!("{}: .png or .mcap is needed", self.out.display()),
         }
@@ -42,12 +53,13 @@ fn placed(surface: &[SurfacePoint], pose: &Isometry3<f64>) -> Vec<SurfacePoint> 
     surface.iter().map(point).collect()
 }
 
-/// In the volume's own frame, from a corner above it.
-fn draw(volume: &Volume, mesh: SurfaceMesh, detection: &Detection) -> Picture {
+/// In the volume's own frame, from a corner above it, from which all of the cube is seen.
+fn draw(volume: &Volume, mesh: SurfaceMesh, table: f64, detection: &Detection) -> Picture {
     let size = volume.voxel_size() * volume.resolution() as f64;
     let [width, height] = SIZE;
-    let (eye, target) = (Point3::new(1.75, -1.1, 1.8) * size, Point3::new(0.52, 0.46, 0.3) * size);
-    let mut picture = Picture::looking_at(width, height, 0.46, eye, target);
+    let (eye, target) = (Point3::new(1.75, -1.1, 1.8) * size, Point3::new(0.5, 0.5, 0.4) * size);
+    let mut picture = Picture::looking_at(width, height, 0.68, eye, target);
+    frame(&mut picture, size, table);
     let SurfaceMesh { vertices, triangles } = mesh;
     picture.mesh(&Mesh { vertices, triangles }, &Isometry3::identity(), 1.0, [206, 204, 198]);
     for grasp in detection.grasps.iter().take(SHOWN).rev() {
@@ -55,4 +67,30 @@ fn draw(volume: &Volume, mesh: SurfaceMesh, detection: &Detection) -> Picture {
         picture.gripper(&pose, grasp.width, quality_color(f64::from(grasp.quality)));
     }
     picture
+}
+
+/// The cube, the table's height on its sides, and the axes at its corner.
+fn frame(picture: &mut Picture, size: f64, table: f64) {
+    let thickness = size / 300.0;
+    let corner = |index: usize| Point3::from([0, 1, 2].map(|axis| if index >> axis & 1 == 1 { size } else { 0.0 }));
+    // From each corner along the axes on whose lower side it lies.
+    let edges = (0..8).flat_map(|from| [1, 2, 4].map(|axis| (from, from | axis))).filter(|(from, to)| from != to);
+    let edges: Vec<Mesh> = edges.map(|(from, to)| bar(corner(from), corner(to), thickness)).collect();
+    picture.mesh(&Mesh::union(&edges), &Isometry3::identity(), 1.0, EDGE);
+    if (0.0..=size).contains(&table) {
+        let at = |index: usize| Point3::new(corner(index).x, corner(index).y, table);
+        let sides = [(0, 1), (1, 3), (3, 2), (2, 0)].map(|(from, to)| bar(at(from), at(to), thickness));
+        picture.mesh(&Mesh::union(&sides), &Isometry3::identity(), 1.0, TABLE);
+    }
+    for (axis, color) in AXES.into_iter().enumerate() {
+        let mut end = Point3::origin();
+        end[axis] = 0.25 * size;
+        picture.mesh(&bar(Point3::origin(), end, 4.0 * thickness), &Isometry3::identity(), 1.0, color);
+    }
+}
+
+/// From one point to another, along an axis.
+fn bar(from: Point3<f64>, to: Point3<f64>, thickness: f64) -> Mesh {
+    let middle = Translation3::from(nalgebra::center(&from, &to));
+    Mesh::cuboid((to - from).abs().add_scalar(thickness)).transformed(&middle.into())
 }

@@ -1,7 +1,11 @@
-use std::str::FromStr;
+use std::path::PathBuf;
 
+use anyhow::ensure;
 use clap::{Args, ValueEnum};
 use grasp_client::{Asked, pb};
+
+use crate::numbers::Numbers;
+use crate::pose;
 
 /// What is asked of the grasps.
 #[derive(Args, Clone)]
@@ -46,6 +50,11 @@ pub(crate) struct WishArgs {
     #[arg(long, value_name = "OPENING,DEPTH,WIDTH,BREADTH")]
     gripper: Option<Numbers<4>>,
 
+    /// What lies behind its fingers, a box in the grasp frame: its smallest and largest coordinates, metres. By default
+    /// nothing.
+    #[arg(long, value_name = "X,Y,Z,X,Y,Z", allow_hyphen_values = true, requires = "gripper")]
+    palm: Option<Numbers<6>>,
+
     /// What becomes of grasps whose open hand would meet what was observed, or the table.
     #[arg(long, value_enum, default_value_t = Collision::Off)]
     collision: Collision,
@@ -61,6 +70,23 @@ pub(crate) struct WishArgs {
     /// Along which axis of that frame the fingers close.
     #[arg(long, value_enum, default_value_t = Closing::Y)]
     closing: Closing,
+
+    /// T_parent_grasp, for `--origin parent`: the pose of the finger base in the link that carries the hand, one in a file
+    /// as for --workspace.
+    #[arg(long, value_name = "FILE", required_if_eq("origin", "parent"))]
+    parent_from_grasp: Option<PathBuf>,
+
+    /// How far back along the approach the pre-grasp is, metres. By default 0.05.
+    #[arg(long, value_name = "METRES")]
+    pregrasp: Option<f64>,
+
+    /// How far the hand goes with what it holds, metres. By default 0.1.
+    #[arg(long, value_name = "METRES")]
+    retreat: Option<f64>,
+
+    /// In which direction of the frame it goes. By default back along the approach.
+    #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true)]
+    retreat_direction: Option<Numbers<3>>,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -72,10 +98,14 @@ enum Collision {
     Filter,
 }
 
-#[derive(Clone, Copy, ValueEnum)]
+#[derive(Clone, Copy, PartialEq, ValueEnum)]
 enum Origin {
+    /// Between the fingers, where they begin.
     FingerBase,
+    /// Between the fingertips.
     Tcp,
+    /// At the link that carries the hand.
+    Parent,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -84,25 +114,18 @@ enum Closing {
     X,
 }
 
-/// Numbers with commas between them.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Numbers<const N: usize>([f64; N]);
-
-impl<const N: usize> FromStr for Numbers<N> {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let numbers: Result<Vec<f64>, _> = text.split(',').map(|number| number.trim().parse()).collect();
-        let numbers = numbers.ok().and_then(|numbers| numbers.try_into().ok());
-        numbers.map(Self).ok_or_else(|| format!("{N} numbers with commas between them are needed"))
-    }
-}
-
 impl WishArgs {
-    pub fn asked(&self) -> Asked {
+    /// As the protocol has it.
+    pub fn read(&self) -> anyhow::Result<Asked> {
+        ensure!(
+            self.parent_from_grasp.is_none() || self.origin == Origin::Parent,
+            "--parent-from-grasp needs --origin parent"
+        );
+        let parent_from_grasp = self.parent_from_grasp.as_deref().map(pose::one).transpose()?;
         let vector = |[x, y, z]: [f64; 3]| Some(pb::Vector3 { x, y, z });
+        let corners = |Numbers([a, b, c, x, y, z])| pb::Box { min: vector([a, b, c]), max: vector([x, y, z]) };
         let Self { model, version, threshold, force, max_grasps, explain, min_height, table_height, .. } = self.clone();
-        Asked {
+        Ok(Asked {
             model,
             version,
             threshold,
@@ -110,23 +133,25 @@ impl WishArgs {
             max_grasps,
             explain,
             min_height,
-            region: self
-                .region
-                .map(|Numbers([a, b, c, x, y, z])| pb::Box { min: vector([a, b, c]), max: vector([x, y, z]) }),
+            region: self.region.map(corners),
             approach: self
                 .approach
                 .map(|Numbers([x, y, z, degrees])| pb::Cone { axis: vector([x, y, z]), angle: degrees.to_radians() }),
             gripper: self.gripper.map(|Numbers([max_opening, finger_depth, finger_width, finger_breadth])| {
-                pb::Gripper { max_opening, finger_depth, finger_width, finger_breadth, palm: None }
+                pb::Gripper { max_opening, finger_depth, finger_width, finger_breadth, palm: self.palm.map(corners) }
             }),
             collision: Some(pb::CollisionCheck { mode: self.collision as i32, table_height }),
             convention: Some(pb::Convention {
                 origin: self.origin as i32,
                 closing_axis: self.closing as i32,
-                parent_from_grasp: None,
+                parent_from_grasp: parent_from_grasp.as_ref().map(Into::into),
             }),
-            ..Asked::default()
-        }
+            pregrasp_distance: self.pregrasp,
+            retreat: (self.retreat.is_some() || self.retreat_direction.is_some()).then(|| pb::Retreat {
+                distance: self.retreat,
+                direction: self.retreat_direction.and_then(|Numbers(direction)| vector(direction)),
+            }),
+        })
     }
 }
 
@@ -142,8 +167,10 @@ mod tests {
             [Mode::Off, Mode::Flag, Mode::Filter].map(i32::from),
             [Collision::Off as i32, Collision::Flag as i32, Collision::Filter as i32]
         );
-        assert_eq!([Wire::FingerBase, Wire::Tcp].map(i32::from), [Origin::FingerBase as i32, Origin::Tcp as i32]);
+        assert_eq!(
+            [Wire::FingerBase, Wire::Tcp, Wire::Parent].map(i32::from),
+            [Origin::FingerBase as i32, Origin::Tcp as i32, Origin::Parent as i32]
+        );
         assert_eq!([ClosingAxis::Y, ClosingAxis::X].map(i32::from), [Closing::Y as i32, Closing::X as i32]);
-        assert!("1,2".parse::<Numbers<3>>().is_err() && "1,2,x".parse::<Numbers<3>>().is_err());
     }
 }

@@ -1,0 +1,76 @@
+//! What every reader of files needs.
+
+use std::fs::File;
+use std::io::{self, BufReader, Cursor, Read};
+use std::path::Path;
+
+use anyhow::{Context, bail};
+use npyz::npz::{NpzArchive, file_name_from_array_name};
+use npyz::{Deserialize, NpyFile, Order, TypeChar};
+
+/// An array of a file, its numbers not read yet.
+pub(crate) type Array = NpyFile<Box<dyn Read>>;
+
+/// Says which file it was, if it is not what it must be.
+pub(crate) fn in_file<T>(path: &Path, read: impl FnOnce(&Path) -> anyhow::Result<T>) -> anyhow::Result<T> {
+    read(path).with_context(|| path.display().to_string())
+}
+
+pub(crate) fn has_extension(path: &Path, wanted: &str) -> bool {
+    path.extension().is_some_and(|extension| extension == wanted)
+}
+
+/// The array of a .npy file; of a .npz file the only one, or the one of this name.
+pub(crate) fn array(path: &Path, name: &str) -> anyhow::Result<Array> {
+    let file = BufReader::new(File::open(path)?);
+    if !has_extension(path, "npz") {
+        return Ok(NpyFile::new(Box::new(file) as Box<dyn Read>)?);
+    }
+    let mut archive = NpzArchive::new(file)?;
+    let names: Vec<String> = archive.array_names().map(str::to_owned).collect();
+    let name = match &names[..] {
+        [only] => only,
+        _ => names
+            .iter()
+            .find(|other| *other == name)
+            .with_context(|| format!("holds {}; one array, or one called `{name}`, is needed", names.join(", ")))?,
+    };
+    let mut bytes = Vec::new();
+    archive.zip_archive().by_name(&file_name_from_array_name(name))?.read_to_end(&mut bytes)?;
+    Ok(NpyFile::new(Box::new(Cursor::new(bytes)) as Box<dyn Read>)?)
+}
+
+/// The kind of its numbers and their bytes, where they are of a kind that is `needed`.
+pub(crate) fn kind(array: &Array, needed: &str, taken: &[(TypeChar, u64)]) -> anyhow::Result<(TypeChar, u64)> {
+    let dtype = array.dtype();
+    let npyz::DType::Plain(plain) = &dtype else { bail!("its dtype is {dtype:?}, {needed} is needed") };
+    let kind = (plain.type_char(), plain.size_field());
+    if taken.contains(&kind) { Ok(kind) } else { bail!("its dtype is {plain}, {needed} is needed") }
+}
+
+/// Its numbers, the last axis fastest, whatever the file's order is.
+pub(crate) fn values<T: Deserialize + Copy>(array: Array) -> io::Result<Vec<T>> {
+    let (shape, order) = (array.shape().to_vec(), array.order());
+    let values: Vec<T> = array.into_vec()?;
+    if order == Order::C {
+        return Ok(values);
+    }
+    let place = |mut index: usize| {
+        let (mut place, mut stride) = (0, values.len());
+        for edge in shape.iter().rev().map(|&edge| edge as usize) {
+            stride /= edge;
+            place += index % edge * stride;
+            index /= edge;
+        }
+        values[place]
+    };
+    Ok((0..values.len()).map(place).collect())
+}
+
+/// The same of floating numbers of either precision.
+pub(crate) fn floats(array: Array) -> anyhow::Result<Vec<f64>> {
+    Ok(match kind(&array, "f64 or f32", &[(TypeChar::Float, 8), (TypeChar::Float, 4)])? {
+        (_, 8) => values(array)?,
+        _ => values::<f32>(array)?.into_iter().map(f64::from).collect(),
+    })
+}

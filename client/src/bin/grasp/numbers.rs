@@ -1,0 +1,26 @@
+use std::str::FromStr;
+
+/// Numbers with commas between them.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Numbers<const N: usize>(pub [f64; N]);
+
+impl<const N: usize> FromStr for Numbers<N> {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let numbers: Result<Vec<f64>, _> = text.split(',').map(|number| number.trim().parse()).collect();
+        let numbers = numbers.ok().and_then(|numbers| numbers.try_into().ok());
+        numbers.map(Self).ok_or_else(|| format!("{N} numbers with commas between them are needed"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn as_many_as_are_needed() {
+        assert_eq!("1, -2,3e-3".parse::<Numbers<3>>().unwrap().0, [1.0, -2.0, 0.003]);
+        assert!("1,2".parse::<Numbers<3>>().is_err() && "1,2,x".parse::<Numbers<3>>().is_err());
+    }
+}
