@@ -27,7 +27,7 @@ pub struct Dropped {
     pub suppressed: usize,
 }
 
-/// What [`decode`] found.
+/// What [`decode`](crate::decode) or [`select`] found.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Decoded {
     /// In the volume's frame, best first.

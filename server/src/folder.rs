@@ -68,7 +68,9 @@ impl Folder {
                 _ = hangup.recv() => true,
                 () = tokio::time::sleep(every.unwrap_or_default()), if every.is_some() => false,
             };
-            let now = stamps(&folder.directory);
+            // A file system across a network may take its time.
+            let looking = Arc::clone(&folder);
+            let Ok(now) = tokio::task::spawn_blocking(move || stamps(&looking.directory)).await else { continue };
             if told || (now != loaded && now == last) {
                 let reloading = Arc::clone(&folder);
                 if let Err(panic) = tokio::task::spawn_blocking(move || reloading.reload()).await {

@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::PathBuf;
 use std::process::Command;
+use std::time::Duration;
 
 use grasp::Volume;
 use grasp_client::{Access, Certificate, Client, Error, Health, Identity, Options};
@@ -10,6 +11,7 @@ use grasp_tests::{RESOLUTION, Server, TestModel, blobs, grasp, graspd};
 use nalgebra::Isometry3;
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
 use tempfile::TempDir;
+use tokio::time::timeout;
 use tonic::Code;
 
 fn volume() -> Volume {
@@ -120,11 +122,14 @@ async fn only_bearers_of_a_token_are_answered_and_tokens_change_at_sighup() {
         let reloads = server.metric("graspd_reloads_total{outcome=\"ok\"}");
         server.reload().unwrap();
         server.wait_for("graspd_reloads_total{outcome=\"ok\"}", reloads + 1.0).await;
-        while detects(&server, with("new-secret")).await.is_err()
-            || detects(&server, with("first-secret")).await.is_ok() != good
-        {
-            tokio::task::yield_now().await;
-        }
+        let taken = async {
+            while detects(&server, with("new-secret")).await.is_err()
+                || detects(&server, with("first-secret")).await.is_ok() != good
+            {
+                tokio::task::yield_now().await;
+            }
+        };
+        timeout(Duration::from_secs(60), taken).await.expect("the file is read anew");
     }
     fs::remove_file(&file).unwrap();
     server.reload().unwrap();
