@@ -33,9 +33,9 @@ with_haproxy = GRASPD_HAPROXY="$$($(PYTHON) deploy/native.py haproxy)" && export
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
 
-demo: ## simulate a cluttered table, clear it with the server's grasps, draw demo.png
+demo: ## simulate a cluttered table, ask the server for grasps, execute the best, draw demo.png
 	$(with_onnxruntime) $(CARGO) build --release --package graspd --package grasp-sim --locked && \
-		$(RELEASE)/grasp-sim demo --graspd $(RELEASE)/graspd --models models/zoo --seed 8 --picture demo.png
+		$(RELEASE)/grasp-sim demo --graspd $(RELEASE)/graspd --models models/zoo --seed 3 --picture demo.png
 
 build: ## build the server, the simulator and the client, optimised
 	$(CARGO) build --release $(WORKSPACE)

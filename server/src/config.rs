@@ -155,7 +155,7 @@ struct Flags {
     #[arg(long, env = "GRASPD_MAX_TRACKED", value_name = "N", default_value = "64")]
     max_tracked: String,
 
-    /// How long a volume is kept without a view, seconds. Then the call ends.
+    /// How long a volume is kept without a request, seconds. Then the call ends.
     #[arg(
         long,
         env = "GRASPD_TRACK_TIMEOUT",

@@ -23,7 +23,7 @@ pub(crate) enum Refusal {
     Draining,
     #[error("{0} volumes are kept already, no more are; end a stream, or raise --max-tracked")]
     TooManyKept(usize),
-    #[error("no view came for {0:?}: the volume is gone; open another stream")]
+    #[error("no request came for {0:?}: the volume is gone; open another stream")]
     Forgotten(Duration),
     #[error(transparent)]
     Failed(#[from] EngineError),

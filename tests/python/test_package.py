@@ -352,7 +352,7 @@ class TrackTest(ServerTest):
                 tracking.add(seen, LOW)
                 time.sleep(0.5)
                 for _ in range(2):
-                    with self.assertRaisesRegex(graspd.Aborted, "no view came"):
+                    with self.assertRaisesRegex(graspd.Aborted, "no request came"):
                         tracking.add(seen, LOW)
 
 

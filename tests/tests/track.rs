@@ -88,7 +88,7 @@ async fn as_many_volumes_are_kept_as_were_allowed_and_none_for_ever() {
 
     server.wait_for(TRACKED, 0.0).await;
     let (status, message) = code(tracking.add(&views, low()).await);
-    assert!(status == Code::Aborted && message.contains("no view came for 300ms"), "{message}");
+    assert!(status == Code::Aborted && message.contains("no request came for 300ms"), "{message}");
     let mut tracking = client.track(Workspace::default()).await.unwrap();
     assert!(tracking.add(&views, low()).await.is_ok(), "its place is free again");
 }

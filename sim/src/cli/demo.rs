@@ -75,7 +75,7 @@ impl Demo {
                 let name = world.objects().iter().find(|body| body.id == object).map(|body| body.object.name.as_str());
                 println!("the best one, executed: lifted {} ({:.0} mm wide)", name.unwrap_or("it"), width * 1e3);
             }
-            Some(failure) => println!("the best one, executed: not lifted ({failure:?})"),
+            Some(failure) => println!("the best one, executed: {}", failure.name().replace('_', " ")),
             None => println!("nothing to execute: {:?}; another --seed makes another scene", detection.dropped),
         }
 

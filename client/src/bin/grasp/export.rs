@@ -60,8 +60,9 @@ pub(crate) fn moveit(detection: &Detection) -> String {
     if text.is_empty() { "[]\n".to_owned() } else { text }
 }
 
-/// NVIDIA's `isaac_grasp`, version 1.0: the gripper is told by how far each finger is from the middle.
-pub(crate) fn isaac(detection: &Detection) -> String {
+/// NVIDIA's `isaac_grasp`, version 1.0: the gripper is told by how far each finger is from the middle. Before a grasp it is
+/// open to `opening`, metres.
+pub(crate) fn isaac(detection: &Detection, opening: f64) -> String {
     let mut text = "format: isaac_grasp\nformat_version: \"1.0\"\n".to_owned();
     let frame = json!(detection.frame_id);
     let _ = writeln!(text, "object_frame_link: {frame}\ngripper_frame_link: \"\"\ngrasps:");
@@ -76,7 +77,7 @@ pub(crate) fn isaac(detection: &Detection) -> String {
         let _ = writeln!(text, "    position: [{x}, {y}, {z}]");
         let _ = writeln!(text, "    orientation: {{w: {qw}, xyz: [{qx}, {qy}, {qz}]}}");
         let _ = writeln!(text, "    cspace_position: {{finger: {}}}", width / 2.0);
-        let _ = writeln!(text, "    pregrasp_cspace_position: {{finger: {}}}", grasp::MAX_OPENING / 2.0);
+        let _ = writeln!(text, "    pregrasp_cspace_position: {{finger: {}}}", opening / 2.0);
     }
     text
 }

@@ -204,15 +204,16 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
         Command::Detect(Detect { scene: args, wishes, csv, moveit, isaac }) => {
             // The files first: a mistake in them needs no server to be found.
             let (scene, asked) = (args.read()?, wishes.read()?);
+            let opening = asked.gripper.as_ref().map_or(grasp::MAX_OPENING, |gripper| gripper.max_opening);
             let detection = scene.detect(&connect().await?, options(&args, asked)).await?;
             print(&detection)?;
-            let write = |path: Option<PathBuf>, text: fn(&Detection) -> String| match path {
+            let write = |path: Option<PathBuf>, text: &dyn Fn(&Detection) -> String| match path {
                 Some(path) => fs::write(&path, text(&detection)).with_context(|| path.display().to_string()),
                 None => Ok(()),
             };
-            write(csv, export::csv)?;
-            write(moveit, export::moveit)?;
-            write(isaac, export::isaac)?;
+            write(csv, &export::csv)?;
+            write(moveit, &export::moveit)?;
+            write(isaac, &|detection| export::isaac(detection, opening))?;
         }
         Command::Watch(Watch { scene: args, wishes, every, count }) => {
             let asked = wishes.read()?;
