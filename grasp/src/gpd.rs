@@ -32,7 +32,7 @@ pub fn is_on_an_object(position: &Point3<f64>, size: f64, table: f64) -> bool {
     inner.contains(&position.x) && inner.contains(&position.y) && (table + SKIN..=size).contains(&position.z)
 }
 
-/// The candidates that a classifier scores above 0, the best first. A score is the logit of a success less that of a
+/// Candidates as a classifier scores them, the best first. A score is the logit of a success less that of a
 /// failure, so that the quality is the probability of a success.
 #[must_use]
 pub fn scored(candidates: &[Candidate], scores: &[f32]) -> Vec<Grasp> {
@@ -41,7 +41,7 @@ pub fn scored(candidates: &[Candidate], scores: &[f32]) -> Vec<Grasp> {
         width: candidate.width,
         quality: 1.0 / (1.0 + (-score).exp()),
     };
-    let mut grasps: Vec<Grasp> = candidates.iter().zip(scores).filter(|(_, score)| **score >= 0.0).map(grasp).collect();
+    let mut grasps: Vec<Grasp> = candidates.iter().zip(scores).map(grasp).collect();
     grasps.sort_by(|a, b| b.quality.total_cmp(&a.quality));
     grasps
 }

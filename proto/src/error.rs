@@ -17,14 +17,14 @@ impl FieldError {
     /// `{field} is {value}, {needed}`.
     pub fn new(field: impl Into<Cow<'static, str>>, value: impl Display, needed: impl Display) -> Self {
         let field = field.into();
-        let message = format!("{field} is {value}, {needed}");
+        let message = on_a_line(&format!("{field} is {value}, {needed}"));
         Self { field, message }
     }
 
     /// `{field}: {reason}`.
     pub fn refused(field: impl Into<Cow<'static, str>>, reason: impl Display) -> Self {
         let field = field.into();
-        let message = format!("{field}: {reason}");
+        let message = on_a_line(&format!("{field}: {reason}"));
         Self { field, message }
     }
 
@@ -32,5 +32,34 @@ impl FieldError {
     #[must_use]
     pub fn inside(self, outer: impl Display) -> Self {
         Self { field: format!("{outer}.{}", self.field).into(), message: format!("{outer}.{}", self.message) }
+    }
+}
+
+/// What may hold a client's own words, for a log and for headers: on one line, and no longer than both take.
+#[must_use]
+pub fn on_a_line(text: &str) -> String {
+    const LONGEST: usize = 1500;
+    let mut line = String::new();
+    for c in text.chars() {
+        if line.len() > LONGEST {
+            line.push('…');
+            break;
+        }
+        if c.is_control() { line.extend(c.escape_default()) } else { line.push(c) }
+    }
+    line
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_client_wrote_forges_no_line_and_fits_a_header() {
+        let error =
+            FieldError::new("outputs", "`a\nINFO forged\u{1b}[0m`", "the outputs are quality, rotation and width");
+        assert!(error.message.starts_with("outputs is `a\\nINFO forged\\u{1b}[0m`, the"), "{error}");
+        let long = FieldError::refused("inputs[0].name", "ä".repeat(1_000_000)).message;
+        assert!(long.len() < 1600 && long.ends_with("ää…"));
     }
 }

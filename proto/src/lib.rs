@@ -22,7 +22,7 @@ pub mod oip {
     tonic::include_proto!("inference");
 }
 
-pub use error::FieldError;
+pub use error::{FieldError, on_a_line};
 pub use options::{Asked, Collision, TABLE_HEIGHT};
 pub use pose::pose;
 pub use views::{MAX_VIEWS, Points, Workspace, check_count, cloud_view, depth_view};

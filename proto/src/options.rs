@@ -16,6 +16,9 @@ const PREGRASP: f64 = 0.05;
 /// From the grasp upwards, metres: VGN's trials.
 const RETREAT: f64 = 0.1;
 
+/// The longest name of a planner, and of its version, bytes.
+pub const MAX_NAME: usize = 256;
+
 /// Farthest that a hand is sent, metres.
 const REACH: f64 = 10.0;
 
@@ -99,6 +102,12 @@ impl TryFrom<&pb::Options> for Asked {
     type Error = FieldError;
 
     fn try_from(options: &pb::Options) -> Result<Self, FieldError> {
+        for (field, name) in [("options.model", &options.model), ("options.version", &options.version)] {
+            if name.len() > MAX_NAME {
+                let value = format_args!("{} bytes long", name.len());
+                return Err(FieldError::new(field, value, format_args!("at most {MAX_NAME} are taken")));
+            }
+        }
         let collision = options.collision.unwrap_or_default();
         let table = number("options.collision.table_height", collision.table_height)?.unwrap_or(TABLE_HEIGHT);
         Ok(Self {
@@ -182,7 +191,10 @@ fn region(bounds: &pb::Box) -> Result<Region, FieldError> {
 
 fn direction(vector: Option<pb::Vector3>, field: &'static str) -> Result<Unit<Vector3<f64>>, FieldError> {
     let pb::Vector3 { x, y, z } = vector.ok_or_else(|| FieldError::new(field, "absent", "must be given"))?;
-    let direction = Unit::try_new(Vector3::new(x, y, z), 1e-9).filter(|unit| unit.iter().all(|c| c.is_finite()));
+    let vector = Vector3::new(x, y, z);
+    // By its largest part first: squares of what is large are infinite.
+    let direction = Unit::try_new(vector / vector.amax().max(1e-9), 1e-9);
+    let direction = direction.filter(|unit| unit.iter().all(|c| c.is_finite()) && vector.norm() > 1e-9);
     direction.ok_or_else(|| {
         FieldError::new(field, format_args!("({x}, {y}, {z})"), "must be finite and of a length above 0")
     })

@@ -244,7 +244,10 @@ impl Call {
         let total = self.started.elapsed();
         let timings = Timings { queue, preprocessing, fusion, inference, postprocessing, total };
         self.answered(&timings, grasps.len());
-        let outcome = Outcome::Answered(Box::new(Answered { timings, volume, grasps: found, collides, finger_depth }));
+        let (pose, size) = (*volume.pose(), volume.voxel_size() * volume.resolution() as f64);
+        let volume = Some(volume).filter(|volume| volume.resolution() <= Answered::MAX_RESOLUTION);
+        let answered = Answered { timings, pose, size, volume, grasps: found, collides, finger_depth };
+        let outcome = Outcome::Answered(Box::new(answered));
         self.recent.add(self.id.clone(), self.label.clone(), outcome);
         Ok(pb::DetectGraspsResponse {
             request_id: self.id.clone(),

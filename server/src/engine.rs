@@ -13,7 +13,7 @@ use nalgebra::Isometry3;
 use prometheus::{Histogram, IntGauge};
 use thiserror::Error;
 use tokio::sync::oneshot;
-use tracing::{Span, error, info};
+use tracing::{Span, error, info, warn};
 
 use crate::deadline::Deadline;
 use crate::metrics::Metrics;
@@ -108,7 +108,7 @@ pub(crate) enum EngineError {
     NoNetwork,
     #[error("the session is gone")]
     Gone,
-    #[error("the deadline has passed before a session was free")]
+    #[error("the deadline has passed before the answer was ready")]
     Expired,
 }
 
@@ -267,10 +267,19 @@ impl Sessions {
         Ok(())
     }
 
-    /// Waits for the sessions to end, which they do once their engine is dropped.
-    pub fn join(&self) {
+    /// Waits for the sessions to end, which they do once their engine is dropped and they have answered what they have, but
+    /// no longer than this.
+    pub fn join(&self, patience: Duration) {
+        let until = Instant::now() + patience;
         let threads = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
         for thread in threads {
+            while !thread.is_finished() && Instant::now() < until {
+                thread::sleep(Duration::from_millis(1));
+            }
+            if !thread.is_finished() {
+                warn!(session = thread.thread().name(), "is still computing, and left behind");
+                continue;
+            }
             // A session catches its panics, and one that did not has nothing left to be waited for.
             let _ = thread.join();
         }

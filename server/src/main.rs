@@ -29,6 +29,7 @@ use std::io::Write;
 use std::net::SocketAddr;
 use std::process::ExitCode;
 use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::Context;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
@@ -77,6 +78,9 @@ fn main() -> ExitCode {
     }
 }
 
+/// How long those are waited for who are still computing when the process ends.
+const PATIENCE: Duration = Duration::from_secs(2);
+
 /// The threads that move messages.
 fn runtime(config: &Config) -> anyhow::Result<Runtime> {
     let mut builder = tokio::runtime::Builder::new_multi_thread();
@@ -95,9 +99,9 @@ fn run(config: &Config, runtime: Runtime, traces: &Traces) -> anyhow::Result<()>
     let served = runtime.block_on(serve(config, &metrics, &sessions));
     traces.finish();
     // With the runtime the last way to reach the sessions goes.
-    drop(runtime);
-    // Whatever happened, no session may still be inside ONNX Runtime when the process ends.
-    sessions.join();
+    runtime.shutdown_timeout(PATIENCE);
+    // No session should still be inside ONNX Runtime when the process ends.
+    sessions.join(PATIENCE);
     served
 }
 

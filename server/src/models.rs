@@ -1,7 +1,7 @@
 use std::sync::{Arc, PoisonError, RwLock};
 
 use grasp::Volume;
-use grasp_proto::{FieldError, pb};
+use grasp_proto::{FieldError, on_a_line, pb};
 
 use crate::engine::Engine;
 use crate::refusal::Refusal;
@@ -60,7 +60,7 @@ impl Models {
         let is_known = served.iter().any(|engine| engine.source.name() == name);
         let engine = served.iter().find(is_named).ok_or_else(|| Refusal::UnknownModel {
             field: if is_known { "options.version" } else { "options.model" },
-            wanted: format!("{name} {version}").trim_end().to_owned(),
+            wanted: on_a_line(format!("{name} {version}").trim_end()),
             available: describe(&served.iter().collect::<Vec<_>>(), |engine| engine.label.clone()),
         })?;
         if fits(engine) { Ok(Arc::clone(engine)) } else { Err(wrong(&taken(engine))) }

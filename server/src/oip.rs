@@ -1,12 +1,12 @@
 use std::sync::Arc;
 
 use grasp::Volume;
-use grasp_proto::FieldError;
 use grasp_proto::oip::grpc_inference_service_server::GrpcInferenceService;
 use grasp_proto::oip::model_infer_request::InferInputTensor;
 use grasp_proto::oip::model_infer_response::InferOutputTensor;
 use grasp_proto::oip::model_metadata_response::TensorMetadata;
 use grasp_proto::oip::{self, infer_parameter::ParameterChoice};
+use grasp_proto::{FieldError, on_a_line};
 use nalgebra::Isometry3;
 use prost::bytes::Bytes;
 use tonic::{Request, Response, Status};
@@ -47,7 +47,7 @@ impl Inference {
 
     /// The network of that name; a planner without one has nothing to infer.
     fn network(&self, name: &str, version: &str) -> Result<Arc<Engine>, Refusal> {
-        let wanted = || format!("{name} {version}").trim_end().to_owned();
+        let wanted = || on_a_line(format!("{name} {version}").trim_end());
         let networks = || {
             let served = self.models.now();
             let names = served.iter().filter(|engine| engine.source.network().is_some());

@@ -19,6 +19,8 @@ pub(crate) struct Grid {
     /// `T_task_grid`: for a network that was trained with a camera on one side, the cube is turned so that the camera
     /// stands there.
     task_from_grid: Isometry3<f64>,
+    /// Where cameras stand in it, if that matters to who reads it: degrees about the vertical.
+    azimuth: Option<f64>,
     /// Whether a planner wants more than the volume.
     sights: bool,
 }
@@ -27,10 +29,17 @@ impl Grid {
     /// The one that a planner reads, of a workspace that cameras look at from these points of the task frame.
     pub fn of(source: &Source, workspace: &Workspace, eyes: &[Point3<f64>]) -> Result<Self, FieldError> {
         let Workspace { frame_from_task, size, .. } = *workspace;
-        let identity = Isometry3::identity();
         let Some(network) = source.network() else {
             let size = size.unwrap_or(WORKSPACE_SIZE);
-            return Ok(Self { resolution: RESOLUTION, size, frame_from_task, task_from_grid: identity, sights: true });
+            let task_from_grid = Isometry3::identity();
+            return Ok(Self {
+                resolution: RESOLUTION,
+                size,
+                frame_from_task,
+                task_from_grid,
+                azimuth: None,
+                sights: true,
+            });
         };
         let resolution = network.metadata.resolution;
         let trained = resolution as f64 * network.metadata.voxel_size;
@@ -40,14 +49,15 @@ impl Grid {
             let needed = format_args!("the model {} takes {trained} m, to one in a thousand, or 0", source.name());
             return Err(FieldError::new("workspace.size", size, needed));
         }
-        let turned = network.metadata.camera_azimuth.map_or(identity, |azimuth| turned(azimuth, trained, eyes));
-        Ok(Self { resolution, size: trained, frame_from_task, task_from_grid: turned, sights: false })
+        let azimuth = network.metadata.camera_azimuth;
+        let task_from_grid = azimuth.map_or_else(Isometry3::identity, |azimuth| turned(azimuth, trained, eyes));
+        Ok(Self { resolution, size: trained, frame_from_task, task_from_grid, azimuth, sights: false })
     }
 
     /// Whether a planner reads what was fused into this one.
     pub fn check(&self, source: &Source) -> Result<(), FieldError> {
         match source.network().map(|entry| &entry.metadata) {
-            Some(network) if network.resolution != self.resolution || !self.is_as_large(network) => {
+            Some(network) if !self.is_read_by(network) => {
                 let value = format_args!("`{}`", source.name());
                 let needed = "which reads another volume than the one that is kept; send a workspace to start one";
                 Err(FieldError::new("options.model", value, needed))
@@ -56,9 +66,11 @@ impl Grid {
         }
     }
 
-    fn is_as_large(&self, network: &Metadata) -> bool {
+    fn is_read_by(&self, network: &Metadata) -> bool {
         let trained = network.resolution as f64 * network.voxel_size;
-        (self.size - trained).abs() <= 1e-3 * trained
+        network.resolution == self.resolution
+            && (self.size - trained).abs() <= 1e-3 * trained
+            && network.camera_azimuth == self.azimuth
     }
 
     /// What is asked of grasps, and that they lie in the cube that was asked about, where the grid reaches beyond it.

@@ -38,12 +38,22 @@ pub(crate) enum Outcome {
 /// What was seen, and the grasps in it.
 pub(crate) struct Answered {
     pub timings: Timings,
-    pub volume: Volume,
+    /// `T_frame_volume`.
+    pub pose: Isometry3<f64>,
+    /// Edge of the volume, metres.
+    pub size: f64,
+    /// None where it is too large to be kept.
+    pub volume: Option<Volume>,
     /// In the frame of the volume's pose.
     pub grasps: Vec<Grasp>,
     pub collides: Option<Vec<bool>>,
     /// Length of the hand's fingers, metres.
     pub finger_depth: f64,
+}
+
+impl Answered {
+    /// The largest volumes that are kept, voxels along an edge: a request of 1 MB.
+    pub const MAX_RESOLUTION: usize = 64;
 }
 
 impl Recent {
@@ -118,16 +128,17 @@ impl Ended {
     fn whole(&self) -> Value {
         let mut value = self.short();
         if let (Some(object), Outcome::Answered(answered)) = (value.as_object_mut(), &self.outcome) {
-            let Answered { volume, grasps, collides, finger_depth, .. } = &**answered;
-            let SurfaceMesh { vertices, triangles } = Fusion::of(volume).mesh();
+            let Answered { pose, size, volume, grasps, collides, finger_depth, .. } = &**answered;
+            let mesh = volume.as_ref().map(|volume| Fusion::of(volume).mesh());
+            let SurfaceMesh { vertices, triangles } = mesh.unwrap_or_default();
             let vertices = vertices.iter().flat_map(|v| [v.x, v.y, v.z].map(|number| (number * 1e4).round() / 1e4));
-            let to_volume = volume.pose().inverse();
+            let to_volume = pose.inverse();
             let grasp = |(index, grasp): (usize, &Grasp)| {
                 let collides = collides.as_ref().and_then(|collides| collides.get(index));
                 let pose = parts(&(to_volume * grasp.pose));
                 json!({ "pose": pose, "width": grasp.width, "depth": finger_depth, "quality": grasp.quality, "collides": collides })
             };
-            object.insert("size".to_owned(), json!(volume.voxel_size() * volume.resolution() as f64));
+            object.insert("size".to_owned(), json!(size));
             object.insert("vertices".to_owned(), vertices.collect());
             object.insert("triangles".to_owned(), triangles.into_iter().flatten().collect());
             object.insert("grasps".to_owned(), grasps.iter().enumerate().map(grasp).collect());

@@ -144,7 +144,6 @@ impl Grasps {
         };
         let engine = self.models.select(&asked.model, &asked.version, None)?;
         call.by(&engine);
-        engine.check_place()?;
         let (from, old) = (Arc::clone(&engine), track.take());
         // It comes back in any case: what is wrong with a view does not cost the volume.
         let (kept, fused) = blocking(move || Ok(Track::integrate(old, &from, asked, workspace, &views))).await?;
@@ -257,30 +256,50 @@ impl GraspService for Grasps {
         let mut requests = request.into_inner();
         let service = self.clone();
         let place = self.kept.place().map_err(|refusal| self.refuse(refusal, caller.clone()))?;
-        let (replies, sent) = mpsc::channel(1);
+        let (replies, sent) = mpsc::channel(2);
+        // Half of it is for what ends the stream, which must not wait for who reads nothing.
+        let Ok(end) = replies.clone().try_reserve_owned() else {
+            return Err(Status::internal("a channel is full from the beginning"));
+        };
         tokio::spawn(async move {
             // Given back when the stream ends, with the volume.
             let _place = place;
             let mut track = None;
-            while let Ok(reply) = replies.reserve().await {
-                let message = tokio::select! {
-                    message = requests.message() => message,
-                    () = draining(service.calls.state()) => return reply.send(Err(service.refuse(Refusal::Draining, caller))),
-                    refusal = service.kept.expired() => return reply.send(Err(service.refuse(refusal, caller))),
+            let ended = loop {
+                let next = async {
+                    // A place for the reply first: what is not read holds up what comes after it.
+                    let reply = replies.reserve().await.ok()?;
+                    Some((reply, requests.message().await))
+                };
+                let (reply, message) = tokio::select! {
+                    next = next => match next {
+                        Some(next) => next,
+                        None => return,
+                    },
+                    () = draining(service.calls.state()) => break service.refuse(Refusal::Draining, caller),
+                    refusal = service.kept.expired() => break service.refuse(refusal, caller),
                 };
                 let mut request = match message {
                     Ok(Some(request)) => request,
                     Ok(None) => return,
-                    Err(status) => return reply.send(Err(status)),
+                    Err(status) => break status,
                 };
                 let (mut call, checked) = service.calls.open(std::mem::take(&mut request.request_id), caller.clone());
-                let work = match checked {
-                    Ok(()) => service.submit_track(request, &mut track, &mut call).await,
-                    Err(refusal) => Err(refusal),
+                let answer = async {
+                    let work = match checked {
+                        Ok(()) => service.submit_track(request, &mut track, &mut call).await,
+                        Err(refusal) => Err(refusal),
+                    };
+                    let id = call.id.clone();
+                    response(id, Begun { call, work }.finish().await)
                 };
-                let id = call.id.clone();
-                reply.send(Ok(response(id, Begun { call, work }.finish().await)));
-            }
+                tokio::select! {
+                    answer = answer => reply.send(Ok(answer)),
+                    // Who has gone wants none; the call counts as cancelled.
+                    () = replies.closed() => return,
+                }
+            };
+            end.send(Err(ended));
         });
         Ok(Response::new(Box::pin(ReceiverStream::new(sent))))
     }

@@ -2,7 +2,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use grasp::{Fusion, View};
-use grasp_proto::{Asked, FieldError, MAX_VIEWS, Workspace, depth_view, pb};
+use grasp_proto::{Asked, FieldError, MAX_VIEWS, Workspace, check_count, depth_view, pb};
 use nalgebra::Isometry3;
 use prometheus::IntGauge;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
@@ -107,6 +107,8 @@ impl Track {
         let mut workspace = Workspace::try_from(workspace)?;
         let origin = Origin::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
         let frame_from_task = workspace.frame_from_task;
+        // How the cube stands may depend on where they were taken from.
+        check_count(views.len())?;
         let views = converted(views, &frame_from_task)?;
         let grid = Grid::of(&engine.source, &workspace, &eyes(&views))?;
         Ok((Self { fusion: grid.fusion(), grid, frame_from_task, origin, asked: asked.clone() }, views))

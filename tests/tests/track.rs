@@ -3,8 +3,10 @@
 use grasp_client::{Asked, Detection, Error, Extrinsics, Options, Workspace};
 use grasp_proto::pb;
 use grasp_tests::scene::{camera, view};
-use grasp_tests::{Server, TestModel};
+use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
 use nalgebra::Isometry3;
+use tokio::task::JoinSet;
+use tokio_stream::StreamExt;
 use tonic::Code;
 
 const TRACKED: &str = "graspd_tracked_volumes";
@@ -74,6 +76,51 @@ async fn a_bad_view_costs_neither_the_stream_nor_the_volume() {
     let reply = replies.into_inner().message().await.unwrap().unwrap();
     let Some(pb::detect_grasps_stream_response::Outcome::Error(error)) = reply.outcome else { panic!("{reply:?}") };
     assert_eq!(error.message, "workspace is absent, must be given in the first request of a stream");
+
+    let (status, message) = code(client.track(Workspace::default()).await.unwrap().add(&[], low()).await);
+    assert_eq!((status, &*message), (Code::InvalidArgument, "views is a list of 0, must have from 1 to 64"));
+}
+
+#[tokio::test]
+async fn views_that_come_while_the_queue_is_full_are_kept() {
+    let server = Server::run(&[TestModel::new("slow").convolutions(60)], &["--queue", "1"]);
+    let client = server.client().await;
+    let views = [-90.0, 90.0].map(|azimuth| view(&camera(40.0, azimuth)));
+    let mut tracking = client.track(Workspace::default()).await.unwrap();
+    tracking.add(&views[..1], low()).await.unwrap();
+
+    let mut callers = JoinSet::new();
+    let volume = blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]]);
+    for _ in 0..12 {
+        let (client, volume) = (client.clone(), volume.clone());
+        callers.spawn(async move { client.detect(&volume, Options::default()).await });
+    }
+    server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 1.0).await;
+    let (status, message) = code(tracking.add(&views[1..], low()).await);
+    assert_eq!(status, Code::ResourceExhausted, "{message}");
+    callers.join_all().await;
+
+    let kept = tracking.add(&[], low()).await.unwrap();
+    let wanted = client.detect_from_depth(&views, &Workspace::default(), low()).await.unwrap();
+    assert_eq!(kept.grasps, wanted.grasps);
+}
+
+#[tokio::test]
+async fn who_does_not_read_holds_no_volume_for_ever() {
+    let server = Server::run(&[TestModel::new("mirror")], &["--track-timeout", "0.3"]);
+    let first = pb::TrackGraspsRequest {
+        views: vec![(&view(&camera(40.0, -90.0))).into()],
+        workspace: Some(pb::Workspace::default()),
+        options: Some(pb::Options { threshold: Some(0.6), ..Default::default() }),
+        ..Default::default()
+    };
+    // Each is answered by several grasps; what a client does not read fills its window.
+    let more = std::iter::repeat_n(pb::TrackGraspsRequest::default(), 500);
+    let requests = tokio_stream::iter(std::iter::once(first).chain(more)).chain(tokio_stream::pending());
+    let replies = server.raw().await.track_grasps(requests).await.unwrap();
+    server.wait_for(TRACKED, 1.0).await;
+    server.wait_for(TRACKED, 0.0).await;
+    drop(replies);
 }
 
 #[tokio::test]

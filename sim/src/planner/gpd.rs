@@ -25,6 +25,9 @@ impl Planner for Gpd {
         let found = candidates(&cloud, &params(), rng);
         let images: Vec<Image> = found.iter().map(|candidate| Image::of(&cloud, candidate)).collect();
         let scores = self.classifier.score(&images)?;
-        Ok(scored(&found, &scores))
+        let mut grasps = scored(&found, &scores);
+        // A success is the likelier, as GPD itself has it.
+        grasps.retain(|grasp| grasp.quality >= 0.5);
+        Ok(grasps)
     }
 }
