@@ -107,6 +107,18 @@ impl Hand {
                 && (lower[2] - from..=upper[2]).contains(&point.z)
     }
 
+    /// Whether a ball around a point of the grasp frame may hold something that the hand [meets](Self::meets).
+    pub(crate) fn comes_near(&self, centre: &Point3<f64>, from: f64, radius: f64) -> bool {
+        let [lower, upper] = self.palm;
+        let (x, y) = (self.height / 2.0, self.outer_diameter / 2.0);
+        let box_of_all = [
+            lower[0].min(-x)..=upper[0].max(x),
+            lower[1].min(-y)..=upper[1].max(y),
+            lower[2].min(0.0) - from..=upper[2].max(self.depth),
+        ];
+        centre.iter().zip(box_of_all).all(|(c, side)| (side.start() - radius..=side.end() + radius).contains(c))
+    }
+
     /// Whether a point of the grasp frame is inside the palm.
     #[must_use]
     pub fn palm_meets(&self, point: &Point3<f64>) -> bool {

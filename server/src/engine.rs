@@ -321,9 +321,8 @@ impl Session {
             }
             self.batch.observe(jobs.len() as f64);
             let Self { planner, queue, pace, .. } = &mut self;
-            let done = |inference: Duration, jobs: usize| {
-                // A place in the queue is free as often as a scene is done.
-                pace.set(inference / u32::try_from(jobs).unwrap_or(u32::MAX));
+            let scenes = u32::try_from(jobs.len()).unwrap_or(u32::MAX);
+            let done = |inference: Duration| {
                 queue.free();
                 Taken { at: now, inference }
             };
@@ -336,17 +335,19 @@ impl Session {
                     }
                 }
             }
+            // A place in the queue is free as often as a scene is done, with all that belongs to it.
+            pace.set(now.elapsed() / scenes);
         }
     }
 }
 
 /// Runs the network over the batch, then makes of each output what is asked for.
-fn infer(network: &mut Network, jobs: Vec<Job>, done: impl FnOnce(Duration, usize) -> Taken) {
+fn infer(network: &mut Network, jobs: Vec<Job>, done: impl FnOnce(Duration) -> Taken) {
     let started = Instant::now();
     let own = network.metadata().decode_params();
     let volumes: Vec<&Volume> = jobs.iter().map(|job| &job.scene.volume).collect();
     let output = caught(|| Ok(network.infer(&volumes)?));
-    let taken = done(started.elapsed(), jobs.len());
+    let taken = done(started.elapsed());
     for (index, Job { scene, task, span, submitted, .. }) in jobs.into_iter().enumerate() {
         let _entered = span.enter();
         let output = match &output {
@@ -368,18 +369,18 @@ fn infer(network: &mut Network, jobs: Vec<Job>, done: impl FnOnce(Duration, usiz
 }
 
 /// Has a planner without a network look at a scene.
-fn plan(classical: &mut Classical, job: Job, done: impl FnOnce(Duration, usize) -> Taken) {
+fn plan(classical: &mut Classical, job: Job, done: impl FnOnce(Duration) -> Taken) {
     let Job { scene, task, span, submitted, .. } = job;
     let _entered = span.enter();
     match task {
         Task::Grasps(asked, reply) => {
             let started = Instant::now();
             let decoded = caught(|| classical.plan(&scene, &asked, &asked.decode_params(classical.decode_params())));
-            let taken = done(started.elapsed(), 1);
+            let taken = done(started.elapsed());
             answer(reply, submitted, taken, || Ok(found(decoded?, scene.volume, &asked)));
         }
         Task::Maps(_) => {
-            done(Duration::ZERO, 1);
+            done(Duration::ZERO);
             task.fail(EngineError::NoNetwork);
         }
     }

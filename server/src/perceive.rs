@@ -98,7 +98,9 @@ impl Grid {
                 return Err(FieldError::new(format!("views[{index}]"), blind(&eye.vector.into()), reason));
             }
             if self.sights {
-                sights.extend(image.points(&view.camera_from_task));
+                // A planner looks at nothing else, and there may be millions.
+                let inside = |point: &SurfacePoint| point.position.iter().all(|c| (0.0..=self.size).contains(c));
+                sights.extend(image.points(&view.camera_from_task).filter(inside));
             }
         }
         Ok(sights)

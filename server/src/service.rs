@@ -1,17 +1,21 @@
+use std::num::NonZero;
 use std::sync::Arc;
+use std::thread;
 use std::time::Instant;
 
 use grasp::Volume;
 use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::grasp_service_server::GraspService;
 use grasp_proto::{Asked, FieldError, Workspace, check_count, cloud_view, depth_view, pb, resolution};
-use tokio::sync::mpsc;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::time::timeout_at;
 use tokio_stream::StreamExt;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::codegen::BoxStream;
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::call::{Call, Caller, Calls, Origin, Work};
+use crate::deadline::Deadline;
 use crate::engine::{Engine, EngineError};
 use crate::health::draining;
 use crate::models::{Models, check_voxel_size};
@@ -30,6 +34,8 @@ pub(crate) struct Grasps {
     models: Arc<Models>,
     calls: Calls,
     kept: Arc<Kept>,
+    /// As many requests as there are processors convert and fuse at a time: a crowd of them would fill the memory.
+    fusing: Arc<Semaphore>,
 }
 
 /// A request that was taken, or refused without anyone having been told yet.
@@ -51,7 +57,8 @@ impl Begun {
 
 impl Grasps {
     pub fn new(models: Arc<Models>, calls: Calls, kept: Kept) -> Self {
-        Self { models, calls, kept: Arc::new(kept) }
+        let processors = thread::available_parallelism().map_or(1, NonZero::get);
+        Self { models, calls, kept: Arc::new(kept), fusing: Arc::new(Semaphore::new(processors)) }
     }
 
     /// Checks a request and queues its volume. What is wrong with it comes out of [`Begun::finish`], like the answer.
@@ -77,8 +84,10 @@ impl Grasps {
     async fn submit_depth(&self, request: pb::DetectGraspsFromDepthRequest, call: &mut Call) -> Result<Work, Refusal> {
         let pb::DetectGraspsFromDepthRequest { views, workspace, options, .. } = request;
         let (asked, workspace, origin, engine) = self.prepare(views.len(), workspace, options, call)?;
+        let place = self.fusing_place(call).await?;
+        engine.check_place()?;
         let from = Arc::clone(&engine);
-        let fused = blocking(move || {
+        let fused = blocking(place, move || {
             let frame_from_task = &workspace.frame_from_task;
             let views = views.iter().enumerate().map(|(index, view)| depth_view(view, index, frame_from_task));
             let views = views.collect::<Result<Vec<_>, _>>()?;
@@ -91,8 +100,10 @@ impl Grasps {
     async fn submit_cloud(&self, request: pb::DetectGraspsFromCloudRequest, call: &mut Call) -> Result<Work, Refusal> {
         let pb::DetectGraspsFromCloudRequest { views, workspace, options, .. } = request;
         let (asked, workspace, origin, engine) = self.prepare(views.len(), workspace, options, call)?;
+        let place = self.fusing_place(call).await?;
+        engine.check_place()?;
         let from = Arc::clone(&engine);
-        let fused = blocking(move || {
+        let fused = blocking(place, move || {
             let frame_from_task = &workspace.frame_from_task;
             let clouds = views.iter().enumerate().map(|(index, view)| cloud_view(view, index, frame_from_task));
             let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
@@ -129,6 +140,17 @@ impl Grasps {
         Ok((asked, workspace, origin, engine))
     }
 
+    /// Waits for its turn to convert and fuse, but no longer than anybody waits for the reply.
+    async fn fusing_place(&self, call: &Call) -> Result<OwnedSemaphorePermit, Refusal> {
+        let place = Arc::clone(&self.fusing).acquire_owned();
+        let place = match call.deadline {
+            None => place.await,
+            Some(Deadline(deadline)) => timeout_at(deadline.into(), place).await.map_err(|_| EngineError::Expired)?,
+        };
+        // Nobody closes it.
+        place.map_err(|_| EngineError::Gone.into())
+    }
+
     /// Integrates what came into the volume that is kept, and queues that.
     async fn submit_track(
         &self,
@@ -144,9 +166,10 @@ impl Grasps {
         };
         let engine = self.models.select(&asked.model, &asked.version, None)?;
         call.by(&engine);
+        let place = self.fusing_place(call).await?;
         let (from, old) = (Arc::clone(&engine), track.take());
         // It comes back in any case: what is wrong with a view does not cost the volume.
-        let (kept, fused) = blocking(move || Ok(Track::integrate(old, &from, asked, workspace, &views))).await?;
+        let (kept, fused) = blocking(place, move || Ok(Track::integrate(old, &from, asked, workspace, &views))).await?;
         *track = kept;
         let (scene, asked, origin, fusion) = fused?;
         call.submit(&engine, scene, asked, origin, Some(fusion))
@@ -169,7 +192,15 @@ fn fuse(
 }
 
 /// On a thread that may take its time; those that move messages must not.
-async fn blocking<T: Send + 'static>(work: impl FnOnce() -> Result<T, Refusal> + Send + 'static) -> Result<T, Refusal> {
+async fn blocking<T: Send + 'static>(
+    place: OwnedSemaphorePermit,
+    work: impl FnOnce() -> Result<T, Refusal> + Send + 'static,
+) -> Result<T, Refusal> {
+    // The place is given back when the work is done, whether or not anybody still waits for it.
+    let work = move || {
+        let _place = place;
+        work()
+    };
     let done = tokio::task::spawn_blocking(work).await;
     done.unwrap_or_else(|panic| Err(EngineError::Panic(panic.to_string()).into()))
 }
