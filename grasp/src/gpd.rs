@@ -9,7 +9,7 @@ mod cloud;
 mod image;
 mod shaf;
 
-pub use candidates::{Candidate, Params, candidates};
+pub use candidates::{Candidate, Params, by_sample, candidates};
 pub use cloud::{Cloud, NORMALS_RADIUS, VOXEL_SIZE};
 pub use image::{CHANNELS, IMAGE_SIZE, Image};
 pub use shaf::highest_first;

@@ -4,6 +4,7 @@ use std::iter;
 
 use crate::graph::{Builder, Conv};
 use crate::onnx::{AttributeProto, ModelProto, NodeProto, TensorProto};
+use crate::{INPUT, OUTPUTS};
 
 /// The name of the heads' convolution.
 pub(crate) const HEADS: &str = "heads";
@@ -46,7 +47,7 @@ impl Orientation {
 
 /// Declares the network's input and returns it: the volume, `[batch, 1, N, N, N]`.
 pub(crate) fn volume(b: &mut Builder, resolution: usize) -> String {
-    b.input("tsdf", &[1, resolution, resolution, resolution])
+    b.input(INPUT, &[1, resolution, resolution, resolution])
 }
 
 /// Declares the three outputs over `features`, `[batch, channels, N, N, N]`:
@@ -64,7 +65,7 @@ pub(crate) fn heads(b: &mut Builder, features: &str, channels: usize, resolution
         Orientation::Quaternion => normalize(b, &rotation),
         Orientation::Axes => from_axes(b, &rotation),
     };
-    for (name, value, channels) in [("quality", quality, 1), ("rotation", rotation, 4), ("width", width, 1)] {
+    for ((name, channels), value) in OUTPUTS.into_iter().zip([quality, rotation, width]) {
         b.output(name, &value, &[channels, resolution, resolution, resolution]);
     }
 }

@@ -25,8 +25,8 @@ pub use metadata::{Metadata, MetadataError, ValueConvention};
 pub use networks::{Architecture, BuildError, build};
 pub use quantize::{QuantizeError, Range, quantized_activations, with_int8};
 pub use runtime::{
-    Backend, BackendError, Choice, Classifier, LoadError, LoadReason, NameError, Network, Options, Output, Precision,
-    Provider, RuntimeError, RuntimeInfo, init,
+    Backend, BackendError, Choice, Classifier, INPUT, LoadError, LoadReason, NameError, Network, OUTPUTS, Options,
+    Output, Precision, Provider, RuntimeError, RuntimeInfo, batch_sizes, init,
 };
 pub use store::{Entry, EntryError, Scan, Store, StoreError};
 pub use turns::{TurnsError, averaged_over_turns};

@@ -23,15 +23,16 @@ use crate::{Entry, Metadata, MetadataError};
 
 pub use backend::{Backend, BackendError, Choice, NameError, Precision, Provider};
 pub use classifier::Classifier;
+pub use plan::batch_sizes;
 
 use backend::Machine;
 use plan::{Model, Outputs, Plan};
 
 /// The input every network has: `[batch, 1, N, N, N]`.
-const INPUT: &str = "tsdf";
+pub const INPUT: &str = "tsdf";
 
 /// The outputs every network has, with their channels: `[batch, channels, N, N, N]`.
-const OUTPUTS: [(&str, usize); 3] = [("quality", 1), ("rotation", 4), ("width", 1)];
+pub const OUTPUTS: [(&str, usize); 3] = [("quality", 1), ("rotation", 4), ("width", 1)];
 
 /// What was loaded.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -302,7 +303,7 @@ impl Network {
         let original = model.original();
         if backend.provider != Provider::Cpu || original.is_some() {
             let mut reference = Self::with(original.as_ref().unwrap_or(model), Backend::REFERENCE, 1)?;
-            if let Some(what) = agreement::difference(&mut network, &mut reference)? {
+            if let Some(what) = agreement::difference(&mut network, max_batch, &mut reference)? {
                 return Err(LoadReason::Disagrees { backend, what });
             }
         }

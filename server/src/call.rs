@@ -7,13 +7,14 @@ use std::time::{Duration, Instant};
 use grasp_proto::{Asked, FieldError, pb};
 use opentelemetry::Context;
 use tokio::sync::watch;
-use tonic::{Code, Request};
+use tonic::{Code, Request, Status};
 use tracing::field::Empty;
 use tracing::{Span, debug, info, info_span};
 
 use crate::deadline::{self, Deadline};
 use crate::engine::{Answer, Engine, Found, Reply, Tensors};
 use crate::health::State;
+use crate::intake;
 use crate::metrics::Metrics;
 use crate::planner::Scene;
 use crate::recent::{Answered, Outcome, Recent};
@@ -89,6 +90,11 @@ impl Calls {
     /// Whether the server is starting, serving or draining.
     pub fn state(&self) -> watch::Receiver<State> {
         self.state.clone()
+    }
+
+    /// What ends a stream whose messages cannot be read any more.
+    pub fn unreadable(&self, status: Status) -> Status {
+        intake::unreadable_message(status, &self.metrics)
     }
 
     /// Opens a call. What is wrong with its id or its moment is the second of the two.

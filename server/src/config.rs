@@ -82,7 +82,8 @@ struct Flags {
     #[arg(long, env = "GRASPD_MODELS", value_name = "DIR")]
     models: Option<PathBuf>,
 
-    /// Model that answers requests which name none, if their volume fits it. By default the first by name.
+    /// Model that answers requests which name none, if their volume fits it. By default the one that the file `default` in
+    /// the folder of models names, else the first by name.
     #[arg(long, env = "GRASPD_DEFAULT_MODEL", value_name = "NAME")]
     default_model: Option<String>,
 

@@ -1,10 +1,12 @@
 use std::io;
 use std::pin::Pin;
 use std::task::{Context, Poll};
+use std::time::Duration;
 
 use prometheus::{IntCounter, IntGauge};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
+use tokio::time::{Sleep, sleep};
 use tokio_stream::{Stream, StreamExt};
 use tonic::transport::server::{Connected, TcpConnectInfo, TcpIncoming};
 use tracing::warn;
@@ -12,6 +14,8 @@ use tracing::warn;
 /// How many connections may be open, and what is counted of them.
 pub(crate) struct Doors {
     pub most: usize,
+    /// How long one may be open without a word.
+    pub patience: Duration,
     pub open: IntGauge,
     pub refused: IntCounter,
 }
@@ -19,11 +23,13 @@ pub(crate) struct Doors {
 /// The connections of a listener, of which no more than `most` are open at a time: a further one is closed at once, which
 /// clients see as the server being unavailable.
 pub(crate) fn accept(listener: TcpListener, doors: Doors) -> impl Stream<Item = io::Result<Connection>> {
-    let Doors { most, open, refused } = doors;
+    let Doors { most, patience, open, refused } = doors;
     // `Server::tcp_nodelay` does nothing for a listener that was bound before; without TCP_NODELAY a reply of several
     // packets waits 40 ms for the client to acknowledge the first.
     TcpIncoming::from(listener).with_nodelay(Some(true)).filter_map(move |accepted| match accepted {
-        Ok(stream) if open.get() < i64::try_from(most).unwrap_or(i64::MAX) => Some(Ok(Connection::new(stream, &open))),
+        Ok(stream) if open.get() < i64::try_from(most).unwrap_or(i64::MAX) => {
+            Some(Ok(Connection::new(stream, patience, &open)))
+        }
         Ok(_) => {
             refused.inc();
             warn!(open = open.get(), "too many connections, a further one was closed (--max-connections)");
@@ -33,16 +39,22 @@ pub(crate) fn accept(listener: TcpListener, doors: Doors) -> impl Stream<Item = 
     })
 }
 
+/// What every client says first, before HTTP/2 (RFC 9113, section 3.4) and, longer than this, before TLS. From then on
+/// keep-alive pings and TLS's own timeout watch over the connection.
+const PREFACE: usize = 24;
+
 /// A connection, counted as long as it is open.
 pub(crate) struct Connection {
     stream: TcpStream,
+    /// Bytes of the preface that are missing, and how long they may take.
+    greeting: Option<(usize, Pin<Box<Sleep>>)>,
     open: IntGauge,
 }
 
 impl Connection {
-    fn new(stream: TcpStream, open: &IntGauge) -> Self {
+    fn new(stream: TcpStream, patience: Duration, open: &IntGauge) -> Self {
         open.inc();
-        Self { stream, open: open.clone() }
+        Self { stream, greeting: Some((PREFACE, Box::pin(sleep(patience)))), open: open.clone() }
     }
 }
 
@@ -66,7 +78,18 @@ impl AsyncRead for Connection {
         context: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_read(context, buffer)
+        let before = buffer.filled().len();
+        let read = Pin::new(&mut self.stream).poll_read(context, buffer)?;
+        if let Some((missing, patience)) = &mut self.greeting {
+            let come = buffer.filled().len() - before;
+            *missing = missing.saturating_sub(come);
+            if *missing == 0 {
+                self.greeting = None;
+            } else if patience.as_mut().poll(context).is_ready() {
+                return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
+            }
+        }
+        read.map(Ok)
     }
 }
 
@@ -110,7 +133,7 @@ mod tests {
         let address = listener.local_addr().unwrap();
         let open = IntGauge::new("open", "How many are open.").unwrap();
         let refused = IntCounter::new("refused", "How many were closed at once.").unwrap();
-        let doors = Doors { most: 1, open: open.clone(), refused: refused.clone() };
+        let doors = Doors { most: 1, patience: Duration::from_secs(10), open: open.clone(), refused: refused.clone() };
         let mut incoming = pin!(accept(listener, doors));
 
         let _first = TcpStream::connect(address).await.unwrap();

@@ -6,8 +6,8 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use grasp::{DecodeError, Decoded, Dropped, Grasp, Obstacles, Volume, decode};
-use grasp_models::{Backend, Network, Options, Output, RuntimeError};
+use grasp::{DecodeError, DecodeParams, Decoded, Dropped, Grasp, Obstacles, Volume, decode};
+use grasp_models::{Backend, Network, Options, Output, RuntimeError, batch_sizes};
 use grasp_proto::{Asked, Collision};
 use nalgebra::Isometry3;
 use prometheus::{Histogram, IntGauge};
@@ -88,12 +88,8 @@ pub(crate) struct Found {
     pub volume: Volume,
 }
 
-/// A network's maps, as bytes: f32, little-endian.
-pub(crate) struct Tensors {
-    pub quality: Vec<u8>,
-    pub rotation: Vec<u8>,
-    pub width: Vec<u8>,
-}
+/// A network's [`OUTPUTS`](grasp_models::OUTPUTS), as bytes: f32, little-endian.
+pub(crate) struct Tensors(pub [Vec<u8>; 3]);
 
 /// Why a session could not answer.
 #[derive(Clone, Debug, Error)]
@@ -115,8 +111,7 @@ pub(crate) enum EngineError {
 /// What a session's answer comes by. Who drops it has gone, and the volume is not looked at any more.
 pub(crate) struct Reply<T> {
     answer: Receiver<T>,
-    /// None if there is no session to wait for.
-    _place: Option<Place<Job>>,
+    _place: Place<Job>,
 }
 
 type Sender<T> = oneshot::Sender<Result<Answer<T>, EngineError>>;
@@ -183,7 +178,7 @@ impl Engine {
         let mut pace = Duration::ZERO;
         for planner in &mut planners {
             if let Planner::Network(network) = planner {
-                pace = warm_up(network).with_context(|| format!("the model {label} cannot answer"))?;
+                pace = warm_up(network, batching.max).with_context(|| format!("the model {label} cannot answer"))?;
             }
         }
         let Gauges { waiting, batch } = metrics.gauges(&label);
@@ -192,7 +187,8 @@ impl Engine {
         let engine = Self { source, label, backend, queue, pace: Arc::new(Pace::new(pace)) };
         for (worker, planner) in planners.into_iter().enumerate() {
             let (queue, pace) = (Arc::clone(&engine.queue), Arc::clone(&engine.pace));
-            let session = Session { planner, queue, batching, batch: batch.clone(), pace };
+            let own = engine.source.decode_params();
+            let session = Session { planner, own, queue, batching, batch: batch.clone(), pace };
             sessions.spawn(format!("{} {worker}", engine.source.name()), session).with_context(|| {
                 format!("cannot start thread {worker} of {workers} for the model {}; lower --workers", engine.label)
             })?;
@@ -229,25 +225,16 @@ impl Engine {
 
     /// Refuses where there is no place at this moment, so that nothing is prepared in vain.
     pub fn check_place(&self) -> Result<(), Overloaded> {
-        self.queue.is_full().map_or(Ok(()), |waiting| Err(self.overloaded(waiting)))
+        self.queue.is_full().map_or(Ok(()), |full| Err(self.overloaded(&full)))
     }
 
-    fn push(
-        &self,
-        scene: Scene,
-        task: Task,
-        deadline: Option<Deadline>,
-        span: Span,
-    ) -> Result<Option<Place<Job>>, Overloaded> {
-        match self.queue.push(Job { scene, task, deadline, span, submitted: Instant::now() }) {
-            Ok(place) => Ok(Some(place)),
-            // The job has been dropped, which the reply says.
-            Err(Full::Closed) => Ok(None),
-            Err(Full::Waiting(waiting)) => Err(self.overloaded(waiting)),
-        }
+    fn push(&self, scene: Scene, task: Task, deadline: Option<Deadline>, span: Span) -> Result<Place<Job>, Overloaded> {
+        // The queue is closed only when the engine goes.
+        let job = Job { scene, task, deadline, span, submitted: Instant::now() };
+        self.queue.push(job).map_err(|full| self.overloaded(&full))
     }
 
-    fn overloaded(&self, waiting: usize) -> Overloaded {
+    fn overloaded(&self, &Full(waiting): &Full) -> Overloaded {
         Overloaded { model: self.source.name().to_owned(), waiting, retry_after: self.pace.get() }
     }
 }
@@ -289,6 +276,8 @@ impl Sessions {
 /// A thread's own planner and its end of the queue.
 struct Session {
     planner: Planner,
+    /// How its grasps are chosen, unless a request says otherwise.
+    own: DecodeParams,
     queue: Arc<Queue<Job>>,
     batching: Batching,
     batch: Histogram,
@@ -320,18 +309,18 @@ impl Session {
                 continue;
             }
             self.batch.observe(jobs.len() as f64);
-            let Self { planner, queue, pace, .. } = &mut self;
+            let Self { planner, own, queue, pace, .. } = &mut self;
             let scenes = u32::try_from(jobs.len()).unwrap_or(u32::MAX);
             let done = |inference: Duration| {
                 queue.free();
                 Taken { at: now, inference }
             };
             match planner {
-                Planner::Network(network) => infer(network, jobs, done),
+                Planner::Network(network) => infer(network, *own, jobs, done),
                 // One at a time: there is nothing to share.
                 Planner::Classical(classical) => {
                     if let Some(job) = jobs.pop() {
-                        plan(classical, job, done);
+                        plan(classical, *own, job, done);
                     }
                 }
             }
@@ -342,9 +331,8 @@ impl Session {
 }
 
 /// Runs the network over the batch, then makes of each output what is asked for.
-fn infer(network: &mut Network, jobs: Vec<Job>, done: impl FnOnce(Duration) -> Taken) {
+fn infer(network: &mut Network, own: DecodeParams, jobs: Vec<Job>, done: impl FnOnce(Duration) -> Taken) {
     let started = Instant::now();
-    let own = network.metadata().decode_params();
     let volumes: Vec<&Volume> = jobs.iter().map(|job| &job.scene.volume).collect();
     let output = caught(|| Ok(network.infer(&volumes)?));
     let taken = done(started.elapsed());
@@ -369,13 +357,14 @@ fn infer(network: &mut Network, jobs: Vec<Job>, done: impl FnOnce(Duration) -> T
 }
 
 /// Has a planner without a network look at a scene.
-fn plan(classical: &mut Classical, job: Job, done: impl FnOnce(Duration) -> Taken) {
-    let Job { scene, task, span, submitted, .. } = job;
+fn plan(classical: &mut Classical, own: DecodeParams, job: Job, done: impl FnOnce(Duration) -> Taken) {
+    let Job { scene, task, deadline, span, submitted } = job;
     let _entered = span.enter();
     match task {
         Task::Grasps(asked, reply) => {
             let started = Instant::now();
-            let decoded = caught(|| classical.plan(&scene, &asked, &asked.decode_params(classical.decode_params())));
+            let wanted = || !reply.is_closed() && deadline.is_none_or(|Deadline(deadline)| Instant::now() < deadline);
+            let decoded = caught(|| classical.plan(&scene, &asked, &asked.decode_params(own), wanted));
             let taken = done(started.elapsed());
             answer(reply, submitted, taken, || Ok(found(decoded?, scene.volume, &asked)));
         }
@@ -390,7 +379,10 @@ fn plan(classical: &mut Classical, job: Job, done: impl FnOnce(Duration) -> Take
 fn answer<T>(reply: Sender<T>, submitted: Instant, taken: Taken, make: impl FnOnce() -> Result<T, EngineError>) {
     let started = Instant::now();
     let made = caught(make);
-    if let Err(error) = &made {
+    // Nobody waits for what came too late.
+    if let Err(error) = &made
+        && !matches!(error, EngineError::Expired)
+    {
         error!(%error, "the session failed");
     }
     let Taken { at, inference } = taken;
@@ -413,21 +405,26 @@ fn found(decoded: Decoded, volume: Volume, asked: &Asked) -> Found {
 
 fn tensors(output: &Output, index: usize) -> Tensors {
     let maps = output.maps(index);
-    let bytes = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect();
-    Tensors { quality: bytes(maps.quality), rotation: bytes(maps.rotation), width: bytes(maps.width) }
+    Tensors(
+        [maps.quality, maps.rotation, maps.width].map(|map| map.iter().flat_map(|value| value.to_le_bytes()).collect()),
+    )
 }
 
-/// Has a network answer once, and says how long that took: the first inference allocates and tunes, no caller should
-/// wait for that.
-fn warm_up(network: &mut Network) -> Result<Duration, EngineError> {
+/// Has a network answer a batch of each size, and says how long a single volume takes: the first inference of a size
+/// allocates and tunes, no caller should wait for that.
+fn warm_up(network: &mut Network, max_batch: usize) -> Result<Duration, EngineError> {
     let metadata = network.metadata();
     let values = vec![0.5; metadata.resolution.pow(3)];
     let volume = Volume::new(metadata.resolution, metadata.voxel_size, Isometry3::identity(), values);
     let resolution = metadata.resolution;
     let volume = volume.expect("metadata has a positive resolution and voxel size, and 0.5 is a surface");
-    let started = Instant::now();
     caught(|| {
-        network.infer(&[&volume])?.maps(0).check(resolution)?;
+        for size in batch_sizes(max_batch) {
+            let output = network.infer(&vec![&volume; size])?;
+            (0..size).try_for_each(|index| output.maps(index).check(resolution))?;
+        }
+        let started = Instant::now();
+        network.infer(&[&volume])?;
         Ok(started.elapsed())
     })
 }

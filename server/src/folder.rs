@@ -18,6 +18,9 @@ use crate::planner::Source;
 /// In the folder of models.
 const CLASSIFIERS: &str = "classifiers";
 
+/// In it, too: the name of the model that answers requests which name none.
+const DEFAULT: &str = "default";
+
 /// Brings the models of a folder into service, and keeps them as the folder has them.
 pub(crate) struct Folder {
     directory: PathBuf,
@@ -137,13 +140,24 @@ impl Folder {
 
     fn replace(&self, engines: Vec<Arc<Engine>>) {
         let before = self.models.now();
-        self.models.replace(engines, self.default_model.as_deref());
+        let default = self.default_model.clone().or_else(|| default_of(&self.directory));
+        if let Some(name) = default.as_deref().filter(|name| engines.iter().all(|engine| engine.source.name() != *name))
+        {
+            warn!(name, "the default model is not served, the first by name is it instead");
+        }
+        self.models.replace(engines, default.as_deref());
         let now = self.models.now();
         self.metrics.replaced(&before, &now);
         for gone in before.iter().filter(|engine| !now.iter().any(|other| Arc::ptr_eq(engine, other))) {
             info!(model = gone.label, sha256 = gone.source.sha256(), "no longer served");
         }
     }
+}
+
+/// What the folder says of it, if it does.
+fn default_of(directory: &Path) -> Option<String> {
+    let name = fs::read_to_string(directory.join(DEFAULT)).ok()?;
+    Some(name.trim().to_owned()).filter(|name| !name.is_empty())
 }
 
 /// The folder's own folder of GPD's classifiers, which need not be there.
@@ -165,7 +179,7 @@ fn sources(networks: Vec<Entry>, classifiers: Vec<Entry>) -> Vec<Source> {
     networks.chain(classifiers.into_iter().map(Source::Gpd)).chain([Source::Shaf]).collect()
 }
 
-/// What tells a folder's model files from other ones without reading them: name, time of the last change, size.
+/// What tells a folder's files from other ones without reading them: name, time of the last change, size.
 pub(crate) type Stamps = Vec<(PathBuf, Option<SystemTime>, u64)>;
 
 pub(crate) fn stamps(directory: &Path) -> Stamps {
@@ -176,8 +190,9 @@ pub(crate) fn stamps(directory: &Path) -> Stamps {
     };
     let folders = [directory.to_owned(), directory.join(CLASSIFIERS)];
     let files = folders.iter().flat_map(fs::read_dir).flatten().flatten().map(|file| file.path());
-    let models = files.filter(|path| path.extension().is_some_and(|extension| extension == "onnx"));
-    let mut stamps: Vec<_> = models.filter_map(stamp).collect();
+    let counts =
+        |path: &PathBuf| path.extension().is_some_and(|extension| extension == "onnx") || path.ends_with(DEFAULT);
+    let mut stamps: Vec<_> = files.filter(counts).filter_map(stamp).collect();
     stamps.sort();
     stamps
 }

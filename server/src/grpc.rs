@@ -11,7 +11,7 @@ use tonic::body::Body;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Server, ServerTlsConfig};
 use tonic_health::pb::health_server::HealthServer;
-use tower::util::MapRequestLayer;
+use tower::util::{MapRequestLayer, MapResponseLayer};
 
 use crate::auth::Tokens;
 use crate::health::{Health, State, draining};
@@ -19,7 +19,7 @@ use crate::intake::{Intake, Limits};
 use crate::metrics::Metrics;
 use crate::oip::Inference;
 use crate::service::Grasps;
-use crate::{auth, connections, deadline};
+use crate::{auth, connections, deadline, intake};
 
 /// HTTP/2's default of 64 KiB holds a quarter of a 40³ volume: the client would wait for us four times per request.
 const STREAM_WINDOW: u32 = 4 << 20;
@@ -63,16 +63,21 @@ pub(crate) async fn serve(
     let grasps = GraspServiceServer::new(service).max_decoding_message_size(usize::MAX);
     let inference = GrpcInferenceServiceServer::new(inference).max_decoding_message_size(usize::MAX);
     let guard = auth::guard(tokens, Arc::clone(&metrics));
-    let incoming = connections::accept(listener, metrics.connections(connections));
+    let incoming = connections::accept(listener, metrics.connections(connections, limits.stall));
+    let counted = Arc::clone(&metrics);
+    let unreadable = MapResponseLayer::new(move |response| intake::unreadable(response, &counted));
     let intake = MapRequestLayer::new(move |request: http::Request<Body>| {
         request.map(|body| Body::new(Intake::new(body, limits, Arc::clone(&metrics))))
     });
     let mut server = Server::builder();
     if let Some(tls) = tls {
-        server = server.tls_config(tls).context("the certificate, its key or the clients' CA cannot be used")?;
+        server = server
+            .tls_config(tls.timeout(limits.stall))
+            .context("the certificate, its key or the clients' CA cannot be used")?;
     }
     server
         .layer(intake)
+        .layer(unreadable)
         .initial_stream_window_size(STREAM_WINDOW)
         .initial_connection_window_size(CONNECTION_WINDOW)
         .max_frame_size(MAX_FRAME)

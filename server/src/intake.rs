@@ -5,23 +5,27 @@ use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
+use http::HeaderValue;
 use http_body::{Frame, SizeHint};
-use tokio::time::{Instant, Sleep, sleep};
-use tonic::Status;
+use tokio::time::{Instant, Sleep, sleep_until};
 use tonic::body::Body;
 use tonic::codegen::Bytes;
+use tonic::{Code, Status};
 
 use crate::metrics::Metrics;
 
 /// A gRPC message's prefix: whether it is compressed, then its length, four bytes from the highest on.
 const PREFIX: usize = 5;
 
+/// What a message must come by at least, bytes a second: one that is fed a byte at a time never stands still.
+const SLOWEST: f64 = 65_536.0;
+
 /// What is taken of anybody.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Limits {
     /// The largest message, bytes.
     pub message_bytes: usize,
-    /// How long a message that has begun may stand still.
+    /// How long a message that has begun may stand still, and a connection before its first.
     pub stall: Duration,
 }
 
@@ -33,6 +37,8 @@ pub(crate) struct Intake {
     message: Message,
     /// When the message has stood still for too long; not set between messages, where a stream may rest.
     patience: Option<Pin<Box<Sleep>>>,
+    /// When all of the message must be here.
+    latest: Instant,
     state: State,
 }
 
@@ -55,7 +61,15 @@ struct Message {
 
 impl Intake {
     pub fn new(body: Body, limits: Limits, metrics: Arc<Metrics>) -> Self {
-        Self { body, limits, metrics, message: Message::default(), patience: None, state: State::Open }
+        Self {
+            body,
+            limits,
+            metrics,
+            message: Message::default(),
+            patience: None,
+            latest: Instant::now(),
+            state: State::Open,
+        }
     }
 
     fn refuse(&mut self, status: Status) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
@@ -67,9 +81,12 @@ impl Intake {
     fn stalled(&self) -> Status {
         let (missing, stall) = (self.message.missing, self.limits.stall);
         let lacks = if missing == 0 { "its length".to_owned() } else { format!("{missing} bytes") };
-        Status::deadline_exceeded(format!(
-            "the message has stood still for {stall:?}, {lacks} of it are missing; send it anew"
-        ))
+        let why = if Instant::now() < self.latest {
+            format!("has stood still for {stall:?}")
+        } else {
+            format!("comes more slowly than {SLOWEST} bytes a second")
+        };
+        Status::deadline_exceeded(format!("the message {why}, {lacks} of it are missing; send it anew"))
     }
 
     fn too_large(&self, bytes: usize) -> Status {
@@ -78,6 +95,28 @@ impl Intake {
             "the message has {bytes} bytes, at most {longest} are taken (--max-message-bytes)"
         ))
     }
+}
+
+/// Of what is no message tonic says `INTERNAL`, as if it were to blame, and nobody counts it. Its own errors are told from
+/// ours by having no details.
+pub(crate) fn unreadable(mut response: http::Response<Body>, metrics: &Metrics) -> http::Response<Body> {
+    let headers = response.headers_mut();
+    let is_tonics = !headers.contains_key(Status::GRPC_STATUS_DETAILS);
+    let status = headers.get(Status::GRPC_STATUS).and_then(|code| code.to_str().ok()?.parse().ok());
+    if is_tonics && status == Some(Code::Internal as i32) {
+        metrics.ended("", Code::InvalidArgument);
+        headers.insert(Status::GRPC_STATUS, HeaderValue::from(Code::InvalidArgument as i32));
+    }
+    response
+}
+
+/// The same of a message of a stream.
+pub(crate) fn unreadable_message(status: Status, metrics: &Metrics) -> Status {
+    if status.code() != Code::Internal {
+        return status;
+    }
+    metrics.ended("", Code::InvalidArgument);
+    Status::invalid_argument(status.message())
 }
 
 /// A message that is longer than it may be.
@@ -154,10 +193,15 @@ impl http_body::Body for Intake {
             this.state = State::Refusing(status);
             return Poll::Ready(Some(Ok(Frame::data(data.slice(..begins)))));
         }
+        let until = Instant::now() + this.limits.stall;
         match &mut this.patience {
             patience if !this.message.has_begun() => *patience = None,
-            Some(patience) => patience.as_mut().reset(Instant::now() + this.limits.stall),
-            patience => *patience = Some(Box::pin(sleep(this.limits.stall))),
+            Some(patience) => patience.as_mut().reset(until.min(this.latest)),
+            patience => {
+                this.latest =
+                    until + this.limits.stall + Duration::from_secs_f64(this.message.missing as f64 / SLOWEST);
+                *patience = Some(Box::pin(sleep_until(until)));
+            }
         }
         Poll::Ready(frame)
     }

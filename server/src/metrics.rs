@@ -1,4 +1,5 @@
 use std::sync::Arc;
+use std::time::Duration;
 
 use grasp_models::Backend;
 #[cfg(target_os = "linux")]
@@ -175,9 +176,9 @@ impl Metrics {
     }
 
     /// Of connections, of which so many may be open.
-    pub fn connections(&self, most: usize) -> Doors {
+    pub fn connections(&self, most: usize, patience: Duration) -> Doors {
         self.connections_limit.set(i64::try_from(most).unwrap_or(i64::MAX));
-        Doors { most, open: self.connections.clone(), refused: self.connections_refused.clone() }
+        Doors { most, patience, open: self.connections.clone(), refused: self.connections_refused.clone() }
     }
 
     /// How many volumes are kept from one view to the next.

@@ -4,6 +4,7 @@ use grasp::Volume;
 use grasp_proto::{FieldError, on_a_line, pb};
 
 use crate::engine::Engine;
+use crate::planner::Classical;
 use crate::refusal::Refusal;
 
 /// The models that are served now.
@@ -35,11 +36,12 @@ impl Models {
         let served = self.now();
         let fits = |engine: &Arc<Engine>| match (engine.source.network(), resolution) {
             (Some(network), Some(resolution)) => network.metadata.resolution == resolution,
-            _ => true,
+            (None, Some(resolution)) => resolution <= Classical::MAX_RESOLUTION,
+            (_, None) => true,
         };
         let taken = |engine: &Engine| match engine.source.network() {
             Some(network) => format!("{} ({})", network.metadata.resolution, engine.label),
-            None => format!("any ({})", engine.label),
+            None => format!("at most {} ({})", Classical::MAX_RESOLUTION, engine.label),
         };
         let wrong = |taken: &str| {
             let needed = format_args!("the models that could answer take {taken}");

@@ -1,6 +1,7 @@
 use std::sync::Arc;
 
 use grasp::Volume;
+use grasp_models::{INPUT, OUTPUTS};
 use grasp_proto::oip::grpc_inference_service_server::GrpcInferenceService;
 use grasp_proto::oip::model_infer_request::InferInputTensor;
 use grasp_proto::oip::model_infer_response::InferOutputTensor;
@@ -17,12 +18,6 @@ use crate::health::State;
 use crate::models::Models;
 use crate::refusal::Refusal;
 use crate::timings::Timings;
-
-/// What a network reads.
-const INPUT: &str = "tsdf";
-
-/// Its outputs with their channels.
-const OUTPUTS: [(&str, i64); 3] = [("quality", 1), ("rotation", 4), ("width", 1)];
 
 const FP32: &str = "FP32";
 
@@ -156,16 +151,12 @@ fn response(
     let n = edge(engine);
     let mut outputs = Vec::new();
     let mut raw_output_contents = Vec::new();
-    for (name, channels) in OUTPUTS {
+    for (index, (name, channels)) in OUTPUTS.into_iter().enumerate() {
         if !request.outputs.is_empty() && !request.outputs.iter().any(|output| output.name == name) {
             continue;
         }
-        let parts = maps.iter().map(|tensors| match name {
-            "quality" => &*tensors.quality,
-            "rotation" => &tensors.rotation,
-            _ => &tensors.width,
-        });
-        let shape = vec![maps.len() as i64, channels, n, n, n];
+        let parts = maps.iter().map(|Tensors(outputs)| &*outputs[index]);
+        let shape = vec![maps.len() as i64, channels as i64, n, n, n];
         outputs.push(InferOutputTensor {
             name: name.to_owned(),
             datatype: FP32.to_owned(),
@@ -230,9 +221,9 @@ impl GrpcInferenceService for Inference {
     ) -> Result<Response<oip::ModelMetadataResponse>, Status> {
         let oip::ModelMetadataRequest { name, version } = request.into_inner();
         let engine = self.network(&name, &version).map_err(|refusal| refusal.status(""))?;
-        let tensor = |name: &str, channels| {
+        let tensor = |name: &str, channels: usize| {
             let edge = edge(&engine);
-            let shape = vec![-1, channels, edge, edge, edge];
+            let shape = vec![-1, channels as i64, edge, edge, edge];
             TensorMetadata { name: name.to_owned(), datatype: FP32.to_owned(), shape }
         };
         let served = self.models.now();
@@ -269,9 +260,13 @@ impl GrpcInferenceService for Inference {
         let oip::ModelConfigRequest { name, version } = request.into_inner();
         let engine = self.network(&name, &version).map_err(|refusal| refusal.status(""))?;
         let edge = edge(&engine);
-        let (data_type, dims) = (oip::DataType::TypeFp32.into(), |channels| vec![channels, edge, edge, edge]);
-        let output =
-            |(name, channels): (&str, i64)| oip::ModelOutput { name: name.to_owned(), data_type, dims: dims(channels) };
+        let (data_type, dims) =
+            (oip::DataType::TypeFp32.into(), |channels: usize| vec![channels as i64, edge, edge, edge]);
+        let output = |(name, channels): (&str, usize)| oip::ModelOutput {
+            name: name.to_owned(),
+            data_type,
+            dims: dims(channels),
+        };
         Ok(Response::new(oip::ModelConfigResponse {
             config: Some(oip::ModelConfig {
                 name: engine.source.name().to_owned(),

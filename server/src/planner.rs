@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::Context;
-use grasp::gpd::{Cloud, Image, Params, candidates, is_on_an_object, ranked, scored};
+use grasp::gpd::{Cloud, Image, Params, by_sample, is_on_an_object, ranked, scored};
 use grasp::{DecodeParams, Decoded, Fusion, Grasp, Hand, SurfacePoint, Volume, select};
 use grasp_models::{Backend, Classifier, Entry, Network, Options};
 use grasp_proto::Asked;
@@ -24,6 +24,9 @@ const GPD_THRESHOLD: f32 = 0.5;
 
 /// Its quality is a rank, and says nothing.
 const SHAF_THRESHOLD: f32 = 1e-6;
+
+/// Candidates that are scored before it is asked again whether anybody waits for them.
+const SCORED_AT_ONCE: usize = 64;
 
 /// What can be asked for by name, and what it is made from.
 #[derive(Clone, Debug, PartialEq)]
@@ -114,16 +117,13 @@ impl Source {
     pub fn decode_params(&self) -> DecodeParams {
         match self {
             Self::Network(entry) => entry.metadata.decode_params(),
-            Self::Gpd(_) => Classical::above(GPD_THRESHOLD),
-            Self::Shaf => Classical::above(SHAF_THRESHOLD),
+            Self::Gpd(_) => DecodeParams { threshold: GPD_THRESHOLD, ..DecodeParams::default() },
+            Self::Shaf => DecodeParams { threshold: SHAF_THRESHOLD, ..DecodeParams::default() },
         }
     }
 
     /// Loads as many as there are sessions.
     pub fn load(&self, options: &Options, count: usize) -> anyhow::Result<(Vec<Planner>, Backend)> {
-        let classical = |load: &dyn Fn() -> anyhow::Result<Classical>| {
-            (0..count).map(|_| load().map(Planner::Classical)).collect::<anyhow::Result<Vec<_>>>()
-        };
         Ok(match self {
             Self::Network(entry) => {
                 let networks = Network::load_several(entry, options, count)?;
@@ -131,28 +131,26 @@ impl Source {
                 (networks.into_iter().map(Planner::Network).collect(), backend)
             }
             Self::Gpd(entry) => {
-                (classical(&|| Ok(Classical::Gpd(Classifier::load(&entry.path, options)?)))?, Backend::REFERENCE)
+                let classifiers = Classifier::load_several(entry, options, count)?.into_iter().map(Classical::Gpd);
+                (classifiers.map(Planner::Classical).collect(), Backend::REFERENCE)
             }
-            Self::Shaf => (classical(&|| Ok(Classical::Shaf))?, Backend::REFERENCE),
+            Self::Shaf => ((0..count).map(|_| Planner::Classical(Classical::Shaf)).collect(), Backend::REFERENCE),
         })
     }
 }
 
 impl Classical {
-    /// How its grasps are chosen, unless a request says otherwise.
-    pub fn decode_params(&self) -> DecodeParams {
-        match self {
-            Self::Gpd(_) => Self::above(GPD_THRESHOLD),
-            Self::Shaf => Self::above(SHAF_THRESHOLD),
-        }
-    }
+    /// The finest volume that is looked at, voxels along an edge: in a cube of 0.3 m, as fine as the cloud is thinned to.
+    pub const MAX_RESOLUTION: usize = 100;
 
-    fn above(threshold: f32) -> DecodeParams {
-        DecodeParams { threshold, ..DecodeParams::default() }
-    }
-
-    /// Looks for places where the hand fits, the same ones whenever it is asked again.
-    pub fn plan(&mut self, scene: &Scene, asked: &Asked, params: &DecodeParams) -> Result<Decoded, EngineError> {
+    /// Looks for places where the hand fits, the same ones whenever it is asked again; for as long as it is `wanted`.
+    pub fn plan(
+        &mut self,
+        scene: &Scene,
+        asked: &Asked,
+        params: &DecodeParams,
+        wanted: impl Fn() -> bool,
+    ) -> Result<Decoded, EngineError> {
         let volume = &scene.volume;
         let size = volume.resolution() as f64 * volume.voxel_size();
         let table = asked.table.unwrap_or(0.0);
@@ -165,12 +163,25 @@ impl Classical {
         let hand = asked.hand.unwrap_or(Hand::GPD);
         let aperture = PLAY..=(2.0 * hand.half_opening() - PLAY);
         let params_of_hands = Params { hand, aperture, ..Params::above(table + ABOVE_TABLE) };
-        let found = candidates(&cloud, &params_of_hands, &mut ChaCha8Rng::seed_from_u64(0));
+        let mut found = Vec::new();
+        for of_sample in by_sample(&cloud, &params_of_hands, &mut ChaCha8Rng::seed_from_u64(0)) {
+            if !wanted() {
+                return Err(EngineError::Expired);
+            }
+            found.extend(of_sample);
+        }
         let grasps = match self {
             Self::Shaf => ranked(found),
             Self::Gpd(classifier) => {
-                let images: Vec<Image> = found.iter().map(|candidate| Image::of(&cloud, candidate)).collect();
-                scored(&found, &classifier.score(&images)?)
+                let mut scores = Vec::with_capacity(found.len());
+                for some in found.chunks(SCORED_AT_ONCE) {
+                    if !wanted() {
+                        return Err(EngineError::Expired);
+                    }
+                    let images: Vec<Image> = some.iter().map(|candidate| Image::of(&cloud, candidate)).collect();
+                    scores.extend(classifier.score(&images)?);
+                }
+                scored(&found, &scores)
             }
         };
         let in_frame: Vec<Grasp> =

@@ -2,6 +2,7 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use grasp_models::batch_sizes;
 use prometheus::IntGauge;
 
 /// What waits for a model's sessions, first come, first served.
@@ -43,14 +44,17 @@ pub(crate) struct Batching {
     pub delay: Duration,
 }
 
-/// Why a job was not taken.
-#[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Full {
-    /// So many wait already.
-    Waiting(usize),
-    /// There is no session any more.
-    Closed,
+impl Batching {
+    /// How many of those that wait are taken: the largest of the [sizes](batch_sizes) that networks are made ready for, so
+    /// that nothing is computed only to fill a batch up, and no batch is the first of its size.
+    fn fitting(self, waiting: usize) -> usize {
+        batch_sizes(self.max).take_while(|&size| size <= waiting).last().unwrap_or(0)
+    }
 }
+
+/// So many jobs wait that no more are taken.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Full(pub usize);
 
 impl<T> Queue<T> {
     /// A queue of so many sessions, in which `capacity` jobs may wait. They are counted in `gauge`, beside those of
@@ -60,15 +64,12 @@ impl<T> Queue<T> {
         Self { state: Mutex::new(state), changed: Condvar::new(), capacity, gauge }
     }
 
-    /// Appends a job, or refuses it at once.
+    /// Appends a job, or refuses it at once. Not for a queue that is closed.
     pub fn push(self: &Arc<Self>, job: T) -> Result<Place<T>, Full> {
         let mut state = self.lock();
-        if state.closed {
-            return Err(Full::Closed);
-        }
         // A free session may not have woken up yet for a job that waits.
         if state.waiting.len() >= self.capacity + state.free {
-            return Err(Full::Waiting(self.capacity));
+            return Err(Full(self.capacity));
         }
         let number = state.next;
         state.next += 1;
@@ -85,9 +86,9 @@ impl<T> Queue<T> {
     }
 
     /// How many wait, if no more can: what [`push`](Self::push) would say at this moment.
-    pub fn is_full(&self) -> Option<usize> {
+    pub fn is_full(&self) -> Option<Full> {
         let state = self.lock();
-        (!state.closed && state.waiting.len() >= self.capacity + state.free).then_some(self.capacity)
+        (state.waiting.len() >= self.capacity + state.free).then_some(Full(self.capacity))
     }
 
     /// Waits for jobs and takes them, the oldest first; none when the queue is closed and empty. The session is busy then,
@@ -100,7 +101,7 @@ impl<T> Queue<T> {
             state = self.gather(state, batching);
         }
         state.free -= 1;
-        let count = state.waiting.len().min(batching.max);
+        let count = batching.fitting(state.waiting.len());
         let jobs: Vec<T> = state.waiting.drain(..count).map(|waiting| waiting.job).collect();
         self.gauge.sub(count as i64);
         let (left, ended) = (!state.waiting.is_empty(), state.closed && jobs.is_empty());
@@ -175,13 +176,21 @@ mod tests {
     fn jobs_come_out_in_their_order_and_no_more_than_fit_wait() {
         let (queue, gauge) = queue(0, 3);
         let _places: Vec<_> = (0..3).map(|job| queue.push(job).ok().unwrap()).collect();
-        assert_eq!(queue.push(3).err(), Some(Full::Waiting(3)));
+        assert_eq!(queue.push(3).err(), Some(Full(3)));
         assert_eq!(gauge.get(), 3);
         queue.free();
         assert_eq!(queue.take(ONE), Some(vec![0]));
         queue.free();
         assert_eq!(queue.take(Batching { max: 8, ..ONE }), Some(vec![1, 2]));
         assert_eq!(gauge.get(), 0);
+    }
+
+    #[test]
+    fn what_does_not_fill_a_batch_is_left_for_the_next() {
+        let (queue, _) = queue(2, 16);
+        let _places: Vec<_> = (0..17).map(|job| queue.push(job).ok().unwrap()).collect();
+        let take = || queue.take(Batching { max: 6, ..ONE }).inspect(|_| queue.free()).map(|jobs| jobs.len());
+        assert_eq!([take(), take(), take(), take()], [6, 6, 4, 1].map(Some));
     }
 
     #[test]
@@ -202,7 +211,6 @@ mod tests {
         let (queue, _) = queue(1, 2);
         let _place = queue.push(1).ok().unwrap();
         queue.close();
-        assert_eq!(queue.push(2).err(), Some(Full::Closed));
         assert_eq!(queue.take(ONE), Some(vec![1]));
         queue.free();
         assert_eq!(queue.take(ONE), None);
@@ -212,9 +220,9 @@ mod tests {
     fn a_free_session_is_a_place_more_until_it_takes_something() {
         let (queue, _) = queue(1, 1);
         let mut places = vec![queue.push(1).ok().unwrap(), queue.push(2).ok().unwrap()];
-        assert_eq!(queue.push(3).err(), Some(Full::Waiting(1)));
+        assert_eq!(queue.push(3).err(), Some(Full(1)));
         assert_eq!(queue.take(ONE), Some(vec![1]));
-        assert_eq!(queue.push(3).err(), Some(Full::Waiting(1)), "it is busy, and one waits");
+        assert_eq!(queue.push(3).err(), Some(Full(1)), "it is busy, and one waits");
         queue.free();
         places.push(queue.push(3).ok().unwrap());
         assert_eq!(queue.take(ONE), Some(vec![2]));

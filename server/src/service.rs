@@ -28,6 +28,10 @@ use crate::track::{Kept, Track};
 /// and few enough that a stream alone never fills a queue.
 const READ_AHEAD: usize = 1;
 
+/// Bytes of a volume that are converted where they arrive, in tens of microseconds: handing them to another thread would
+/// take as long.
+const AT_ONCE: usize = 1 << 20;
+
 /// grasp.v1.GraspService.
 #[derive(Clone)]
 pub(crate) struct Grasps {
@@ -62,13 +66,16 @@ impl Grasps {
     }
 
     /// Checks a request and queues its volume. What is wrong with it comes out of [`Begun::finish`], like the answer.
-    fn begin(&self, mut request: pb::DetectGraspsRequest, caller: Caller) -> Begun {
+    async fn begin(&self, mut request: pb::DetectGraspsRequest, caller: Caller) -> Begun {
         let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), caller);
-        let work = checked.and_then(|()| self.submit(request, &mut call));
+        let work = match checked {
+            Ok(()) => self.submit(request, &mut call).await,
+            Err(refusal) => Err(refusal),
+        };
         Begun { call, work }
     }
 
-    fn submit(&self, request: pb::DetectGraspsRequest, call: &mut Call) -> Result<Work, Refusal> {
+    async fn submit(&self, request: pb::DetectGraspsRequest, call: &mut Call) -> Result<Work, Refusal> {
         let pb::DetectGraspsRequest { volume, options, .. } = request;
         let mut volume = volume.ok_or_else(|| FieldError::new("volume", "absent", "must be given"))?;
         let origin = Origin::checked("volume.frame_id", std::mem::take(&mut volume.frame_id), volume.stamp)?;
@@ -76,7 +83,13 @@ impl Grasps {
         // The model before the data: nothing is converted that no model takes.
         let engine = self.models.select(&asked.model, &asked.version, Some(resolution(&volume)?))?;
         call.by(&engine);
-        let checked = Volume::try_from(&volume)?;
+        let checked = if volume.data.len() <= AT_ONCE {
+            Volume::try_from(&volume)?
+        } else {
+            let place = self.fusing_place(call).await?;
+            engine.check_place()?;
+            blocking(place, move || Ok(Volume::try_from(&volume)?)).await?
+        };
         check_voxel_size(&checked, &engine)?;
         call.submit(&engine, Scene { volume: checked, sights: None }, asked, origin, None)
     }
@@ -212,7 +225,7 @@ impl GraspService for Grasps {
         request: Request<pb::DetectGraspsRequest>,
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
         let caller = Caller::of(&request);
-        self.begin(request.into_inner(), caller).respond().await
+        self.begin(request.into_inner(), caller).await.respond().await
     }
 
     async fn detect_grasps_from_depth(
@@ -262,10 +275,10 @@ impl GraspService for Grasps {
                     () = draining(service.calls.state()) => return place.send(Err(service.refuse(Refusal::Draining, caller))),
                 };
                 match message {
-                    Ok(Some(request)) => place.send(Ok(service.begin(request, caller.clone()))),
+                    Ok(Some(request)) => place.send(Ok(service.begin(request, caller.clone()).await)),
                     Ok(None) => return,
                     // Too large, or no message at all: HTTP/2's framing is lost, so the stream ends with this status.
-                    Err(status) => return place.send(Err(status)),
+                    Err(status) => return place.send(Err(service.calls.unreadable(status))),
                 }
             }
         });
@@ -313,7 +326,7 @@ impl GraspService for Grasps {
                 let mut request = match message {
                     Ok(Some(request)) => request,
                     Ok(None) => return,
-                    Err(status) => break status,
+                    Err(status) => break service.calls.unreadable(status),
                 };
                 let (mut call, checked) = service.calls.open(std::mem::take(&mut request.request_id), caller.clone());
                 let answer = async {

@@ -1,5 +1,7 @@
 //! Depth images and point clouds are answered as the volume that they make; what is wrong with them is told.
 
+use std::time::Duration;
+
 use grasp::{DepthImage, Fusion, RESOLUTION as PAPERS, Volume, WORKSPACE_SIZE};
 use grasp_client::{
     Asked, Client, CloudView, Depth, DepthView, Detection, Error, Extrinsics, Options, Proposal, Workspace,
@@ -204,6 +206,40 @@ async fn planners_without_a_network_answer_by_their_names() {
     let narrow = client.detect_from_depth(&views, &Workspace::default(), asking(asked)).await.unwrap();
     let widest = narrow.grasps.iter().map(|grasp| grasp.width).fold(0.0, f64::max);
     assert!(widest <= 0.02, "a hand that opens to 3 cm takes nothing of {widest} m");
+}
+
+#[tokio::test]
+async fn a_planner_stops_when_nobody_waits() {
+    let server = Server::run(&[TestModel::new("mirror")], &["--workers", "1"]);
+    let client = server.client().await;
+    let checkered = |resolution: usize| {
+        let value = |i: usize| {
+            let [x, y, z] = [i / (resolution * resolution), i / resolution % resolution, i % resolution];
+            if (x + y + z) % 2 == 0 { 0.25 } else { 0.75 }
+        };
+        let voxel_size = WORKSPACE_SIZE / resolution as f64;
+        let values = (0..resolution.pow(3)).map(value).collect();
+        Volume::new(resolution, voxel_size, Isometry3::identity(), values).unwrap()
+    };
+    // A hand that reaches everywhere has everything in its way.
+    let large =
+        pb::Gripper { max_opening: 0.5, finger_depth: 0.5, finger_width: 0.01, finger_breadth: 0.5, palm: None };
+    let shaf = |gripper| Asked { model: "shaf".to_owned(), gripper, ..Asked::default() };
+    let hurried = Options { timeout: Some(Duration::from_millis(500)), ..asking(shaf(Some(large))) };
+    let late = client.detect(&checkered(100), hurried).await;
+    // The client's own timer may be faster, which calls it cancelled.
+    let late = late.err().and_then(|error| error.code());
+    assert!(matches!(late, Some(Code::DeadlineExceeded | Code::Cancelled)), "{late:?}");
+    // What nobody waits for would take minutes, and there is one session.
+    let volume = fused(&[camera(30.0, -90.0), camera(40.0, 90.0)], PAPERS, Isometry3::identity());
+    let patient = Options { timeout: Some(Duration::from_secs(20)), ..asking(shaf(None)) };
+    assert!(!client.detect(&volume, patient).await.unwrap().grasps.is_empty());
+
+    let finer = client.detect(&checkered(101), asking(shaf(None))).await.unwrap_err().to_string();
+    assert!(
+        finer.contains("volume.resolution is 101, the models that could answer take at most 100 (shaf 1)"),
+        "{finer}"
+    );
 }
 
 async fn asked_with(client: &Client, asked: Asked) -> Detection {

@@ -11,6 +11,7 @@ use grasp_tests::{RESOLUTION, Server, TestModel, blobs, graspd, resident_bytes};
 use h2::client::SendRequest;
 use nalgebra::Isometry3;
 use prost::Message;
+use tokio::io::AsyncWriteExt;
 use tokio::net::TcpStream;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
@@ -142,6 +143,12 @@ async fn half_a_message_is_waited_for_no_longer_than_it_may_stand_still() {
     }
     assert_eq!(server.metric("graspd_requests_total{code=\"DEADLINE_EXCEEDED\",model=\"\"}"), 4.0);
 
+    // Fed a byte at a time it never stands still, and is refused all the same.
+    let single: Vec<&[u8]> = bytes.chunks(1).collect();
+    let (code, message) = call(&mut h2, &single, Duration::from_millis(10), true).await;
+    assert_eq!(code, Code::DeadlineExceeded);
+    assert!(message.starts_with("the message comes more slowly than 65536 bytes a second, "), "{message}");
+
     // Nor does it hold up the end.
     let stuck = tokio::spawn(async move { call(&mut h2, &[&bytes[..1000]], Duration::ZERO, false).await });
     tokio::task::yield_now().await;
@@ -149,6 +156,36 @@ async fn half_a_message_is_waited_for_no_longer_than_it_may_stand_still() {
     assert_eq!(tokio::task::spawn_blocking(move || server.wait().unwrap().code()).await.unwrap(), Some(0));
     // The connection may have been closed before the call was begun.
     drop(stuck);
+}
+
+#[tokio::test]
+async fn who_connects_and_says_nothing_is_not_waited_for() {
+    let server = Server::run(&[TestModel::new("mirror")], &["--stall-timeout", "0.3"]);
+    let mut silent =
+        [TcpStream::connect(server.grpc()).await.unwrap(), TcpStream::connect(server.grpc()).await.unwrap()];
+    silent[1].write_all(b"PRI * HTTP/2.0").await.unwrap();
+    server.wait_for("graspd_connections", 2.0).await;
+    server.wait_for("graspd_connections", 0.0).await;
+    // Who has greeted may rest.
+    let client = server.client().await;
+    client.detect(&volume(), Options::default()).await.unwrap();
+    tokio::time::sleep(Duration::from_millis(600)).await;
+    assert_eq!(server.metric("graspd_connections"), 1.0);
+    client.detect(&volume(), Options::default()).await.unwrap();
+}
+
+#[tokio::test]
+async fn what_is_no_message_is_the_callers_fault_and_counted() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let mut h2 = connect(&server).await;
+    // The fifth field of wire type 7, which there is none of.
+    let (code, message) = call(&mut h2, &[&[0, 0, 0, 0, 1, 0x2f]], Duration::ZERO, true).await;
+    assert_eq!(code, Code::InvalidArgument, "{message}");
+    assert_eq!(server.metric("graspd_requests_total{code=\"INVALID_ARGUMENT\",model=\"\"}"), 1.0);
+    let (code, message) = call(&mut h2, &[&[]], Duration::ZERO, true).await;
+    assert_eq!(code, Code::InvalidArgument, "{message}");
+    assert_eq!(server.metric("graspd_requests_total{code=\"INVALID_ARGUMENT\",model=\"\"}"), 2.0);
+    assert_eq!(server.metric("graspd_requests_total{code=\"INTERNAL\",model=\"\"}"), 0.0);
 }
 
 #[tokio::test]
@@ -209,7 +246,10 @@ async fn call(h2: &mut SendRequest<Bytes>, pieces: &[&[u8]], pause: Duration, en
     let request = request.header("content-type", "application/grpc").header("te", "trailers").body(()).unwrap();
     let (response, mut body) = h2.clone().ready().await.unwrap().send_request(request, false).unwrap();
     for (index, piece) in pieces.iter().enumerate() {
-        body.send_data(Bytes::copy_from_slice(piece), ends && index + 1 == pieces.len()).unwrap();
+        // The server may have ended it.
+        if body.send_data(Bytes::copy_from_slice(piece), ends && index + 1 == pieces.len()).is_err() {
+            break;
+        }
         tokio::time::sleep(pause).await;
     }
     let response = response.await.unwrap();

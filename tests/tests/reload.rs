@@ -63,6 +63,19 @@ async fn a_folder_that_is_watched_needs_no_signal() {
 }
 
 #[tokio::test]
+async fn a_folder_names_its_default() {
+    let server = Server::run(&[TestModel::new("mirror"), TestModel::new("second")], WATCH);
+    let client = server.client().await;
+    assert_eq!(served(&client).await, ["mirror 1", "second 1"], "by name, where nothing is said");
+    fs::write(server.models().join("default"), "second\n").unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
+    assert_eq!(served(&client).await, ["second 1", "mirror 1"]);
+    fs::write(server.models().join("default"), "missing").unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 2.0).await;
+    assert_eq!(served(&client).await, ["mirror 1", "second 1"], "of what is there");
+}
+
+#[tokio::test]
 async fn what_cannot_be_served_changes_nothing_and_is_told() {
     let server = Server::run(&[TestModel::new("mirror")], NO_WATCH);
     let client = server.client().await;

@@ -65,9 +65,15 @@ pub struct Candidate {
 /// are free, pushed as far as it goes. The same cloud and state of `rng` give the same candidates.
 #[must_use]
 pub fn candidates(cloud: &Cloud, params: &Params, rng: &mut impl Rng) -> Vec<Candidate> {
+    by_sample(cloud, params, rng).flatten().collect()
+}
+
+/// The same, fitted as they are asked for: those of one sample after the other. It takes long where much was seen and the
+/// hand is large, and who waits for it may go.
+pub fn by_sample(cloud: &Cloud, params: &Params, rng: &mut impl Rng) -> impl Iterator<Item = Vec<Candidate>> {
     let points = cloud.points();
     let samples = index::sample(rng, points.len(), params.samples.min(points.len()));
-    samples.iter().flat_map(|sample| fit_at(cloud, params, &points[sample])).collect()
+    samples.into_iter().map(|sample| fit_at(cloud, params, &points[sample]))
 }
 
 /// The candidates at one sample.

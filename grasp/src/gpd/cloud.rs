@@ -10,7 +10,12 @@ pub const VOXEL_SIZE: f64 = 0.003;
 /// Radius of the neighbourhood that a normal is taken from, metres (GPD's code: `normals_radius`).
 pub const NORMALS_RADIUS: f64 = 0.03;
 
-/// A point cloud with one point a voxel of [`VOXEL_SIZE`], and normals that look at the camera. Task frame, metres.
+/// The most points that are kept. What lies on a table has a few thousand; noise, or a checkerboard, would have a
+/// hundred times as many, each with a neighbourhood of thousands.
+const MAX_POINTS: usize = 20_000;
+
+/// A point cloud with one point a voxel of [`VOXEL_SIZE`], or as much larger ones as it takes to have no more than
+/// 20,000, and normals that look at the camera. Task frame, metres.
 #[derive(Clone, Debug)]
 pub struct Cloud {
     points: Vec<SurfacePoint>,
@@ -27,19 +32,18 @@ impl Cloud {
     /// The normals of `points` need only point to the side that was seen, such as [towards the
     /// camera](crate::DepthImage::points). The order of the points does not matter, but for rounding.
     pub fn new(points: impl IntoIterator<Item = SurfacePoint>) -> Self {
-        // In the order of the voxels, so that the same points give the same cloud.
-        let mut voxels: BTreeMap<[i64; 3], (Vector3<f64>, Vector3<f64>, f64)> = BTreeMap::new();
-        for SurfacePoint { position, normal } in points {
-            let (sum, side, count) = voxels.entry(cell_of(&position, VOXEL_SIZE)).or_default();
-            *sum += position.coords;
-            *side += normal;
-            *count += 1.0;
+        let one = |SurfacePoint { position, normal }| Sum { positions: position.coords, normals: normal, count: 1.0 };
+        let mut edge = VOXEL_SIZE;
+        let mut voxels = thinned(points.into_iter().map(one), edge);
+        while voxels.len() > MAX_POINTS {
+            edge *= 2.0;
+            voxels = thinned(voxels.into_values(), edge);
         }
         let seen: Vec<SurfacePoint> = voxels
             .into_values()
-            .map(|(sum, side, count)| SurfacePoint {
-                position: Point3::from(sum / count),
-                normal: side.try_normalize(1e-12).unwrap_or(Vector3::z()),
+            .map(|sum| SurfacePoint {
+                position: sum.mean(),
+                normal: sum.normals.try_normalize(1e-12).unwrap_or(Vector3::z()),
             })
             .collect();
         let mut cells: HashMap<[i64; 3], Vec<usize>> = HashMap::new();
@@ -64,12 +68,18 @@ impl Cloud {
     pub fn within(&self, centre: Point3<f64>, radius: f64) -> impl Iterator<Item = &SurfacePoint> {
         let lower = cell_of(&(centre - Vector3::repeat(radius)), CELL);
         let upper = cell_of(&(centre + Vector3::repeat(radius)), CELL);
+        let wanted: f64 = lower.iter().zip(upper).map(|(&lower, upper)| (upper - lower + 1) as f64).product();
+        // A large hand reaches over more cells than there are points.
+        let all = wanted > self.points.len() as f64;
         let cells = (lower[0]..=upper[0])
             .flat_map(move |x| (lower[1]..=upper[1]).flat_map(move |y| (lower[2]..=upper[2]).map(move |z| [x, y, z])));
+        let cells = cells.take(if all { 0 } else { usize::MAX });
+        let points = self.points.get(if all { 0 } else { self.points.len() }..).unwrap_or_default();
         cells
             .filter_map(|cell| self.cells.get(&cell))
             .flatten()
             .map(|&index| &self.points[index])
+            .chain(points)
             .filter(move |point| (point.position - centre).norm_squared() <= radius * radius)
     }
 
@@ -89,6 +99,32 @@ impl Cloud {
         let normal: Vector3<f64> = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into();
         if normal.dot(&point.normal) < 0.0 { -normal } else { normal }
     }
+}
+
+/// What lies in a voxel.
+#[derive(Default)]
+struct Sum {
+    positions: Vector3<f64>,
+    normals: Vector3<f64>,
+    count: f64,
+}
+
+impl Sum {
+    fn mean(&self) -> Point3<f64> {
+        Point3::from(self.positions / self.count)
+    }
+}
+
+/// By voxel, in their order, so that the same points give the same cloud.
+fn thinned(points: impl Iterator<Item = Sum>, edge: f64) -> BTreeMap<[i64; 3], Sum> {
+    let mut voxels: BTreeMap<[i64; 3], Sum> = BTreeMap::new();
+    for point in points {
+        let sum = voxels.entry(cell_of(&point.mean(), edge)).or_default();
+        sum.positions += point.positions;
+        sum.normals += point.normals;
+        sum.count += point.count;
+    }
+    voxels
 }
 
 fn cell_of(point: &Point3<f64>, edge: f64) -> [i64; 3] {
@@ -128,11 +164,23 @@ mod tests {
     #[test]
     fn neighbours_are_those_within_the_radius() {
         let cloud = Cloud::new(plane(0.2));
-        for (centre, radius) in [(Point3::origin(), 0.01), (Point3::new(0.02, -0.03, 0.0), 0.07)] {
+        // The last reaches over more cells than there are points.
+        for (centre, radius) in
+            [(Point3::origin(), 0.01), (Point3::new(0.02, -0.03, 0.0), 0.07), (Point3::new(0.5, 0.0, 0.0), 0.46)]
+        {
             let near = |point: &&SurfacePoint| (point.position - centre).norm() <= radius;
             let expected = cloud.points().iter().filter(near).count();
+            assert!(expected > 0);
             assert_eq!(cloud.within(centre, radius).count(), expected);
         }
+    }
+
+    #[test]
+    fn noise_is_thinned_to_what_can_be_looked_at() {
+        let at = |i: usize| Point3::from([i / 10_000, i / 100 % 100, i % 100].map(|c| c as f64 * VOXEL_SIZE));
+        let cloud = Cloud::new((0..1_000_000).map(|i| SurfacePoint { position: at(i), normal: Vector3::z() }));
+        let count = cloud.points().len();
+        assert!((MAX_POINTS / 8..=MAX_POINTS).contains(&count), "{count}");
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use grasp::{Maps, Volume};
 use nalgebra::Isometry3;
 
-use super::Network;
+use super::{Network, batch_sizes};
 use crate::RuntimeError;
 
 /// What outputs may differ by, from those of ONNX Runtime's own kernels in f32, on [`sample`].
@@ -22,19 +22,34 @@ struct Limit {
     largest: f32,
 }
 
-/// Says what differs by more than it may, if anything does.
-pub(super) fn difference(network: &mut Network, reference: &mut Network) -> Result<Option<String>, RuntimeError> {
+/// Says what differs by more than it may, if anything does, in batches of the sizes up to `max_batch`.
+pub(super) fn difference(
+    network: &mut Network,
+    max_batch: usize,
+    reference: &mut Network,
+) -> Result<Option<String>, RuntimeError> {
     let metadata = network.metadata();
     let volume = sample(metadata.resolution, metadata.voxel_size);
-    let (got, expected) = (network.infer(&[&volume])?, reference.infer(&[&volume])?);
-    let (got, expected) = (got.maps(0), expected.maps(0));
+    let expected = reference.infer(&[&volume])?;
+    let expected = expected.maps(0);
+    for size in batch_sizes(max_batch) {
+        let got = network.infer(&vec![&volume; size])?;
+        // The last, which has the others before it.
+        if let Some(what) = apart(&got.maps(size - 1), &expected) {
+            return Ok(Some(if size == 1 { what } else { format!("in a batch of {size}, {what}") }));
+        }
+    }
+    Ok(None)
+}
+
+fn apart(got: &Maps, expected: &Maps) -> Option<String> {
     let apart = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).collect::<Vec<_>>();
     let differences = [
         ("quality", apart(got.quality, expected.quality), QUALITY),
         ("width", apart(got.width, expected.width), WIDTH),
-        ("rotation", turned(&got, &expected), ROTATION),
+        ("rotation", turned(got, expected), ROTATION),
     ];
-    Ok(differences.into_iter().find_map(|(name, differences, limit)| {
+    differences.into_iter().find_map(|(name, differences, limit)| {
         let mean = differences.iter().sum::<f32>() / differences.len().max(1) as f32;
         let largest = differences.iter().copied().fold(0.0, f32::max);
         // So that what is not a number is no agreement.
@@ -45,7 +60,7 @@ pub(super) fn difference(network: &mut Network, reference: &mut Network) -> Resu
                 limit.mean, limit.largest
             )
         })
-    }))
+    })
 }
 
 fn turned(got: &Maps, expected: &Maps) -> Vec<f32> {

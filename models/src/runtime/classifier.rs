@@ -7,6 +7,7 @@ use ort::value::{Outlet, Tensor, TensorElementType};
 
 use super::plan::Model;
 use super::{Backend, LoadError, LoadReason, Options, RuntimeError, refusal};
+use crate::Entry;
 use crate::gpd::{INPUT, OUTPUT};
 
 /// Images that are scored together, to bound the memory: 5.5 MB of input.
@@ -25,12 +26,30 @@ impl Classifier {
     /// # Errors
     /// [`LoadError`] names the file and what is wrong with it.
     pub fn load(path: &Path, options: &Options) -> Result<Self, LoadError> {
-        let at_path = |reason| LoadError { path: path.to_owned(), reason };
-        let bytes = fs::read(path).map_err(|error| at_path(error.into()))?;
-        let session = Model::new(path, &bytes, options).open(Backend::REFERENCE, None).map_err(at_path)?;
-        check(session.inputs(), INPUT, &[CHANNELS, IMAGE_SIZE, IMAGE_SIZE]).map_err(at_path)?;
-        check(session.outputs(), OUTPUT, &[2]).map_err(at_path)?;
-        Ok(Self { session, name: path.display().to_string() })
+        let load = || Self::open(path, &fs::read(path)?, options);
+        load().map_err(|reason| LoadError { path: path.to_owned(), reason })
+    }
+
+    /// Loads an entry of a store several times, for as many threads that run it at the same time.
+    ///
+    /// # Errors
+    /// [`LoadError`] names the file and what is wrong with it, if it is not the one that the store read, too.
+    pub fn load_several(entry: &Entry, options: &Options, count: usize) -> Result<Vec<Self>, LoadError> {
+        let load = || {
+            let bytes = entry.bytes()?;
+            (0..count).map(|_| Self::open(&entry.path, &bytes, options)).collect::<Result<_, LoadReason>>()
+        };
+        load().map_err(|reason| LoadError { path: entry.path.clone(), reason })
+    }
+
+    /// Scores once, too: the first time allocates, and no caller should wait for that.
+    fn open(path: &Path, bytes: &[u8], options: &Options) -> Result<Self, LoadReason> {
+        let session = Model::new(path, bytes, options).open(Backend::REFERENCE, None)?;
+        check(session.inputs(), INPUT, &[CHANNELS, IMAGE_SIZE, IMAGE_SIZE])?;
+        check(session.outputs(), OUTPUT, &[2])?;
+        let mut classifier = Self { session, name: path.display().to_string() };
+        logits(&mut classifier.session, vec![0.0; BATCH * CHANNELS * IMAGE_SIZE * IMAGE_SIZE])?;
+        Ok(classifier)
     }
 
     /// The score of each image: the logit of a success less that of a failure, above 0 if a success is the likelier.
@@ -40,16 +59,18 @@ impl Classifier {
     pub fn score(&mut self, images: &[Image]) -> Result<Vec<f32>, RuntimeError> {
         let mut scores = Vec::with_capacity(images.len());
         for batch in images.chunks(BATCH) {
-            let logits = logits(&mut self.session, batch).map_err(|error| refusal(&self.name, &error))?;
+            let pixels = batch.iter().flat_map(Image::pixels).map(|&value| f32::from(value) / 255.0).collect();
+            let logits = logits(&mut self.session, pixels).map_err(|error| refusal(&self.name, &error))?;
             scores.extend(logits.chunks_exact(2).map(|pair| pair[1] - pair[0]));
         }
         Ok(scores)
     }
 }
 
-fn logits(session: &mut Session, batch: &[Image]) -> ort::Result<Vec<f32>> {
-    let pixels = batch.iter().flat_map(Image::pixels).map(|&value| f32::from(value) / 255.0).collect::<Vec<_>>();
-    let input = Tensor::from_array(([batch.len(), CHANNELS, IMAGE_SIZE, IMAGE_SIZE], pixels))?;
+/// Of images, one after the other.
+fn logits(session: &mut Session, pixels: Vec<f32>) -> ort::Result<Vec<f32>> {
+    let images = pixels.len() / (CHANNELS * IMAGE_SIZE * IMAGE_SIZE);
+    let input = Tensor::from_array(([images, CHANNELS, IMAGE_SIZE, IMAGE_SIZE], pixels))?;
     let outputs = session.run(ort::inputs![INPUT => input])?;
     Ok(outputs[OUTPUT].try_extract_tensor::<f32>()?.1.to_vec())
 }

@@ -35,7 +35,8 @@ pub(super) struct Plan {
     session: Session,
     /// The size of every batch; smaller ones are filled up. Any without.
     size: Option<usize>,
-    /// By batch size; a batch of a size that was seen before allocates nothing.
+    /// By batch size; a batch of a size that was seen before allocates nothing. A caller that keeps to
+    /// [`batch_sizes`] has room for less than three times the largest.
     buffers: BTreeMap<usize, Buffers>,
 }
 
@@ -105,7 +106,7 @@ impl Plan {
     /// TensorRT would build its engine anew for each size that it meets.
     pub fn all(model: &Model, backend: Backend, max_batch: usize) -> Result<Vec<Self>, LoadReason> {
         let fixed = matches!(backend.provider, Provider::OpenVino | Provider::TensorRt) && model.batch.is_some();
-        let sizes = if fixed { sizes(max_batch).into_iter().map(Some).collect() } else { vec![None] };
+        let sizes = if fixed { batch_sizes(max_batch).map(Some).collect() } else { vec![None] };
         let plan = |size| Ok(Self { session: model.open(backend, size)?, size, buffers: BTreeMap::new() });
         sizes.into_iter().map(plan).collect()
     }
@@ -148,10 +149,10 @@ impl Plan {
     }
 }
 
-/// The powers of two below a number, and the number.
-fn sizes(max_batch: usize) -> Vec<usize> {
+/// The sizes that networks are made ready for, of batches of at most `largest`: the powers of two below it, and itself.
+pub fn batch_sizes(largest: usize) -> impl Iterator<Item = usize> {
     let powers = (0..usize::BITS).map(|bit| 1 << bit);
-    powers.take_while(|&size| size < max_batch).chain([max_batch]).collect()
+    powers.take_while(move |&size| size < largest).chain([largest])
 }
 
 impl Buffers {
@@ -175,6 +176,7 @@ mod tests {
 
     #[test]
     fn every_batch_fits_one_that_is_less_than_twice_its_size() {
+        let sizes = |largest| batch_sizes(largest).collect::<Vec<_>>();
         assert_eq!(sizes(1), [1]);
         assert_eq!(sizes(2), [1, 2]);
         assert_eq!(sizes(6), [1, 2, 4, 6]);

@@ -3,9 +3,12 @@ use std::thread;
 
 use grasp::VoxelOrigin;
 use grasp_data::Dataset;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 
 use crate::augment::Transform;
 use crate::loss::Targets;
+use crate::teacher::{Teacher, TeacherError};
 
 /// Batches that are read ahead of the one at work.
 const AHEAD: usize = 2;
@@ -17,6 +20,8 @@ pub(crate) struct Example {
     /// Which of its volumes.
     pub look: usize,
     pub transform: Transform,
+    /// Decides of which voxels a teacher is asked.
+    pub voxels: u64,
 }
 
 /// Scenes as a network takes them, with what it should answer.
@@ -26,21 +31,31 @@ pub(crate) struct Batch {
     /// `[len, N, N, N]`.
     pub volumes: Vec<f32>,
     pub targets: Targets,
+    /// What the teacher says, if there is one.
+    pub answers: Targets,
 }
 
 impl Batch {
-    fn read(dataset: &Dataset, examples: &[Example], origin: VoxelOrigin) -> Self {
+    fn read(
+        dataset: &Dataset,
+        examples: &[Example],
+        origin: VoxelOrigin,
+        mut teacher: Option<&mut Teacher>,
+    ) -> Result<Self, TeacherError> {
         let n = dataset.resolution();
         let mut volumes = vec![0.0; examples.len() * n.pow(3)];
-        let mut targets = Targets::default();
+        let (mut targets, mut answers) = (Targets::default(), Targets::default());
         for (index, (example, out)) in examples.iter().zip(volumes.chunks_exact_mut(n.pow(3))).enumerate() {
-            let &Example { scene, look, transform } = example;
+            let &Example { scene, look, transform, voxels } = example;
             transform.volume(dataset.volume(scene, look), n, out);
             for trial in dataset.trials(scene) {
                 targets.push(index, &transform.trial(&trial, n), n, origin);
             }
+            if let Some(teacher) = teacher.as_deref_mut() {
+                teacher.answer(index, out, &mut ChaCha8Rng::seed_from_u64(voxels), &mut answers)?;
+            }
         }
-        Self { len: examples.len(), volumes, targets }
+        Ok(Self { len: examples.len(), volumes, targets, answers })
     }
 }
 
@@ -49,14 +64,15 @@ pub(crate) fn read_ahead<R>(
     dataset: &Dataset,
     plan: &[&[Example]],
     origin: VoxelOrigin,
-    take: impl FnOnce(mpsc::IntoIter<Batch>) -> R,
+    mut teacher: Option<&mut Teacher>,
+    take: impl FnOnce(mpsc::IntoIter<Result<Batch, TeacherError>>) -> R,
 ) -> R {
     thread::scope(|scope| {
         let (sender, batches) = mpsc::sync_channel(AHEAD);
         scope.spawn(move || {
             for examples in plan {
                 // Nobody takes it when training was stopped.
-                if sender.send(Batch::read(dataset, examples, origin)).is_err() {
+                if sender.send(Batch::read(dataset, examples, origin, teacher.as_deref_mut())).is_err() {
                     break;
                 }
             }

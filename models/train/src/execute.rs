@@ -117,6 +117,14 @@ pub struct Outputs {
     pub width: Tensor,
 }
 
+impl Outputs {
+    /// Those of so many volumes, or voxels, from the one numbered `first`.
+    pub(crate) fn narrow(&self, first: usize, count: usize) -> Self {
+        let part = |map: &Tensor| map.narrow(0, first as i64, count as i64);
+        Self { quality: part(&self.quality), rotation: part(&self.rotation), width: part(&self.width) }
+    }
+}
+
 impl Executor {
     /// Takes over a model, its weights as f32: checks that every node can be executed and makes its weights trainable.
     ///

@@ -2,7 +2,7 @@
 //!
 //! A [`Trainer`] takes scenes out of a [`Dataset`](grasp_data::Dataset), [changes](Augmentation) them, and runs them through an
 //! [`Executor`]: the ONNX graph that is served, in libtorch and under autograd. [`Targets::loss`] is what [`Adam`]
-//! minimises; a [`Checkpoint`] is where a run stands. A [`Learner`] trains the classifier of grasp candidates on
+//! minimises, and a [`Teacher`] answers where nothing was tried; a [`Checkpoint`] is where a run stands. A [`Learner`] trains the classifier of grasp candidates on
 //! [`Examples`].
 
 mod adam;
@@ -19,6 +19,7 @@ mod loss;
 mod operators;
 mod record;
 mod settings;
+mod teacher;
 mod trainer;
 
 pub use adam::Adam;
@@ -30,4 +31,5 @@ pub use execute::{ExecuteError, Execution, Executor, Outputs};
 pub use loss::{Loss, LossError, Sums, Targets, Weights};
 pub use record::{Record, Success, Validation};
 pub use settings::Settings;
+pub use teacher::{Teacher, TeacherError};
 pub use trainer::{Epoch, TrainError, Trainer};

@@ -17,7 +17,7 @@ const WIDTH_WEIGHT: f64 = 0.01;
 pub struct Targets {
     /// Which voxel: flat index into `[batch, N, N, N]`.
     cells: Vec<i64>,
-    /// 1 for a success, 0 for a failure.
+    /// 1 for a success, 0 for a failure; a network's answer lies between.
     labels: Vec<f32>,
     /// The rotations that hold, each also turned by 180° about its z: x y z w; where there are fewer, the first again.
     rotations: Vec<[[[f32; 4]; 2]; TURNS]>,
@@ -87,15 +87,19 @@ impl Targets {
         let Some(cell) = voxel_of(trial, n, origin) else { return };
         self.cells.push((index * n.pow(3) + cell) as i64);
         self.labels.push(f32::from(u8::from(trial.success)));
-        let both = |rotation: &UnitQuaternion<f64>| {
-            let [x, y, z, w]: [f32; 4] = rotation.coords.map(|c| c as f32).into();
-            // The second is q · (0, 0, 1, 0): turned by 180° about its own z.
-            [[x, y, z, w], [y, -x, w, -z]]
-        };
+        let both = |rotation: &UnitQuaternion<f64>| both_ways(rotation.coords.map(|c| c as f32).into());
         let mut rotations = [both(&trial.rotation); TURNS];
         trial.rotations().zip(&mut rotations).for_each(|(rotation, place)| *place = both(&rotation));
         self.rotations.push(rotations);
         self.widths.push(trial.width as f32);
+    }
+
+    /// Adds what a network answers at a voxel: a quality in [0, 1], a quaternion x y z w, a width in voxels.
+    pub(crate) fn push_answer(&mut self, cell: usize, quality: f32, rotation: [f32; 4], width: f32) {
+        self.cells.push(cell as i64);
+        self.labels.push(quality);
+        self.rotations.push([both_ways(rotation); TURNS]);
+        self.widths.push(width);
     }
 
     /// How many voxels are labelled.
@@ -161,6 +165,11 @@ impl Targets {
         };
         Ok(Loss { mean: (quality_loss + rotation_loss + width_loss) / self.len() as f64, sums })
     }
+}
+
+/// A rotation x y z w, and the same turned by 180° about its own z, q · (0, 0, 1, 0): a hand has no front.
+fn both_ways([x, y, z, w]: [f32; 4]) -> [[f32; 4]; 2] {
+    [[x, y, z, w], [y, -x, w, -z]]
 }
 
 /// The voxel that stands for a grasp there: the nearest index (VGN), or the voxel it lies in.

@@ -139,6 +139,12 @@ struct Training {
     /// What the rotation counts for in the loss, against quality and width.
     #[arg(long, default_value_t = 1.0)]
     rotation_weight: f64,
+    /// Learn from this trained model, too: from its answers in front of surfaces, beside the trials.
+    #[arg(long, value_name = "MODEL")]
+    teacher: Option<PathBuf>,
+    /// What the teacher's answers count for in the loss, against the trials.
+    #[arg(long, default_value_t = 1.0, requires = "teacher")]
+    teacher_weight: f64,
     /// Compute convolutions and matrix products in bf16.
     #[arg(long)]
     bf16: bool,

@@ -151,6 +151,9 @@ impl Step<'_> {
         if begin != end {
             return Err(self.setting(format!("a padding of {begin:?} before and {end:?} after")));
         }
+        if !transposed && let Some(y) = self.patches(&x, &weight, bias.as_ref()) {
+            return Ok(vec![y.map_err(|source| self.torch(source))?]);
+        }
         let y = x.f_convolution(
             &weight,
             bias.as_ref(),
@@ -162,6 +165,29 @@ impl Step<'_> {
             self.int("group", 1),
         );
         Ok(vec![y.map_err(|source| self.torch(source))?])
+    }
+
+    /// A convolution of one channel whose windows lie side by side is a matrix product, which is computed many times as
+    /// fast; none if it is another.
+    fn patches(&self, x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> Option<Result<Tensor, TchError>> {
+        let (&[batch, 1, size, height, width], &[channels, 1, edge, ..]) =
+            (x.size().as_slice(), weight.size().as_slice())
+        else {
+            return None;
+        };
+        let cube = |name| self.ints(name, &[]) == [edge; 3];
+        let whole = height == size && width == size && size % edge == 0;
+        let plain = |name, expected: i64| self.ints(name, &[]).iter().all(|&value| value == expected);
+        if !(cube("strides") && cube("kernel_shape") && whole && plain("pads", 0) && plain("dilations", 1)) {
+            return None;
+        }
+        let n = size / edge;
+        let compute = || {
+            let windows = x.f_reshape([batch, n, edge, n, edge, n, edge])?.f_permute([0, 1, 3, 5, 2, 4, 6])?;
+            let y = windows.f_reshape([batch, n * n * n, -1])?.f_linear(&weight.f_reshape([channels, -1])?, bias)?;
+            y.f_reshape([batch, n, n, n, channels])?.f_permute([0, 4, 1, 2, 3])
+        };
+        Some(compute())
     }
 
     /// A convolution over what is twice as large as its input, of which it is told the small array

@@ -11,8 +11,8 @@ use anyhow::{Context, Result, ensure};
 use grasp::{RESOLUTION, VoxelOrigin};
 use grasp_data::Dataset;
 use grasp_models::onnx::ModelProto;
-use grasp_models::{Architecture, Metadata};
-use grasp_train::{Augmentation, Checkpoint, Epoch, Execution, Record, Settings, Success, Trainer, curves};
+use grasp_models::{Architecture, Metadata, Network, Options};
+use grasp_train::{Augmentation, Checkpoint, Epoch, Execution, Record, Settings, Success, Teacher, Trainer, curves};
 use indicatif::{ProgressBar, ProgressStyle};
 use time::OffsetDateTime;
 
@@ -48,6 +48,11 @@ pub(crate) fn train(training: &Training) -> Result<()> {
     let device = training.device.device()?;
     let execution = Execution { device, bf16: training.bf16, channels_last: true };
     let mut trainer = Trainer::new(model, dataset, settings.clone(), execution)?;
+    if let Some(path) = &training.teacher {
+        let (teacher, name) = teacher(training, path, &metadata)?;
+        trainer = trainer.taught_by(teacher);
+        metadata.provenance.insert("teacher".to_owned(), name);
+    }
 
     let mut records = Vec::new();
     let mut progress = Progress::default();
@@ -167,6 +172,27 @@ fn start_from(training: &Training) -> Result<(ModelProto, Metadata)> {
         None => VoxelOrigin::Center,
     };
     Ok((model, metadata))
+}
+
+/// Who teaches, and its name and version. It computes in the thread that reads the scenes.
+fn teacher(training: &Training, path: &Path, pupil: &Metadata) -> Result<(Teacher, String)> {
+    let weight = training.teacher_weight;
+    ensure!(weight >= 0.0, "--teacher-weight is {weight}, must be at least 0");
+    let network = Network::load(path, &Options::auto(1))?;
+    let Metadata { name, version, resolution, voxel_origin, .. } = network.metadata();
+    ensure!(
+        *resolution == pupil.resolution,
+        "the teacher reads {resolution}³ voxels, its pupil {0}³",
+        pupil.resolution
+    );
+    ensure!(
+        *voxel_origin == pupil.voxel_origin,
+        "the teacher's grasps stand at the {} of their voxels, its pupil's at the {}; give --voxel-origin",
+        voxel_origin.name(),
+        pupil.voxel_origin.name()
+    );
+    let name = format!("{name} {version} at {weight}");
+    Ok((Teacher::new(network, weight), name))
 }
 
 /// VGN's released code trains with Adam at 3e-4 in batches of 32 for 30 epochs; the paper with 1e-4, 64 and 21. A model

@@ -17,6 +17,7 @@ use crate::execute::{ExecuteError, Execution, Executor};
 use crate::loss::{Loss, LossError, Sums, Weights};
 use crate::record::{Record, Validation};
 use crate::settings::Settings;
+use crate::teacher::{Teacher, TeacherError};
 
 /// Why training stopped.
 #[derive(Debug, Error)]
@@ -36,6 +37,9 @@ pub enum TrainError {
     /// The checkpoint cannot be continued.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
+    /// The teacher has no answer.
+    #[error("the teacher: {0}")]
+    Teacher(#[from] TeacherError),
     /// The loss cannot be computed.
     #[error(transparent)]
     Loss(#[from] LossError),
@@ -66,6 +70,9 @@ pub struct Trainer {
     /// What must be the same for a run to go on.
     fingerprint: String,
     executor: Executor,
+    teacher: Option<Teacher>,
+    /// What its answers count for.
+    teaching: f64,
     adam: Adam,
     average: Option<Average>,
     /// Epochs completed, batches done of the next, and their losses.
@@ -96,6 +103,8 @@ impl Trainer {
             weights: Weights::default(),
             fingerprint: String::new(),
             executor,
+            teacher: None,
+            teaching: 0.0,
             adam,
             average,
             epoch: 0,
@@ -104,6 +113,13 @@ impl Trainer {
         };
         trainer.look_over()?;
         Ok(trainer)
+    }
+
+    /// The same run, with a network to learn from beside the trials.
+    #[must_use]
+    pub fn taught_by(self, teacher: Teacher) -> Self {
+        let fingerprint = format!("{}, {}", self.fingerprint, teacher.fingerprint());
+        Self { teaching: teacher.weight(), teacher: Some(teacher), fingerprint, ..self }
     }
 
     /// Takes in what has been added to the data since; says how many scenes. Between two epochs only.
@@ -135,6 +151,9 @@ impl Trainer {
         let classes = if self.settings.balance { class_weights(&self.dataset, &training)? } else { [1.0; 2] };
         self.weights = Weights { classes, rotation: self.settings.rotation_weight };
         self.fingerprint = self.settings.fingerprint(&self.dataset, training.len(), validation.len());
+        if let Some(teacher) = &self.teacher {
+            self.fingerprint += &format!(", {}", teacher.fingerprint());
+        }
         (self.training, self.validation) = (training, validation);
         Ok(())
     }
@@ -239,7 +258,9 @@ impl Trainer {
         let mut learning_rate = 0.0;
         // Out of the way of what the steps change; back in its place before anything is returned.
         let dataset = std::mem::replace(&mut self.dataset, Dataset::none());
-        let done: Result<bool, TrainError> = read_ahead(&dataset, &plan, voxel_origin, |mut batches| {
+        let mut teacher = self.teacher.take();
+        let answers_of = teacher.as_mut();
+        let done: Result<bool, TrainError> = read_ahead(&dataset, &plan, voxel_origin, answers_of, |mut batches| {
             let mut left = plan.len();
             while left > 0 {
                 if stop.load(Ordering::Relaxed) {
@@ -254,7 +275,7 @@ impl Trainer {
             }
             Ok(true)
         });
-        self.dataset = dataset;
+        (self.dataset, self.teacher) = (dataset, teacher);
         if !done? {
             return Ok(Epoch::Interrupted);
         }
@@ -280,12 +301,13 @@ impl Trainer {
     /// One step over so many batches, whose gradients weigh the same; says how many volumes they were.
     fn step(
         &mut self,
-        batches: impl Iterator<Item = Batch>,
+        batches: impl Iterator<Item = Result<Batch, TeacherError>>,
         passes: usize,
         learning_rate: f64,
     ) -> Result<usize, TrainError> {
         let (mut volumes, mut learnt) = (0, false);
         for batch in batches {
+            let batch = batch?;
             volumes += batch.len;
             let Some(Loss { mean, sums }) = self.loss(&batch)? else { continue };
             if !sums.loss().is_finite() {
@@ -308,10 +330,10 @@ impl Trainer {
     fn validate(&self) -> Result<Option<Validation>, TrainError> {
         let scenes: Vec<_> = self.validation.iter().map(|&scene| Example { scene, ..Example::default() }).collect();
         let plan: Vec<&[Example]> = scenes.chunks(self.settings.batch).collect();
-        read_ahead(&self.dataset, &plan, self.settings.voxel_origin, |batches| {
+        read_ahead(&self.dataset, &plan, self.settings.voxel_origin, None, |batches| {
             let mut sums = Sums::default();
             for batch in batches {
-                if let Some(loss) = no_grad(|| self.loss(&batch))? {
+                if let Some(loss) = no_grad(|| self.loss(&batch?))? {
                     sums.add(&loss.sums);
                 }
             }
@@ -321,19 +343,26 @@ impl Trainer {
 
     /// The order of an epoch's scenes and how each is changed: a function of the seed and the epoch.
     fn plan(&self) -> Vec<Example> {
-        let mut rng = ChaCha8Rng::seed_from_u64(self.settings.seed);
-        rng.set_stream(self.epoch);
+        let stream = |number| {
+            let mut rng = ChaCha8Rng::seed_from_u64(self.settings.seed);
+            rng.set_stream(number);
+            rng
+        };
+        // The teacher has a stream of its own: with and without one, all else is the same.
+        let (mut rng, mut voxels) = (stream(self.epoch), stream(!self.epoch));
         let mut scenes = self.training.clone();
         scenes.shuffle(&mut rng);
         let mut example = |scene| Example {
             scene,
             look: rng.random_range(0..self.dataset.volumes(scene)),
             transform: self.settings.augmentation.draw(&mut rng),
+            voxels: voxels.random(),
         };
         scenes.into_iter().map(&mut example).collect()
     }
 
-    /// One forward pass; none when no grasp of the scenes lies inside its volume.
+    /// One forward pass; none when no grasp of the scenes lies inside its volume. A teacher's answers are part of the
+    /// mean; the sums are of the trials alone.
     fn loss(&self, batch: &Batch) -> Result<Option<Loss>, TrainError> {
         if batch.targets.is_empty() {
             return Ok(None);
@@ -341,10 +370,23 @@ impl Trainer {
         let edge = (batch.volumes.len() as f64 / batch.len as f64).cbrt().round() as i64;
         let volumes = Tensor::f_from_slice(&batch.volumes)?.f_reshape([batch.len as i64, 1, edge, edge, edge])?;
         let volumes = volumes.to_device(self.executor.device());
-        let outputs = self.executor.forward_at(&volumes, batch.targets.cells())?;
-        match batch.targets.loss(&outputs, &self.weights) {
+        let (tried, answered) = (batch.targets.len(), batch.answers.len());
+        let cells = [batch.targets.cells(), batch.answers.cells()].concat();
+        let outputs = self.executor.forward_at(&volumes, &cells)?;
+        let Loss { mut mean, sums } = self.checked(batch.targets.loss(&outputs.narrow(0, tried), &self.weights))?;
+        if answered > 0 {
+            // A teacher's qualities are balanced as its own training was.
+            let weights = Weights { rotation: self.settings.rotation_weight, ..Weights::default() };
+            let answers = self.checked(batch.answers.loss(&outputs.narrow(tried, answered), &weights))?;
+            mean += answers.mean * self.teaching;
+        }
+        Ok(Some(Loss { mean, sums }))
+    }
+
+    fn checked(&self, loss: Result<Loss, LossError>) -> Result<Loss, TrainError> {
+        match loss {
             Err(LossError::NotANumber) => Err(self.diverged()),
-            loss => Ok(Some(loss?)),
+            loss => Ok(loss?),
         }
     }
 

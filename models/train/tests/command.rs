@@ -99,6 +99,18 @@ fn a_run_goes_on_where_it_stopped() {
 }
 
 #[test]
+fn a_teacher_is_named_and_one_of_another_convention_refused() {
+    let folder = prepare();
+    let output = train(folder.path(), "--out out.onnx --epochs 1 --teacher start.onnx --teacher-weight 2");
+    assert!(output.status.success(), "{}", said(&output));
+    let path = folder.path().join("out.onnx");
+    let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
+    assert_eq!(metadata.provenance["teacher"], "start 1 at 2");
+    let output = train(folder.path(), "--out out.onnx --epochs 1 --teacher start.onnx --voxel-origin center");
+    assert!(!output.status.success() && said(&output).contains("give --voxel-origin"), "{}", said(&output));
+}
+
+#[test]
 fn a_run_ends_when_the_simulator_says_so() {
     let folder = prepare();
     // Worse each time: 0.9, 0.8, 0.7…

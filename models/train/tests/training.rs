@@ -7,13 +7,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use grasp::VoxelOrigin;
 use grasp_data::{Dataset, Setup, Trial, packed};
 use grasp_models::onnx::ModelProto;
-use grasp_models::{Architecture, Orientation};
+use grasp_models::{Architecture, Metadata, Network, Options, Orientation};
 use grasp_train::{
-    Augmentation, Checkpoint, CheckpointError, Epoch, Execution, Outputs, Record, Settings, Targets, TrainError,
-    Trainer, Weights,
+    Augmentation, Checkpoint, CheckpointError, Epoch, Execution, Executor, Outputs, Record, Settings, Targets, Teacher,
+    TrainError, Trainer, Weights,
 };
 use nalgebra::{Point3, UnitQuaternion, Vector3};
-use tch::{Device, Tensor};
+use tch::{Device, Kind, Tensor};
 
 const N: usize = 16;
 const EXECUTION: Execution = Execution { device: Device::Cpu, bf16: false, channels_last: true };
@@ -168,6 +168,53 @@ fn a_resumed_run_is_the_uninterrupted_run() {
         assert_eq!(comparable(&got), comparable(expected));
     }
     assert_eq!(resumed.model(), whole.model(), "to the last bit");
+}
+
+#[test]
+fn a_pupil_learns_what_no_trial_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("teacher.onnx");
+    let learnt = Settings { batch: 8, learning_rate: 1e-3, ..settings() };
+    let mut taught = trainer(support::dataset(8, N), &learnt, EXECUTION);
+    (0..60).for_each(|_| drop(epoch(&mut taught)));
+    let teacher_model = taught.model();
+    let mut metadata = Metadata::of(&teacher_model, &path).unwrap();
+    metadata.voxel_origin = VoxelOrigin::Center;
+    let mut file = teacher_model.clone();
+    metadata.write_to(&mut file);
+    file.write(&path).unwrap();
+
+    // The pupil sees scenes that its teacher never saw, and none of its own trials is near most of their surfaces.
+    let scenes = || Dataset::of((100..108).map(|seed| support::scene(seed, N)).collect()).unwrap();
+    let teacher = || Teacher::new(Network::load(&path, &Options::default()).unwrap(), 10.0);
+    let start = || {
+        let model = Architecture::Vgn.build(N, 1).unwrap();
+        Trainer::new(model, scenes(), learnt.clone(), EXECUTION).unwrap()
+    };
+    let (mut alone, mut pupil) = (start(), start().taught_by(teacher()));
+    (0..40).for_each(|_| drop((epoch(&mut alone), epoch(&mut pupil))));
+
+    let qualities = |model: &ModelProto| {
+        let values: Vec<f32> =
+            (0..scenes().len()).flat_map(|scene| scenes().volume(scene, 0).to_vec()).map(grasp_data::value).collect();
+        let volumes = Tensor::from_slice(&values).reshape([-1, 1, N as i64, N as i64, N as i64]);
+        let executor = Executor::new(model.clone(), EXECUTION).unwrap();
+        tch::no_grad(|| executor.forward(&volumes).unwrap().quality)
+    };
+    let answers = qualities(&teacher_model);
+    let distance = |model: &ModelProto| (qualities(model) - &answers).abs().mean(Kind::Float).double_value(&[]);
+    let (without, with) = (distance(&alone.model()), distance(&pupil.model()));
+    println!("mean difference of quality to the teacher's: {without:.3} without its answers, {with:.3} with them");
+    assert!(with < without / 2.0, "{with} and {without}");
+
+    // Another voxel is drawn in every step, but not when the run is resumed.
+    let mut resumed = start().taught_by(teacher());
+    resumed.resume(&pupil.checkpoint()).unwrap();
+    epoch(&mut resumed);
+    epoch(&mut pupil);
+    assert_eq!(resumed.model(), pupil.model(), "to the last bit");
+    let refused = start().resume(&pupil.checkpoint());
+    assert!(matches!(refused, Err(TrainError::Checkpoint(CheckpointError::Settings { .. }))), "the teacher is missing");
 }
 
 #[test]

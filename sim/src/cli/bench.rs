@@ -1,4 +1,5 @@
 use std::collections::BTreeMap;
+use std::fmt;
 use std::fs::{self, File};
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
@@ -14,6 +15,7 @@ use grasp_sim::benchmark::{Benchmark, Event};
 use grasp_sim::planner::PlannerSpec;
 use grasp_sim::score::{Spread, Summary};
 use indicatif::ProgressBar;
+use serde::Serialize;
 
 use super::{SceneArgs, show};
 
@@ -78,7 +80,7 @@ enum Format {
 
 /// Between a network's output and the grasps; by default as GIGA's evaluation has it. A running graspd takes the first
 /// two only.
-#[derive(Args)]
+#[derive(Args, Serialize)]
 struct DecodingArgs {
     /// Smallest quality of a grasp (ε).
     #[arg(long, default_value_t = 0.9)]
@@ -101,13 +103,27 @@ struct DecodingArgs {
     clear: bool,
 }
 
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Serialize)]
 struct Force(Option<f32>);
 
 fn parse_force(text: &str) -> Result<Force, String> {
     match text {
         "none" => Ok(Force(None)),
         number => number.parse().map(|floor| Force(Some(floor))).map_err(|_| "a number or `none`".to_owned()),
+    }
+}
+
+impl fmt::Display for DecodingArgs {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let Self { threshold, force, out_th, no_border, clear } = self;
+        write!(f, "ε {threshold}, ")?;
+        match force.0 {
+            Some(floor) => write!(f, "force down to {floor}, ")?,
+            None => f.write_str("no force, ")?,
+        }
+        write!(f, "out_th {out_th}")?;
+        f.write_str(if *no_border { ", borders too" } else { "" })?;
+        f.write_str(if *clear { ", hands clear of what was observed" } else { "" })
     }
 }
 
@@ -150,7 +166,7 @@ impl Bench {
         let params = self.decoding.params();
         let options = Options { provider: self.provider.0, precision: self.precision.0, ..Options::default() };
         if self.format == Format::Markdown {
-            println!("{setup}, {} seeds, {params:?}\n\n{MARKDOWN_HEAD}", self.seeds);
+            println!("{setup}, {} seeds, {}\n\n{MARKDOWN_HEAD}", self.seeds, self.decoding);
         }
         for name in &self.planners {
             let progress = ProgressBar::new(self.rounds * self.seeds).with_message(name.clone());
@@ -177,7 +193,7 @@ impl Bench {
                     let mut line = serde_json::to_value(&whole)?;
                     line["seeds"] = serde_json::json!({ "gsr": gsr, "dr": dr });
                     line["planner"] = name.as_str().into();
-                    line["decoding"] = format!("{params:?}").into();
+                    line["decoding"] = serde_json::to_value(&self.decoding)?;
                     line["provider"] = format!("{} {}", self.provider, self.precision).into();
                     line["setup"] = setup.as_str().into();
                     println!("{line}");

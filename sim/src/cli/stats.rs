@@ -1,5 +1,6 @@
 use std::collections::BTreeMap;
 use std::fs;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
@@ -35,7 +36,11 @@ impl Stats {
             Some(path) => by_object(&export::read(path)?),
             None => BTreeMap::new(),
         };
-        print(&statistics, &objects);
+        match print(&statistics, &objects) {
+            // Nobody reads on, as after `| head`.
+            Err(error) if error.kind() == io::ErrorKind::BrokenPipe => {}
+            printed => printed.context("cannot print")?,
+        }
         let Some(folder) = &self.out else { return Ok(()) };
         fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
         let json = folder.join("statistics.json");
@@ -53,10 +58,11 @@ impl Stats {
     }
 }
 
-fn print(statistics: &Statistics, objects: &BTreeMap<String, Count>) {
+fn print(statistics: &Statistics, objects: &BTreeMap<String, Count>) -> io::Result<()> {
+    let mut out = io::stdout().lock();
     let Statistics { scenes, volumes, observed, grasps, .. } = statistics;
-    println!("{scenes} scenes seen {volumes} times, {:.1} % of the voxels near a surface", observed * 100.0);
-    println!("{} grasps, {} successes ({})", grasps.all(), grasps.successes, percent(*grasps));
+    writeln!(out, "{scenes} scenes seen {volumes} times, {:.1} % of the voxels near a surface", observed * 100.0)?;
+    writeln!(out, "{} grasps, {} successes ({})", grasps.all(), grasps.successes, percent(*grasps))?;
     for histogram in [&statistics.widths, &statistics.heights, &statistics.approaches, &statistics.shares] {
         let mut table = table([histogram.quantity, histogram.counted, "share", "successes"]);
         let total: u64 = histogram.bins.iter().map(|bin| bin.all()).sum();
@@ -76,15 +82,16 @@ fn print(statistics: &Statistics, objects: &BTreeMap<String, Count>) {
                 if only_successes { String::new() } else { percent(count) },
             ]);
         }
-        println!("{table}");
+        writeln!(out, "{table}")?;
     }
     if !objects.is_empty() {
         let mut table = table(["object", "grasps", "successes", ""]);
         for (name, count) in objects {
             table.add_row([name.clone(), count.all().to_string(), count.successes.to_string(), percent(*count)]);
         }
-        println!("{table}");
+        writeln!(out, "{table}")?;
     }
+    Ok(())
 }
 
 fn table(header: [&str; 4]) -> Table {

@@ -55,19 +55,19 @@ struct Cli {
 #[derive(Args)]
 struct AccessArgs {
     /// CA that signed the server's certificate, PEM. By default those that this machine trusts, with https:// addresses.
-    #[arg(long, global = true, env = "GRASPD_TLS_CA", value_name = "FILE")]
+    #[arg(long, global = true, help_heading = "Connection", env = "GRASPD_TLS_CA", value_name = "FILE")]
     tls_ca: Option<PathBuf>,
 
     /// Certificate to show to a server that wants one, PEM.
-    #[arg(long, global = true, value_name = "FILE", requires = "tls_key")]
+    #[arg(long, global = true, help_heading = "Connection", value_name = "FILE", requires = "tls_key")]
     tls_cert: Option<PathBuf>,
 
     /// Its private key, PEM.
-    #[arg(long, global = true, value_name = "FILE", requires = "tls_cert")]
+    #[arg(long, global = true, help_heading = "Connection", value_name = "FILE", requires = "tls_cert")]
     tls_key: Option<PathBuf>,
 
     /// File that holds the token that the server wants.
-    #[arg(long, global = true, env = "GRASPD_TOKEN_FILE", value_name = "FILE")]
+    #[arg(long, global = true, help_heading = "Connection", env = "GRASPD_TOKEN_FILE", value_name = "FILE")]
     token_file: Option<PathBuf>,
 }
 

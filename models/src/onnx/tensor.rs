@@ -1,0 +1,160 @@
+//! The values of tensors.
+
+use half::f16;
+use thiserror::Error;
+
+use super::{DataType, StringStringEntryProto, TensorProto};
+
+/// Why a tensor's values cannot be used.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+pub enum TensorError {
+    /// The element type is not one that was asked for.
+    #[error("tensor `{name}` has elements of ONNX type {got}, {expected} needed")]
+    Type {
+        /// The tensor.
+        name: String,
+        /// Its element type, as `onnx.proto` numbers them.
+        got: i32,
+        /// What was asked for.
+        expected: &'static str,
+    },
+    /// The number of values does not fit the shape.
+    #[error("tensor `{name}` holds {got} values, its shape {dims:?} needs {expected}")]
+    Length {
+        /// The tensor.
+        name: String,
+        /// Values it holds.
+        got: usize,
+        /// Values its shape needs.
+        expected: usize,
+        /// Its shape.
+        dims: Vec<i64>,
+    },
+    /// The values lie in another file.
+    #[error("tensor `{name}` keeps its values in another file; save the model as a single file")]
+    External {
+        /// The tensor.
+        name: String,
+    },
+}
+
+impl TensorProto {
+    /// A tensor of f32.
+    #[must_use]
+    pub fn from_f32(name: &str, dims: &[i64], values: &[f32]) -> Self {
+        let mut tensor = Self { dims: dims.to_vec(), name: Some(name.to_owned()), ..Self::default() };
+        tensor.set_f32(values);
+        tensor
+    }
+
+    /// A tensor of i64.
+    #[must_use]
+    pub fn from_i64(name: &str, dims: &[i64], values: &[i64]) -> Self {
+        Self::from_bytes(name, dims, DataType::Int64, values.iter().flat_map(|value| value.to_le_bytes()).collect())
+    }
+
+    /// A tensor of i32.
+    #[must_use]
+    pub fn from_i32(name: &str, dims: &[i64], values: &[i32]) -> Self {
+        Self::from_bytes(name, dims, DataType::Int32, values.iter().flat_map(|value| value.to_le_bytes()).collect())
+    }
+
+    /// A tensor of i8.
+    #[must_use]
+    pub fn from_i8(name: &str, dims: &[i64], values: &[i8]) -> Self {
+        Self::from_bytes(name, dims, DataType::Int8, values.iter().map(|&value| value as u8).collect())
+    }
+
+    /// A tensor of u8.
+    #[must_use]
+    pub fn from_u8(name: &str, dims: &[i64], values: &[u8]) -> Self {
+        Self::from_bytes(name, dims, DataType::Uint8, values.to_vec())
+    }
+
+    fn from_bytes(name: &str, dims: &[i64], data_type: DataType, bytes: Vec<u8>) -> Self {
+        Self {
+            dims: dims.to_vec(),
+            data_type: Some(data_type.into()),
+            name: Some(name.to_owned()),
+            raw_data: Some(bytes),
+            ..Self::default()
+        }
+    }
+
+    /// How many values its shape needs.
+    #[must_use]
+    pub fn elements(&self) -> usize {
+        self.dims.iter().map(|&dim| usize::try_from(dim).unwrap_or(0)).product()
+    }
+
+    /// Whether it holds floating-point numbers.
+    #[must_use]
+    pub fn is_float(&self) -> bool {
+        matches!(self.data_type(), DataType::Float | DataType::Float16)
+    }
+
+    /// The values of an f32 or f16 tensor.
+    ///
+    /// # Errors
+    /// [`TensorError`] when it holds something else, or too little of it.
+    pub fn to_f32(&self) -> Result<Vec<f32>, TensorError> {
+        let halves = |bits: u16| f16::from_bits(bits).to_f32();
+        match (self.data_type(), self.raw()?) {
+            (DataType::Float, Some(raw)) => self.checked(raw.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b))),
+            (DataType::Float, None) => self.checked(self.float_data.iter().copied()),
+            (DataType::Float16, Some(raw)) => {
+                self.checked(raw.as_chunks().0.iter().map(|b| halves(u16::from_le_bytes(*b))))
+            }
+            (DataType::Float16, None) => self.checked(self.int32_data.iter().map(|&bits| halves(bits as u16))),
+            _ => Err(self.wrong_type("FLOAT (1) or FLOAT16 (10)")),
+        }
+    }
+
+    /// The values of an i64 tensor.
+    ///
+    /// # Errors
+    /// [`TensorError`] when it holds something else, or too little of it.
+    pub fn to_i64(&self) -> Result<Vec<i64>, TensorError> {
+        match (self.data_type(), self.raw()?) {
+            (DataType::Int64, Some(raw)) => self.checked(raw.as_chunks().0.iter().map(|b| i64::from_le_bytes(*b))),
+            (DataType::Int64, None) => self.checked(self.int64_data.iter().copied()),
+            _ => Err(self.wrong_type("INT64 (7)")),
+        }
+    }
+
+    /// Replaces the values, as f32, keeping name and shape.
+    pub fn set_f32(&mut self, values: &[f32]) {
+        self.data_type = Some(DataType::Float.into());
+        self.float_data.clear();
+        self.int32_data.clear();
+        self.raw_data = Some(values.iter().flat_map(|value| value.to_le_bytes()).collect());
+    }
+
+    /// The other file that the values lie in, if they do.
+    #[must_use]
+    pub fn external_file(&self) -> Option<&str> {
+        let file = self.external_data.iter().find(|entry| entry.key() == "location");
+        (self.data_location == Some(1)).then(|| file.map_or("", StringStringEntryProto::value))
+    }
+
+    /// The raw bytes, if the values are stored so.
+    fn raw(&self) -> Result<Option<&[u8]>, TensorError> {
+        if self.external_file().is_some() {
+            return Err(TensorError::External { name: self.name().to_owned() });
+        }
+        Ok(self.raw_data.as_deref())
+    }
+
+    fn checked<T>(&self, values: impl Iterator<Item = T>) -> Result<Vec<T>, TensorError> {
+        let values: Vec<T> = values.collect();
+        let expected = self.elements();
+        if values.len() == expected {
+            return Ok(values);
+        }
+        Err(TensorError::Length { name: self.name().to_owned(), got: values.len(), expected, dims: self.dims.clone() })
+    }
+
+    fn wrong_type(&self, expected: &'static str) -> TensorError {
+        TensorError::Type { name: self.name().to_owned(), got: self.data_type.unwrap_or_default(), expected }
+    }
+}
