@@ -105,7 +105,7 @@ fn a_teacher_is_named_and_one_of_another_convention_refused() {
     assert!(output.status.success(), "{}", said(&output));
     let path = folder.path().join("out.onnx");
     let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
-    assert_eq!(metadata.provenance["teacher"], "start 1 at 2");
+    assert_eq!(metadata.provenance["teacher"], "vgn 1 at 2");
     let output = train(folder.path(), "--out out.onnx --epochs 1 --teacher start.onnx --voxel-origin center");
     assert!(!output.status.success() && said(&output).contains("give --voxel-origin"), "{}", said(&output));
 }

@@ -192,7 +192,7 @@ fn a_pupil_learns_what_no_trial_said() {
         Trainer::new(model, scenes(), learnt.clone(), EXECUTION).unwrap()
     };
     let (mut alone, mut pupil) = (start(), start().taught_by(teacher()));
-    (0..40).for_each(|_| drop((epoch(&mut alone), epoch(&mut pupil))));
+    (0..150).for_each(|_| drop((epoch(&mut alone), epoch(&mut pupil))));
 
     let qualities = |model: &ModelProto| {
         let values: Vec<f32> =
