@@ -176,7 +176,9 @@ fn a_pupil_learns_what_no_trial_said() {
     let path = folder.path().join("teacher.onnx");
     let learnt = Settings { batch: 8, learning_rate: 1e-3, ..settings() };
     let mut taught = trainer(support::dataset(8, N), &learnt, EXECUTION);
-    (0..60).for_each(|_| drop(epoch(&mut taught)));
+    for _ in 0..60 {
+        epoch(&mut taught);
+    }
     let teacher_model = taught.model();
     let mut metadata = Metadata::of(&teacher_model, &path).unwrap();
     metadata.voxel_origin = VoxelOrigin::Center;
@@ -192,7 +194,10 @@ fn a_pupil_learns_what_no_trial_said() {
         Trainer::new(model, scenes(), learnt.clone(), EXECUTION).unwrap()
     };
     let (mut alone, mut pupil) = (start(), start().taught_by(teacher()));
-    (0..150).for_each(|_| drop((epoch(&mut alone), epoch(&mut pupil))));
+    for _ in 0..150 {
+        epoch(&mut alone);
+        epoch(&mut pupil);
+    }
 
     let qualities = |model: &ModelProto| {
         let values: Vec<f32> =
