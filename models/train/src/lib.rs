@@ -2,8 +2,8 @@
 //!
 //! A [`Trainer`] takes scenes out of a [`Dataset`](grasp_data::Dataset), [changes](Augmentation) them, and runs them through an
 //! [`Executor`]: the ONNX graph that is served, in libtorch and under autograd. [`Targets::loss`] is what [`Adam`]
-//! minimises, and a [`Teacher`] answers where nothing was tried; a [`Checkpoint`] is where a run stands. A [`Learner`] trains the classifier of grasp candidates on
-//! [`Examples`].
+//! minimises, and a [`Teacher`] answers where nothing was tried; a [`Checkpoint`] is where a run stands. A [`Learner`]
+//! trains the classifier of grasp candidates on [`Examples`].
 
 mod adam;
 mod augment;

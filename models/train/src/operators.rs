@@ -167,8 +167,8 @@ impl Step<'_> {
         Ok(vec![y.map_err(|source| self.torch(source))?])
     }
 
-    /// A convolution of one channel whose windows lie side by side is a matrix product, which is computed many times as
-    /// fast; none if it is another.
+    /// A convolution of one channel whose windows lie side by side, as a matrix product: oneDNN's convolution of 8³ windows
+    /// was a fifth of the time that the transformer's convolutions took. None if it is another.
     fn patches(&self, x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> Option<Result<Tensor, TchError>> {
         let (&[batch, 1, size, height, width], &[channels, 1, edge, ..]) =
             (x.size().as_slice(), weight.size().as_slice())
