@@ -226,9 +226,9 @@ impl Client {
     }
 
     fn grasps(&self) -> GraspServiceClient<InterceptedService<Channel, Bearer>> {
-        // A reply holds grasps, never volumes, but with a low threshold there may be thousands of them.
+        // With a low threshold there may be tens of thousands of grasps.
         let service = GraspServiceClient::with_interceptor(self.channel.clone(), self.bearer.clone());
-        service.max_decoding_message_size(WINDOW as usize)
+        service.max_decoding_message_size(usize::MAX)
     }
 }
 
@@ -245,15 +245,21 @@ impl Tracking {
     /// Adds views to the volume, and asks for the grasps in all that was seen so far.
     ///
     /// # Errors
-    /// [`Error::Refused`]: what is wrong with a view does not end the tracking.
+    /// [`Error::Refused`]: what is wrong with a view does not end the tracking. With [`Code::ResourceExhausted`] the views
+    /// have been added all the same: ask again without them.
     pub async fn add(&mut self, views: &[DepthView], options: Options) -> Result<Detection, Error> {
         let request = options.track_request(views, self.workspace.as_ref());
         // A server that hung up says why in its last reply.
         let _ = self.requests.send(request).await;
         let reply = self.replies.message().await?;
-        let detection = outcome(reply.ok_or_else(|| Status::unavailable("the server has ended the stream"))?)?;
-        self.workspace = None;
-        Ok(detection)
+        let detection = outcome(reply.ok_or_else(|| Status::unavailable("the server has ended the stream"))?);
+        // These two are met only after the views were added: another workspace would start another volume.
+        let was_added = [Code::ResourceExhausted, Code::Internal];
+        if detection.as_ref().map_or_else(|error| error.code().is_some_and(|code| was_added.contains(&code)), |_| true)
+        {
+            self.workspace = None;
+        }
+        detection
     }
 }
 

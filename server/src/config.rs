@@ -195,8 +195,8 @@ struct Flags {
     )]
     drain_timeout: String,
 
-    /// Collector of OpenTelemetry that gets a trace of each request, over gRPC, such as http://127.0.0.1:4317. A request
-    /// that brings a W3C traceparent is a part of its caller's trace. By default nobody gets any.
+    /// Collector of OpenTelemetry that gets a trace of each request, over gRPC without TLS, such as http://127.0.0.1:4317.
+    /// A request that brings a W3C traceparent is a part of its caller's trace. By default nobody gets any.
     #[arg(long, env = "GRASPD_OTLP", value_name = "URL")]
     otlp: Option<String>,
 
@@ -238,30 +238,26 @@ impl Config {
         let queue = errors.parse("queue", &flags.queue, COUNT).map(|Count(queue)| queue);
         let max_batch = errors.parse("max-batch", &flags.max_batch, COUNT).map(|Count(volumes)| volumes);
         let batch_delay = errors
-            .parse("batch-delay", &flags.batch_delay, "a number of milliseconds, 0 or more")
+            .parse("batch-delay", &flags.batch_delay, "a number of milliseconds from 0 to a million")
             .map(|Seconds(milliseconds)| milliseconds / 1000);
-        let watch =
-            errors.parse("watch", &flags.watch, "a number of seconds, 0 or more").map(|Seconds(duration)| duration);
+        let watch = errors.seconds("watch", &flags.watch);
         let max_message_bytes = errors.parse("max-message-bytes", &flags.max_message_bytes, BYTES);
         let max_connections =
             errors.parse::<NonZeroUsize>("max-connections", &flags.max_connections, "a whole number above 0");
         let max_tracked = errors.parse("max-tracked", &flags.max_tracked, COUNT).map(|Count(volumes)| volumes);
-        let track_timeout = errors
-            .parse("track-timeout", &flags.track_timeout, "a number of seconds, 0 or more")
-            .map(|Seconds(duration)| duration);
+        let track_timeout = errors.seconds("track-timeout", &flags.track_timeout);
         let recent = match &flags.recent {
             Some(recent) => errors.parse("recent", recent, "a whole number, 0 or more"),
             None => Some(if flags.token_file.is_some() { 0 } else { RECENT }),
         };
-        let stall = errors
-            .parse("stall-timeout", &flags.stall_timeout, "a number of seconds, 0 or more")
-            .map(|Seconds(duration)| duration);
+        let stall = errors.seconds("stall-timeout", &flags.stall_timeout);
+        if stall == Some(Duration::ZERO) {
+            errors.add("stall-timeout", "is 0, nobody could say a word; it must be above");
+        }
         let tls = errors.tls(flags.tls_cert.as_deref(), flags.tls_key.as_deref(), flags.tls_client_ca.as_deref());
         let tokens = flags.token_file.map(Tokens::read).transpose();
         let tokens = tokens.map_err(|error| errors.add("token-file", format_args!("{error:#}"))).ok();
-        let drain_timeout = errors
-            .parse("drain-timeout", &flags.drain_timeout, "a number of seconds, 0 or more")
-            .map(|Seconds(duration)| duration);
+        let drain_timeout = errors.seconds("drain-timeout", &flags.drain_timeout);
         let log_format = errors.parse("log-format", &flags.log_format, "text or json");
         if let Err(error) = EnvFilter::try_new(&flags.log) {
             errors.add("log", format_args!("is `{}`: {error}", flags.log));
@@ -349,6 +345,10 @@ impl ConfigErrors {
     fn parse<T: FromStr>(&mut self, flag: &str, value: &str, expected: &str) -> Option<T> {
         value.parse().map_err(|_| self.add(flag, format_args!("is `{value}`, it must be {expected}"))).ok()
     }
+
+    fn seconds(&mut self, flag: &str, value: &str) -> Option<Duration> {
+        self.parse(flag, value, "a number of seconds from 0 to a million").map(|Seconds(duration)| duration)
+    }
 }
 
 impl Display for ConfigErrors {
@@ -377,6 +377,10 @@ impl FromStr for Seconds {
 
     fn from_str(text: &str) -> Result<Self, ()> {
         let seconds: f64 = text.parse().map_err(drop)?;
+        // Longer ones could not be added to a moment.
+        if seconds > 1e6 {
+            return Err(());
+        }
         Duration::try_from_secs_f64(seconds).map(Self).map_err(drop)
     }
 }

@@ -26,7 +26,15 @@ pub(crate) fn accept(listener: TcpListener, doors: Doors) -> impl Stream<Item = 
     let Doors { most, patience, open, refused } = doors;
     // `Server::tcp_nodelay` does nothing for a listener that was bound before; without TCP_NODELAY a reply of several
     // packets waits 40 ms for the client to acknowledge the first.
-    TcpIncoming::from(listener).with_nodelay(Some(true)).filter_map(move |accepted| match accepted {
+    let accepted = TcpIncoming::from(listener).with_nodelay(Some(true)).then(async |accepted| {
+        if let Err(error) = &accepted {
+            // Most likely too many files are open; asked again at once, it would say the same.
+            warn!(%error, "a connection could not be taken");
+            sleep(PAUSE).await;
+        }
+        accepted
+    });
+    accepted.filter_map(move |accepted| match accepted {
         Ok(stream) if open.get() < i64::try_from(most).unwrap_or(i64::MAX) => {
             Some(Ok(Connection::new(stream, patience, &open)))
         }
@@ -38,6 +46,9 @@ pub(crate) fn accept(listener: TcpListener, doors: Doors) -> impl Stream<Item = 
         Err(error) => Some(Err(error)),
     })
 }
+
+/// After a connection could not be taken.
+const PAUSE: Duration = Duration::from_millis(100);
 
 /// What every client says first, before HTTP/2 (RFC 9113, section 3.4) and, longer than this, before TLS. From then on
 /// keep-alive pings and TLS's own timeout watch over the connection.

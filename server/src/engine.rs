@@ -225,17 +225,19 @@ impl Engine {
 
     /// Refuses where there is no place at this moment, so that nothing is prepared in vain.
     pub fn check_place(&self) -> Result<(), Overloaded> {
-        self.queue.is_full().map_or(Ok(()), |full| Err(self.overloaded(&full)))
+        if self.queue.is_full() { Err(self.overloaded()) } else { Ok(()) }
     }
 
     fn push(&self, scene: Scene, task: Task, deadline: Option<Deadline>, span: Span) -> Result<Place<Job>, Overloaded> {
         // The queue is closed only when the engine goes.
         let job = Job { scene, task, deadline, span, submitted: Instant::now() };
-        self.queue.push(job).map_err(|full| self.overloaded(&full))
+        self.queue.push(job).map_err(|Full| self.overloaded())
     }
 
-    fn overloaded(&self, &Full(waiting): &Full) -> Overloaded {
-        Overloaded { model: self.source.name().to_owned(), waiting, retry_after: self.pace.get() }
+    /// What is said to whom there is no place for.
+    pub fn overloaded(&self) -> Overloaded {
+        let (model, waiting) = (self.source.name().to_owned(), self.capacity());
+        Overloaded { model, waiting, retry_after: self.pace.get() }
     }
 }
 
@@ -336,8 +338,13 @@ fn infer(network: &mut Network, own: DecodeParams, jobs: Vec<Job>, done: impl Fn
     let volumes: Vec<&Volume> = jobs.iter().map(|job| &job.scene.volume).collect();
     let output = caught(|| Ok(network.infer(&volumes)?));
     let taken = done(started.elapsed());
-    for (index, Job { scene, task, span, submitted, .. }) in jobs.into_iter().enumerate() {
+    for (index, Job { scene, task, deadline, span, submitted }) in jobs.into_iter().enumerate() {
         let _entered = span.enter();
+        if task.is_closed() || deadline.is_some_and(|Deadline(deadline)| deadline <= Instant::now()) {
+            // Those behind it in the batch need not wait for what nobody does.
+            task.fail(EngineError::Expired);
+            continue;
+        }
         let output = match &output {
             Ok(output) => output,
             Err(error) => {

@@ -18,6 +18,7 @@ use crate::health::{Health, State, draining};
 use crate::intake::{Intake, Limits};
 use crate::metrics::Metrics;
 use crate::oip::Inference;
+use crate::outbox::outgoing;
 use crate::service::Grasps;
 use crate::{auth, connections, deadline, intake};
 
@@ -65,9 +66,11 @@ pub(crate) async fn serve(
     let guard = auth::guard(tokens, Arc::clone(&metrics));
     let incoming = connections::accept(listener, metrics.connections(connections, limits.stall));
     let counted = Arc::clone(&metrics);
-    let unreadable = MapResponseLayer::new(move |response| intake::unreadable(response, &counted));
+    let outgoing = MapResponseLayer::new(move |response| outgoing(intake::unreadable(response, &counted)));
     let intake = MapRequestLayer::new(move |request: http::Request<Body>| {
-        request.map(|body| Body::new(Intake::new(body, limits, Arc::clone(&metrics))))
+        let (parts, body) = request.into_parts();
+        let body = Intake::new(parts.uri.path(), body, limits, Arc::clone(&metrics));
+        http::Request::from_parts(parts, Body::new(body))
     });
     let mut server = Server::builder();
     if let Some(tls) = tls {
@@ -77,7 +80,7 @@ pub(crate) async fn serve(
     }
     server
         .layer(intake)
-        .layer(unreadable)
+        .layer(outgoing)
         .initial_stream_window_size(STREAM_WINDOW)
         .initial_connection_window_size(CONNECTION_WINDOW)
         .max_frame_size(MAX_FRAME)

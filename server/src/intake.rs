@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use http::HeaderValue;
 use http_body::{Frame, SizeHint};
-use tokio::time::{Instant, Sleep, sleep_until};
+use tokio::time::{Instant, Sleep, sleep};
 use tonic::body::Body;
 use tonic::codegen::Bytes;
 use tonic::{Code, Status};
@@ -16,6 +16,9 @@ use crate::metrics::Metrics;
 
 /// A gRPC message's prefix: whether it is compressed, then its length, four bytes from the highest on.
 const PREFIX: usize = 5;
+
+/// How the methods end that take a stream of messages.
+const STREAMS: [&str; 3] = ["Stream", "TrackGrasps", "ServerReflectionInfo"];
 
 /// What a message must come by at least, bytes a second: one that is fed a byte at a time never stands still.
 const SLOWEST: f64 = 65_536.0;
@@ -34,11 +37,15 @@ pub(crate) struct Intake {
     body: Body,
     limits: Limits,
     metrics: Arc<Metrics>,
+    /// Whether messages may come whenever they like, as those of a stream do.
+    rests: bool,
     message: Message,
-    /// When the message has stood still for too long; not set between messages, where a stream may rest.
-    patience: Option<Pin<Box<Sleep>>>,
-    /// When all of the message must be here.
-    latest: Instant,
+    /// Since when the client is waited for.
+    since: Option<Instant>,
+    /// For how long it was, in this message; what the server takes to read on is not the client's fault.
+    waited: Duration,
+    /// Ends the waiting.
+    patience: Pin<Box<Sleep>>,
     state: State,
 }
 
@@ -52,6 +59,8 @@ enum State {
 /// Where in a message the body is.
 #[derive(Debug, Default, PartialEq, Eq)]
 struct Message {
+    /// Which message, from 1 on; 0 before the first.
+    number: usize,
     prefix: [u8; PREFIX],
     /// Bytes of the prefix that have come.
     prefixed: usize,
@@ -60,16 +69,31 @@ struct Message {
 }
 
 impl Intake {
-    pub fn new(body: Body, limits: Limits, metrics: Arc<Metrics>) -> Self {
+    /// The body of a request for a method at `path`.
+    pub fn new(path: &str, body: Body, limits: Limits, metrics: Arc<Metrics>) -> Self {
         Self {
             body,
             limits,
             metrics,
+            rests: STREAMS.iter().any(|stream| path.ends_with(stream)),
             message: Message::default(),
-            patience: None,
-            latest: Instant::now(),
+            since: None,
+            waited: Duration::ZERO,
+            patience: Box::pin(sleep(Duration::ZERO)),
             state: State::Open,
         }
+    }
+
+    /// Whether there is something that the client should send at once.
+    fn is_owed(&self) -> bool {
+        self.message.has_begun() || !self.rests
+    }
+
+    /// For how much longer the client is waited for.
+    fn left(&self) -> Duration {
+        let Limits { stall, .. } = self.limits;
+        let slowest = 2 * stall + Duration::from_secs_f64(self.message.length() as f64 / SLOWEST);
+        stall.min(slowest.saturating_sub(self.waited))
     }
 
     fn refuse(&mut self, status: Status) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
@@ -79,14 +103,18 @@ impl Intake {
     }
 
     fn stalled(&self) -> Status {
-        let (missing, stall) = (self.message.missing, self.limits.stall);
-        let lacks = if missing == 0 { "its length".to_owned() } else { format!("{missing} bytes") };
-        let why = if Instant::now() < self.latest {
-            format!("has stood still for {stall:?}")
-        } else {
-            format!("comes more slowly than {SLOWEST} bytes a second")
+        let stall = self.limits.stall;
+        let lacks = match self.message.missing {
+            0 if self.message.number > 0 && !self.message.has_begun() => "the end of the request is".to_owned(),
+            0 => "its length is".to_owned(),
+            missing => format!("{missing} bytes of it are"),
         };
-        Status::deadline_exceeded(format!("the message {why}, {lacks} of it are missing; send it anew"))
+        let why = if self.left() < stall {
+            format!("comes more slowly than {SLOWEST} bytes a second")
+        } else {
+            format!("has stood still for {stall:?}")
+        };
+        Status::deadline_exceeded(format!("the message {why}, {lacks} missing; send it anew"))
     }
 
     fn too_large(&self, bytes: usize) -> Status {
@@ -135,6 +163,7 @@ impl Message {
             if self.prefixed < PREFIX {
                 if self.prefixed == 0 {
                     begins = at;
+                    self.number += 1;
                 }
                 self.prefix[self.prefixed] = bytes[at];
                 self.prefixed += 1;
@@ -142,8 +171,7 @@ impl Message {
                 if self.prefixed < PREFIX {
                     continue;
                 }
-                let [_, a, b, c, d] = self.prefix;
-                self.missing = u32::from_be_bytes([a, b, c, d]) as usize;
+                self.missing = self.length();
                 if self.missing > longest {
                     return Err(TooLarge { bytes: self.missing, begins });
                 }
@@ -160,6 +188,12 @@ impl Message {
 
     fn has_begun(&self) -> bool {
         self.prefixed > 0
+    }
+
+    /// Of the message, bytes; 0 until it is known.
+    fn length(&self) -> usize {
+        let [_, a, b, c, d] = self.prefix;
+        if self.prefixed == PREFIX { u32::from_be_bytes([a, b, c, d]) as usize } else { 0 }
     }
 }
 
@@ -178,13 +212,32 @@ impl http_body::Body for Intake {
             }
         }
         let Poll::Ready(frame) = Pin::new(&mut this.body).poll_frame(context) else {
-            let Some(patience) = &mut this.patience else { return Poll::Pending };
-            ready!(patience.as_mut().poll(context));
+            if !this.is_owed() {
+                return Poll::Pending;
+            }
+            if this.since.is_none() {
+                let (now, left) = (Instant::now(), this.left());
+                this.since = Some(now);
+                this.patience.as_mut().reset(now + left);
+            }
+            ready!(this.patience.as_mut().poll(context));
             let status = this.stalled();
             return this.refuse(status);
         };
-        let data = frame.as_ref().and_then(|frame| frame.as_ref().ok()?.data_ref());
+        if let Some(since) = this.since.take() {
+            this.waited += since.elapsed();
+        }
+        let data = match &frame {
+            Some(Ok(frame)) => frame.data_ref(),
+            // Who goes resets the stream, which hyper tells as its end; tonic would take it for a broken message.
+            Some(Err(_)) | None if this.message.has_begun() => {
+                let status = Status::cancelled("the caller has gone in the middle of the message");
+                return this.refuse(status);
+            }
+            Some(Err(_)) | None => None,
+        };
         let Some(data) = data else { return Poll::Ready(frame) };
+        let before = this.message.number;
         if let Err(TooLarge { bytes, begins }) = this.message.advance(data, this.limits.message_bytes) {
             let status = this.too_large(bytes);
             if begins == 0 {
@@ -193,15 +246,8 @@ impl http_body::Body for Intake {
             this.state = State::Refusing(status);
             return Poll::Ready(Some(Ok(Frame::data(data.slice(..begins)))));
         }
-        let until = Instant::now() + this.limits.stall;
-        match &mut this.patience {
-            patience if !this.message.has_begun() => *patience = None,
-            Some(patience) => patience.as_mut().reset(until.min(this.latest)),
-            patience => {
-                this.latest =
-                    until + this.limits.stall + Duration::from_secs_f64(this.message.missing as f64 / SLOWEST);
-                *patience = Some(Box::pin(sleep_until(until)));
-            }
+        if this.message.number != before {
+            this.waited = Duration::ZERO;
         }
         Poll::Ready(frame)
     }

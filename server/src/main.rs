@@ -14,6 +14,7 @@ mod intake;
 mod metrics;
 mod models;
 mod oip;
+mod outbox;
 mod perceive;
 mod planner;
 mod queue;
@@ -90,13 +91,13 @@ fn runtime(config: &Config) -> anyhow::Result<Runtime> {
 
 /// From the configuration to the last session dropped.
 fn run(config: &Config, runtime: Runtime, traces: &Traces) -> anyhow::Result<()> {
-    allow_connections(config.max_connections);
+    let connections = allow_connections(config.max_connections);
     let onnxruntime = grasp_models::init()?;
     info!(version = onnxruntime.version, library = %onnxruntime.library.display(), "ONNX Runtime");
 
     let metrics = Arc::new(Metrics::new());
     let sessions = Arc::new(Sessions::default());
-    let served = runtime.block_on(serve(config, &metrics, &sessions));
+    let served = runtime.block_on(serve(config, connections, &metrics, &sessions));
     traces.finish();
     // With the runtime the last way to reach the sessions goes.
     runtime.shutdown_timeout(PATIENCE);
@@ -106,7 +107,12 @@ fn run(config: &Config, runtime: Runtime, traces: &Traces) -> anyhow::Result<()>
 }
 
 /// From binding the listeners to the end of the drain.
-async fn serve(config: &Config, metrics: &Arc<Metrics>, sessions: &Arc<Sessions>) -> anyhow::Result<()> {
+async fn serve(
+    config: &Config,
+    connections: usize,
+    metrics: &Arc<Metrics>,
+    sessions: &Arc<Sessions>,
+) -> anyhow::Result<()> {
     let mut signals = Signals::new().context("cannot handle signals")?;
     let hangup = hangup().context("cannot handle signals")?;
     let grpc = bind(config.listen, "--listen").await?;
@@ -120,15 +126,15 @@ async fn serve(config: &Config, metrics: &Arc<Metrics>, sessions: &Arc<Sessions>
     let recent = Arc::new(Recent::new(config.recent));
     let pages = Pages { metrics: Arc::clone(metrics), models: Arc::clone(&models), recent: Arc::clone(&recent) };
     let http = tokio::spawn(http::serve(http, pages, state.clone()));
-    let Config { tls, tokens, max_connections: connections, limits, max_tracked, track_timeout, .. } = config;
+    let Config { tls, tokens, limits, max_tracked, track_timeout, queue, .. } = config;
     let calls = Calls::new(Arc::clone(metrics), recent, state.clone());
     let inference = Inference::new(Arc::clone(&models), calls.clone());
     let kept = Kept::new(*max_tracked, *track_timeout, metrics.tracked());
-    let service = Grasps::new(Arc::clone(&models), calls, kept);
+    let service = Grasps::new(Arc::clone(&models), calls, kept, *queue);
     if let Some(tokens) = tokens {
         tokio::spawn(Arc::clone(tokens).watch(self::hangup().context("cannot handle signals")?));
     }
-    let entrance = Entrance { tls: tls.clone(), tokens: tokens.clone(), connections: *connections, limits: *limits };
+    let entrance = Entrance { tls: tls.clone(), tokens: tokens.clone(), connections, limits: *limits };
     let mut grpc = tokio::spawn(grpc::serve(grpc, entrance, service, inference, Arc::clone(metrics), state.clone()));
 
     let folder = Folder::new(config, models, Arc::clone(sessions), Arc::clone(metrics));
@@ -165,8 +171,9 @@ async fn bind(address: SocketAddr, flag: &str) -> anyhow::Result<TcpListener> {
     TcpListener::bind(address).await.with_context(|| format!("cannot listen on {flag} {address}"))
 }
 
-/// Raises the limit of open files as far as this process may: many systems give 1024 to who does not ask for more.
-fn allow_connections(connections: usize) {
+/// Raises the limit of open files as far as this process may: many systems give 1024 to who does not ask for more. Returns
+/// how many connections may be open then.
+fn allow_connections(connections: usize) -> usize {
     // Models, listeners and logs are files, too.
     const OTHERS: u64 = 64;
     let limit = getrlimit(Resource::Nofile);
@@ -174,9 +181,11 @@ fn allow_connections(connections: usize) {
         warn!(%error, "the limit of open files stays as it is");
     }
     let files = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
-    if files < connections as u64 + OTHERS {
-        warn!(files, connections, "fewer files may be open than connections are allowed (--max-connections)");
+    let most = usize::try_from(files.saturating_sub(OTHERS)).unwrap_or(usize::MAX).max(1);
+    if most < connections {
+        warn!(files, connections, most, "fewer files may be open than connections are allowed (--max-connections)");
     }
+    connections.min(most)
 }
 
 /// Tells whoever started this process; it need not be listening.

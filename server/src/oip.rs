@@ -10,12 +10,14 @@ use grasp_proto::oip::{self, infer_parameter::ParameterChoice};
 use grasp_proto::{FieldError, on_a_line};
 use nalgebra::Isometry3;
 use prost::bytes::Bytes;
+use tokio::task::spawn_blocking;
 use tonic::{Request, Response, Status};
 
 use crate::call::{Call, Caller, Calls};
-use crate::engine::{Engine, Reply, Tensors};
+use crate::engine::{Engine, EngineError, Reply, Tensors};
 use crate::health::State;
 use crate::models::Models;
+use crate::outbox::{Held, Outbox};
 use crate::refusal::Refusal;
 use crate::timings::Timings;
 
@@ -24,16 +26,21 @@ const FP32: &str = "FP32";
 /// The most volumes of one request, if so many may wait.
 const MAX_BATCH: usize = 64;
 
+/// Bytes of the maps for each voxel of a volume: six f32.
+const MAPS_PER_VOXEL: usize = 24;
+
 /// The Open Inference Protocol: a network's own input and output, for tools that know nothing of grasps.
 #[derive(Clone)]
 pub(crate) struct Inference {
     models: Arc<Models>,
     calls: Calls,
+    /// Maps are a hundred times as large as the grasps in them.
+    outbox: Outbox,
 }
 
 impl Inference {
     pub fn new(models: Arc<Models>, calls: Calls) -> Self {
-        Self { models, calls }
+        Self { models, calls, outbox: Outbox::new() }
     }
 
     fn is_ready(&self) -> bool {
@@ -69,6 +76,7 @@ impl Inference {
             }
         }
         let batch = batches(request, n, max_batch(&engine))?;
+        let held = self.outbox.hold(batch.len() * MAPS_PER_VOXEL).ok_or_else(|| engine.overloaded())?;
         let volume = |values: &[f32]| {
             let volume = Volume::new(n, voxel_size, Isometry3::identity(), values.to_vec());
             volume.map_err(|error| {
@@ -79,7 +87,7 @@ impl Inference {
         // If one finds no place, those before it leave theirs.
         let replies = volumes.into_iter().map(|volume| engine.maps(volume, call.deadline, call.span()));
         let replies = replies.collect::<Result<Vec<_>, _>>()?;
-        Ok(Queued { engine, replies })
+        Ok(Queued { engine, replies, held })
     }
 }
 
@@ -87,6 +95,7 @@ impl Inference {
 struct Queued {
     engine: Arc<Engine>,
     replies: Vec<Reply<Tensors>>,
+    held: Held,
 }
 
 /// The values of the input, checked: `[batch, 1, n, n, n]`.
@@ -139,6 +148,12 @@ fn batches(request: &oip::ModelInferRequest, n: usize, most: usize) -> Result<Ve
             format_args!("the shape needs {expected}"),
         ))
     }
+}
+
+/// Copies of megabytes are made where no messages are moved.
+async fn copying<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, Status> {
+    let copied = spawn_blocking(work).await;
+    copied.map_err(|panic| Status::internal(EngineError::Panic(panic.to_string()).to_string()))
 }
 
 /// The volumes' maps one after the other, as one tensor for each output that was asked for.
@@ -245,12 +260,20 @@ impl GrpcInferenceService for Inference {
         let request = request.into_inner();
         let (mut call, checked) = self.calls.open(request.id.clone(), caller);
         let id = call.id.clone();
-        let outcome = match checked.and_then(|()| self.submit(&request, &mut call)) {
-            Ok(Queued { engine, replies }) => call.maps(replies).await.map(|answer| (engine, answer)),
+        let inference = self.clone();
+        let (call, request, queued) = copying(move || {
+            let queued = checked.and_then(|()| inference.submit(&request, &mut call));
+            (call, request, queued)
+        })
+        .await?;
+        let outcome = match queued {
+            Ok(Queued { engine, replies, held }) => call.maps(replies).await.map(|answer| (engine, held, answer)),
             Err(refusal) => Err(call.end(refusal)),
         };
-        let (engine, (maps, timings)) = outcome.map_err(|refusal| refusal.status(&id))?;
-        Ok(Response::new(response(request, &engine, &maps, &timings)))
+        let (engine, held, (maps, timings)) = outcome.map_err(|refusal| refusal.status(&id))?;
+        let mut response = Response::new(copying(move || response(request, &engine, &maps, &timings)).await?);
+        response.extensions_mut().insert(held);
+        Ok(response)
     }
 
     async fn model_config(
@@ -289,7 +312,8 @@ fn edge(engine: &Engine) -> i64 {
     engine.source.network().map_or(0, |entry| entry.metadata.resolution as i64)
 }
 
-/// A request whose volumes do not all fit into the queue could never be answered.
+/// A request whose volumes do not all fit into the queue, or whose maps into the outbox, could never be answered.
 fn max_batch(engine: &Engine) -> usize {
-    MAX_BATCH.min(engine.capacity())
+    let maps = (edge(engine) as usize).pow(3) * MAPS_PER_VOXEL;
+    MAX_BATCH.min(engine.capacity()).min(Outbox::CAPACITY / maps.max(1))
 }

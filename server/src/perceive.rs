@@ -87,7 +87,7 @@ impl Grid {
 
     /// Adds views, each of which must see something of the cube. Returns what planners on point clouds want.
     pub fn integrate(&self, fusion: &mut Fusion, views: &[View]) -> Result<Vec<SurfacePoint>, FieldError> {
-        let mut sights = Vec::new();
+        let mut sights = Sights::default();
         for (index, view) in views.iter().enumerate() {
             let image = DepthImage::new(view.intrinsics, &view.depth);
             let image = image.map_err(|error| FieldError::refused(format!("views[{index}]"), error))?;
@@ -98,12 +98,11 @@ impl Grid {
                 return Err(FieldError::new(format!("views[{index}]"), blind(&eye.vector.into()), reason));
             }
             if self.sights {
-                // A planner looks at nothing else, and there may be millions.
                 let inside = |point: &SurfacePoint| point.position.iter().all(|c| (0.0..=self.size).contains(c));
-                sights.extend(image.points(&view.camera_from_task).filter(inside));
+                image.points(&view.camera_from_task).filter(inside).for_each(|point| sights.add(point));
             }
         }
-        Ok(sights)
+        Ok(sights.points)
     }
 
     /// What a planner looks at.
@@ -116,6 +115,41 @@ impl Grid {
             error => FieldError::refused("workspace", error),
         })?;
         Ok(Scene { volume, sights: sights.filter(|_| self.sights) })
+    }
+}
+
+/// Points that were seen, thinned out evenly once there are [`MOST`](Self::MOST): images may have millions of pixels, and a
+/// queue of requests that hold them would fill the memory.
+struct Sights {
+    points: Vec<SurfacePoint>,
+    /// One of so many is kept.
+    every: usize,
+    passed: usize,
+}
+
+impl Sights {
+    /// Far more than the planners, which thin them again, look at: 10 MB.
+    const MOST: usize = 200_000;
+
+    fn add(&mut self, point: SurfacePoint) {
+        if self.passed.is_multiple_of(self.every) {
+            self.points.push(point);
+        }
+        self.passed += 1;
+        if self.points.len() == Self::MOST {
+            let mut index = 0;
+            self.points.retain(|_| {
+                index += 1;
+                index % 2 == 1
+            });
+            self.every *= 2;
+        }
+    }
+}
+
+impl Default for Sights {
+    fn default() -> Self {
+        Self { points: Vec::new(), every: 1, passed: 0 }
     }
 }
 
@@ -168,6 +202,15 @@ fn turned(azimuth: f64, size: f64, eyes: &[Point3<f64>]) -> Isometry3<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn points_are_thinned_out_evenly() {
+        let mut sights = Sights::default();
+        let point = |x: usize| SurfacePoint { position: Point3::new(x as f64, 0.0, 0.0), normal: Vector3::z() };
+        (0..5 * Sights::MOST).for_each(|x| sights.add(point(x)));
+        assert!((Sights::MOST / 2..Sights::MOST).contains(&sights.points.len()));
+        assert!(sights.points.windows(2).all(|pair| pair[1].position.x - pair[0].position.x == 8.0));
+    }
 
     #[test]
     fn the_cube_turns_until_the_camera_stands_where_the_network_was_trained() {

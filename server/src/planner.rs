@@ -158,16 +158,19 @@ impl Classical {
             Some(sights) => Cow::Borrowed(sights),
             None => Cow::Owned(Fusion::of(volume).surface()),
         };
-        let on_objects = sights.iter().filter(|point| is_on_an_object(&point.position, size, table));
-        let cloud = Cloud::new(on_objects.copied());
+        let on_objects: Vec<SurfacePoint> =
+            sights.iter().filter(|point| is_on_an_object(&point.position, size, table)).copied().collect();
+        let elsewhere = sights.len() - on_objects.len();
+        let cloud = Cloud::new(on_objects);
         let hand = asked.hand.unwrap_or(Hand::GPD);
         let aperture = PLAY..=(2.0 * hand.half_opening() - PLAY);
         let params_of_hands = Params { hand, aperture, ..Params::above(table + ABOVE_TABLE) };
-        let mut found = Vec::new();
+        let (mut found, mut unfit) = (Vec::new(), 0);
         for of_sample in by_sample(&cloud, &params_of_hands, &mut ChaCha8Rng::seed_from_u64(0)) {
             if !wanted() {
                 return Err(EngineError::Expired);
             }
+            unfit += params_of_hands.rotations - of_sample.len();
             found.extend(of_sample);
         }
         let grasps = match self {
@@ -186,6 +189,9 @@ impl Classical {
         };
         let in_frame: Vec<Grasp> =
             grasps.into_iter().map(|grasp| Grasp { pose: volume.pose() * grasp.pose, ..grasp }).collect();
-        Ok(select(&in_frame, volume, params))
+        let mut decoded = select(&in_frame, volume, params);
+        decoded.dropped.mask += elsewhere;
+        decoded.dropped.collision += unfit;
+        Ok(decoded)
     }
 }

@@ -54,7 +54,7 @@ impl Batching {
 
 /// So many jobs wait that no more are taken.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Full(pub usize);
+pub(crate) struct Full;
 
 impl<T> Queue<T> {
     /// A queue of so many sessions, in which `capacity` jobs may wait. They are counted in `gauge`, beside those of
@@ -69,7 +69,7 @@ impl<T> Queue<T> {
         let mut state = self.lock();
         // A free session may not have woken up yet for a job that waits.
         if state.waiting.len() >= self.capacity + state.free {
-            return Err(Full(self.capacity));
+            return Err(Full);
         }
         let number = state.next;
         state.next += 1;
@@ -85,10 +85,10 @@ impl<T> Queue<T> {
         self.capacity
     }
 
-    /// How many wait, if no more can: what [`push`](Self::push) would say at this moment.
-    pub fn is_full(&self) -> Option<Full> {
+    /// Whether [`push`](Self::push) would refuse at this moment.
+    pub fn is_full(&self) -> bool {
         let state = self.lock();
-        (state.waiting.len() >= self.capacity + state.free).then_some(Full(self.capacity))
+        state.waiting.len() >= self.capacity + state.free
     }
 
     /// Waits for jobs and takes them, the oldest first; none when the queue is closed and empty. The session is busy then,
@@ -176,7 +176,7 @@ mod tests {
     fn jobs_come_out_in_their_order_and_no_more_than_fit_wait() {
         let (queue, gauge) = queue(0, 3);
         let _places: Vec<_> = (0..3).map(|job| queue.push(job).ok().unwrap()).collect();
-        assert_eq!(queue.push(3).err(), Some(Full(3)));
+        assert_eq!(queue.push(3).err(), Some(Full));
         assert_eq!(gauge.get(), 3);
         queue.free();
         assert_eq!(queue.take(ONE), Some(vec![0]));
@@ -220,9 +220,9 @@ mod tests {
     fn a_free_session_is_a_place_more_until_it_takes_something() {
         let (queue, _) = queue(1, 1);
         let mut places = vec![queue.push(1).ok().unwrap(), queue.push(2).ok().unwrap()];
-        assert_eq!(queue.push(3).err(), Some(Full(1)));
+        assert_eq!(queue.push(3).err(), Some(Full));
         assert_eq!(queue.take(ONE), Some(vec![1]));
-        assert_eq!(queue.push(3).err(), Some(Full(1)), "it is busy, and one waits");
+        assert_eq!(queue.push(3).err(), Some(Full), "it is busy, and one waits");
         queue.free();
         places.push(queue.push(3).ok().unwrap());
         assert_eq!(queue.take(ONE), Some(vec![2]));

@@ -3,7 +3,7 @@ use std::sync::Arc;
 use std::thread;
 use std::time::Instant;
 
-use grasp::Volume;
+use grasp::{View, Volume};
 use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::grasp_service_server::GraspService;
 use grasp_proto::{Asked, FieldError, Workspace, check_count, cloud_view, depth_view, pb, resolution};
@@ -38,8 +38,10 @@ pub(crate) struct Grasps {
     models: Arc<Models>,
     calls: Calls,
     kept: Arc<Kept>,
-    /// As many requests as there are processors convert and fuse at a time: a crowd of them would fill the memory.
+    /// As many requests as there are processors convert and fuse at a time...
     fusing: Arc<Semaphore>,
+    /// ... and as many more as a model's queue takes wait for that: a crowd of them would fill the memory.
+    turns: Arc<Semaphore>,
 }
 
 /// A request that was taken, or refused without anyone having been told yet.
@@ -60,16 +62,24 @@ impl Begun {
 }
 
 impl Grasps {
-    pub fn new(models: Arc<Models>, calls: Calls, kept: Kept) -> Self {
+    /// `queue` requests may wait to be converted and fused.
+    pub fn new(models: Arc<Models>, calls: Calls, kept: Kept, queue: usize) -> Self {
         let processors = thread::available_parallelism().map_or(1, NonZero::get);
-        Self { models, calls, kept: Arc::new(kept), fusing: Arc::new(Semaphore::new(processors)) }
+        let semaphore = |places: usize| Arc::new(Semaphore::new(places.min(Semaphore::MAX_PERMITS)));
+        let (fusing, turns) = (semaphore(processors), semaphore(processors.saturating_add(queue)));
+        Self { models, calls, kept: Arc::new(kept), fusing, turns }
     }
 
-    /// Checks a request and queues its volume. What is wrong with it comes out of [`Begun::finish`], like the answer.
-    async fn begin(&self, mut request: pb::DetectGraspsRequest, caller: Caller) -> Begun {
-        let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), caller);
+    /// Opens a call and submits what it asks for. What is wrong with it comes out of [`Begun::finish`], like the answer.
+    async fn begin(
+        &self,
+        request_id: String,
+        caller: Caller,
+        submit: impl AsyncFnOnce(&mut Call) -> Result<Work, Refusal>,
+    ) -> Begun {
+        let (mut call, checked) = self.calls.open(request_id, caller);
         let work = match checked {
-            Ok(()) => self.submit(request, &mut call).await,
+            Ok(()) => submit(&mut call).await,
             Err(refusal) => Err(refusal),
         };
         Begun { call, work }
@@ -86,9 +96,9 @@ impl Grasps {
         let checked = if volume.data.len() <= AT_ONCE {
             Volume::try_from(&volume)?
         } else {
-            let place = self.fusing_place(call).await?;
+            let held = (self.turn(&engine)?, self.fusing_place(call).await?);
             engine.check_place()?;
-            blocking(place, move || Ok(Volume::try_from(&volume)?)).await?
+            blocking(held, move || Ok(Volume::try_from(&volume)?)).await?
         };
         check_voxel_size(&checked, &engine)?;
         call.submit(&engine, Scene { volume: checked, sights: None }, asked, origin, None)
@@ -96,31 +106,45 @@ impl Grasps {
 
     async fn submit_depth(&self, request: pb::DetectGraspsFromDepthRequest, call: &mut Call) -> Result<Work, Refusal> {
         let pb::DetectGraspsFromDepthRequest { views, workspace, options, .. } = request;
-        let (asked, workspace, origin, engine) = self.prepare(views.len(), workspace, options, call)?;
-        let place = self.fusing_place(call).await?;
-        engine.check_place()?;
-        let from = Arc::clone(&engine);
-        let fused = blocking(place, move || {
-            let frame_from_task = &workspace.frame_from_task;
-            let views = views.iter().enumerate().map(|(index, view)| depth_view(view, index, frame_from_task));
-            let views = views.collect::<Result<Vec<_>, _>>()?;
-            fuse(&from, asked, &workspace, &views)
-        });
-        let (scene, asked, fusion) = fused.await?;
-        call.submit(&engine, scene, asked, origin, Some(fusion))
+        let count = views.len();
+        let seen = move |workspace: &Workspace, _: f64| -> Result<Vec<View>, FieldError> {
+            let views = views.iter().enumerate();
+            views.map(|(index, view)| depth_view(view, index, &workspace.frame_from_task)).collect()
+        };
+        self.submit_views(count, workspace, options, call, seen).await
     }
 
     async fn submit_cloud(&self, request: pb::DetectGraspsFromCloudRequest, call: &mut Call) -> Result<Work, Refusal> {
         let pb::DetectGraspsFromCloudRequest { views, workspace, options, .. } = request;
-        let (asked, workspace, origin, engine) = self.prepare(views.len(), workspace, options, call)?;
-        let place = self.fusing_place(call).await?;
+        let count = views.len();
+        let seen = move |workspace: &Workspace, size: f64| -> Result<Vec<View>, FieldError> {
+            let views = views.iter().enumerate();
+            let clouds = views.map(|(index, view)| cloud_view(view, index, &workspace.frame_from_task));
+            rendered(&clouds.collect::<Result<Vec<_>, _>>()?, size)
+        };
+        self.submit_views(count, workspace, options, call, seen).await
+    }
+
+    /// Fuses so many views, which are `seen` in a workspace and a cube of that size, and queues what they show.
+    async fn submit_views(
+        &self,
+        count: usize,
+        workspace: Option<pb::Workspace>,
+        options: Option<pb::Options>,
+        call: &mut Call,
+        seen: impl FnOnce(&Workspace, f64) -> Result<Vec<View>, FieldError> + Send + 'static,
+    ) -> Result<Work, Refusal> {
+        check_count(count)?;
+        let asked = Asked::try_from(&options.unwrap_or_default())?;
+        let mut workspace = Workspace::try_from(workspace.unwrap_or_default())?;
+        let origin = Origin::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
+        let engine = self.models.select(&asked.model, &asked.version, None)?;
+        call.by(&engine);
+        let held = (self.turn(&engine)?, self.fusing_place(call).await?);
         engine.check_place()?;
         let from = Arc::clone(&engine);
-        let fused = blocking(place, move || {
-            let frame_from_task = &workspace.frame_from_task;
-            let clouds = views.iter().enumerate().map(|(index, view)| cloud_view(view, index, frame_from_task));
-            let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
-            let views = rendered(&clouds, size(&from.source, &workspace))?;
+        let fused = blocking(held, move || {
+            let views = seen(&workspace, size(&from.source, &workspace))?;
             fuse(&from, asked, &workspace, &views)
         });
         let (scene, asked, fusion) = fused.await?;
@@ -134,26 +158,13 @@ impl Grasps {
         call.end(refusal).status(&id)
     }
 
-    /// What can be checked before anything is converted.
-    fn prepare(
-        &self,
-        views: usize,
-        workspace: Option<pb::Workspace>,
-        options: Option<pb::Options>,
-        call: &mut Call,
-    ) -> Result<(Asked, Workspace, Origin, Arc<Engine>), Refusal> {
-        check_count(views)?;
-        let asked = Asked::try_from(&options.unwrap_or_default())?;
-        let mut workspace = Workspace::try_from(workspace.unwrap_or_default())?;
-        let origin = Origin::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
-        let engine = self.models.select(&asked.model, &asked.version, None)?;
-        call.by(&engine);
-        // Before the work, not after it.
+    /// A turn to convert and fuse, or a refusal at once: where too many wait already, or the planner has no place.
+    fn turn(&self, engine: &Engine) -> Result<OwnedSemaphorePermit, Refusal> {
         engine.check_place()?;
-        Ok((asked, workspace, origin, engine))
+        Ok(Arc::clone(&self.turns).try_acquire_owned().map_err(|_| engine.overloaded())?)
     }
 
-    /// Waits for its turn to convert and fuse, but no longer than anybody waits for the reply.
+    /// Waits for a place to do it, but no longer than anybody waits for the reply.
     async fn fusing_place(&self, call: &Call) -> Result<OwnedSemaphorePermit, Refusal> {
         let place = Arc::clone(&self.fusing).acquire_owned();
         let place = match call.deadline {
@@ -179,6 +190,7 @@ impl Grasps {
         };
         let engine = self.models.select(&asked.model, &asked.version, None)?;
         call.by(&engine);
+        // Without a turn: there are no more of these than volumes that are kept.
         let place = self.fusing_place(call).await?;
         let (from, old) = (Arc::clone(&engine), track.take());
         // It comes back in any case: what is wrong with a view does not cost the volume.
@@ -194,7 +206,7 @@ fn fuse(
     engine: &Engine,
     mut asked: Asked,
     workspace: &Workspace,
-    views: &[grasp::View],
+    views: &[View],
 ) -> Result<(Scene, Asked, std::time::Duration), Refusal> {
     let started = Instant::now();
     let grid = Grid::of(&engine.source, workspace, &eyes(views))?;
@@ -206,7 +218,7 @@ fn fuse(
 
 /// On a thread that may take its time; those that move messages must not.
 async fn blocking<T: Send + 'static>(
-    place: OwnedSemaphorePermit,
+    place: impl Send + 'static,
     work: impl FnOnce() -> Result<T, Refusal> + Send + 'static,
 ) -> Result<T, Refusal> {
     // The place is given back when the work is done, whether or not anybody still waits for it.
@@ -225,7 +237,9 @@ impl GraspService for Grasps {
         request: Request<pb::DetectGraspsRequest>,
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
         let caller = Caller::of(&request);
-        self.begin(request.into_inner(), caller).await.respond().await
+        let mut request = request.into_inner();
+        let id = std::mem::take(&mut request.request_id);
+        self.begin(id, caller, async |call| self.submit(request, call).await).await.respond().await
     }
 
     async fn detect_grasps_from_depth(
@@ -234,12 +248,8 @@ impl GraspService for Grasps {
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
         let caller = Caller::of(&request);
         let mut request = request.into_inner();
-        let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), caller);
-        let work = match checked {
-            Ok(()) => self.submit_depth(request, &mut call).await,
-            Err(refusal) => Err(refusal),
-        };
-        Begun { call, work }.respond().await
+        let id = std::mem::take(&mut request.request_id);
+        self.begin(id, caller, async |call| self.submit_depth(request, call).await).await.respond().await
     }
 
     async fn detect_grasps_from_cloud(
@@ -248,12 +258,8 @@ impl GraspService for Grasps {
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
         let caller = Caller::of(&request);
         let mut request = request.into_inner();
-        let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), caller);
-        let work = match checked {
-            Ok(()) => self.submit_cloud(request, &mut call).await,
-            Err(refusal) => Err(refusal),
-        };
-        Begun { call, work }.respond().await
+        let id = std::mem::take(&mut request.request_id);
+        self.begin(id, caller, async |call| self.submit_cloud(request, call).await).await.respond().await
     }
 
     type DetectGraspsStreamStream = BoxStream<pb::DetectGraspsStreamResponse>;
@@ -275,7 +281,11 @@ impl GraspService for Grasps {
                     () = draining(service.calls.state()) => return place.send(Err(service.refuse(Refusal::Draining, caller))),
                 };
                 match message {
-                    Ok(Some(request)) => place.send(Ok(service.begin(request, caller.clone()).await)),
+                    Ok(Some(mut request)) => {
+                        let id = std::mem::take(&mut request.request_id);
+                        let submit = async |call: &mut Call| service.submit(request, call).await;
+                        place.send(Ok(service.begin(id, caller.clone(), submit).await));
+                    }
                     Ok(None) => return,
                     // Too large, or no message at all: HTTP/2's framing is lost, so the stream ends with this status.
                     Err(status) => return place.send(Err(service.calls.unreadable(status))),
@@ -328,16 +338,16 @@ impl GraspService for Grasps {
                     Ok(None) => return,
                     Err(status) => break service.calls.unreadable(status),
                 };
-                let (mut call, checked) = service.calls.open(std::mem::take(&mut request.request_id), caller.clone());
+                let id = std::mem::take(&mut request.request_id);
                 let answer = async {
-                    let work = match checked {
-                        Ok(()) => service.submit_track(request, &mut track, &mut call).await,
-                        Err(refusal) => Err(refusal),
-                    };
-                    let id = call.id.clone();
-                    response(id, Begun { call, work }.finish().await)
+                    let submit = async |call: &mut Call| service.submit_track(request, &mut track, call).await;
+                    let begun = service.begin(id, caller.clone(), submit).await;
+                    let id = begun.call.id.clone();
+                    response(id, begun.finish().await)
                 };
                 tokio::select! {
+                    // What was read is opened first, and counted.
+                    biased;
                     answer = answer => reply.send(Ok(answer)),
                     // Who has gone wants none; the call counts as cancelled.
                     () = replies.closed() => return,

@@ -2,9 +2,11 @@
 //!
 //! `make soak`, or `cargo run --release -p grasp-tests --example soak [MINUTES]` with `ORT_DYLIB_PATH` set. First a minute in
 //! which four times as many ask as can be answered, then, for 20 minutes unless told otherwise, callers who come by chance
-//! at 80 % of what it can do. The last line is one JSON object.
+//! at 80 % of what it can do. The callers have a processor of their own, where there are two: what they take is no work of
+//! the server's. The last line is one JSON object.
 
 use std::fs;
+use std::io;
 use std::path::Path;
 use std::time::Duration;
 
@@ -15,6 +17,7 @@ use grasp_proto::pb::DetectGraspsRequest;
 use grasp_proto::pb::grasp_service_client::GraspServiceClient;
 use grasp_tests::{blobs, graspd};
 use nalgebra::Isometry3;
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 use serde_json::json;
 use tonic::Code;
 use tonic::transport::Channel;
@@ -34,7 +37,12 @@ const SOAK: f64 = 0.8;
 async fn main() -> anyhow::Result<()> {
     ensure!(!cfg!(debug_assertions), "this measures: build it with --release");
     let minutes: u32 = std::env::args().nth(1).map_or(Ok(20), |minutes| minutes.parse())?;
+    let (ours, servers) = processors()?;
+    // A process begins on the processors of who starts it.
+    sched_setaffinity(None, &servers)?;
     let server = LocalServer::spawn(graspd(), ["--models", ZOO, "--log", "error"])?;
+    sched_setaffinity(None, &ours)?;
+    println!("the server has {} processors, its callers {}", servers.count(), ours.count());
     let volume = blobs(grasp::RESOLUTION, Isometry3::identity(), &[[10, 20, 15], [30, 12, 25]]);
     let volume = Some(encode(&volume, DataType::F32, ""));
     let caller = Caller {
@@ -98,7 +106,21 @@ async fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Asks with a message that is made once: on the same CPUs, what callers take is missing to the server.
+/// The last processor for the callers, the others for the server; the same one for both, where there is no other.
+fn processors() -> io::Result<(CpuSet, CpuSet)> {
+    let mut servers = sched_getaffinity(None)?;
+    let last = (0..CpuSet::MAX_CPU).rev().find(|&processor| servers.is_set(processor));
+    let mut ours = CpuSet::new();
+    if let Some(last) = last.filter(|_| servers.count() > 1) {
+        ours.set(last);
+        servers.unset(last);
+    } else {
+        ours = servers;
+    }
+    Ok((ours, servers))
+}
+
+/// Asks with a message that is made once.
 struct Caller {
     client: GraspServiceClient<Channel>,
     request: DetectGraspsRequest,

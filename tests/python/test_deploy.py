@@ -268,7 +268,9 @@ class KubernetesTest(unittest.TestCase):
     def test_kserve_runs_the_same(self):
         (runtime,), (service,) = (load(KUBERNETES / "kserve" / file) for file in ["runtime.yaml", "service.yaml"])
         self.assertEqual((runtime["kind"], service["kind"]), ("ServingRuntime", "InferenceService"))
-        model = service["spec"]["predictor"]["model"]
+        predictor = service["spec"]["predictor"]
+        self.assertGreater(predictor["maxReplicas"], predictor["minReplicas"], "it must be able to scale")
+        model = predictor["model"]
         self.assertEqual(model["runtime"], runtime["metadata"]["name"])
         self.assertIn(model["protocolVersion"], runtime["spec"]["protocolVersions"])
         formats = [known["name"] for known in runtime["spec"]["supportedModelFormats"]]

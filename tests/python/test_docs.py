@@ -22,6 +22,7 @@ import unittest
 from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
+from urllib.request import urlopen
 
 import grpc
 import numpy as np
@@ -80,13 +81,13 @@ class Page:
     """A document, and what the examples in it have made so far."""
 
     def __init__(self, name, server, folder):
-        self.path, self.server, self.folder = DOCS / name, server, folder
+        self.path, self.server, self.http, self.folder = DOCS / name, server.grpc, server.http, folder
         self.text = self.path.read_text()
         self.names = {"__name__": "__main__"}
         self.environment = {
             **os.environ,
             "PATH": f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}",
-            "GRASPD_SERVER": server,
+            "GRASPD_SERVER": server.grpc,
         }
 
     def blocks(self):
@@ -121,7 +122,7 @@ def pattern(said):
 
 
 class DocsTest(unittest.TestCase):
-    def page(self, name):
+    def page(self, name, edited=lambda code: code):
         """The document once all of its blocks have been run."""
         folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
         shutil.copytree(os.environ["GRASPD_MODELS"], folder / "models/zoo")
@@ -134,11 +135,11 @@ class DocsTest(unittest.TestCase):
             script.chmod(0o755)
         with mock.patch.dict(os.environ, {"GRASPD_MODELS": str(folder / "models/zoo")}):
             server = self.enterContext(Server("--watch", 0.2))
-        page = Page(name, server.grpc, folder)
+        page = Page(name, server, folder)
         for language, code, line, said in page.blocks():
             if language not in ["sh", "python"]:
                 continue
-            printed = page.run(language, code, line)
+            printed = page.run(language, edited(code), line)
             if said is not None:
                 self.assertRegex(printed, rf"\A{pattern(said)}\Z", f"{page.path}:{line}")
         # Clients and their channels go before the server does.
@@ -152,6 +153,18 @@ class DocsTest(unittest.TestCase):
         for option in options:
             with self.subTest(option):
                 page.run("python", f"client.detect(volume, graspd.Options({option}))", 1)
+
+    def test_operations(self):
+        page = self.page("operations.md", lambda code: re.sub(r"--seconds \d+", "--seconds 1", code))
+        flags = subprocess.run([os.environ["GRASPD"], "--help"], capture_output=True, text=True, check=True).stdout
+        for flag in re.findall(r"`(--[a-z-]+)", page.text):
+            self.assertIn(f"{flag} ", flags.replace("\n", " "))
+        with urlopen(f"http://{page.http}/metrics") as metrics:
+            served = set(re.findall(r"^# TYPE (graspd_\w+)", metrics.read().decode(), re.MULTILINE))
+        table = page.text.partition("## What the metrics mean")[2].partition("## Log")[0]
+        told = set(re.findall(r"`(graspd_\w+)", table))
+        # Nothing has been loaded anew yet.
+        self.assertEqual(served | {"graspd_reloads_total"}, told)
 
     def test_conventions(self):
         self.page("conventions.md")

@@ -29,6 +29,7 @@ pub struct TestModel {
     resolution: usize,
     convolutions: usize,
     rotation: [f32; 4],
+    camera_azimuth: Option<f64>,
     breaks_at: Option<f32>,
     fails_at_zero: bool,
 }
@@ -43,6 +44,7 @@ impl TestModel {
             resolution: RESOLUTION,
             convolutions: 0,
             rotation: [0.0, 0.0, 0.0, 1.0],
+            camera_azimuth: None,
             breaks_at: None,
             fails_at_zero: false,
         }
@@ -76,6 +78,12 @@ impl TestModel {
     #[must_use]
     pub fn rotation(self, rotation: [f32; 4]) -> Self {
         Self { rotation, ..self }
+    }
+
+    /// It was trained with a camera at this angle about the vertical, degrees.
+    #[must_use]
+    pub fn camera_azimuth(self, degrees: f64) -> Self {
+        Self { camera_azimuth: Some(degrees), ..self }
     }
 
     /// ONNX Runtime fails in the middle of a batch in which any voxel is 0.
@@ -149,7 +157,7 @@ impl TestModel {
             voxel_size: grasp::WORKSPACE_SIZE / self.resolution as f64,
             value_convention: ValueConvention::Vgn,
             voxel_origin: grasp::VoxelOrigin::Corner,
-            camera_azimuth: None,
+            camera_azimuth: self.camera_azimuth,
             provenance: BTreeMap::from([("data".to_owned(), "none".to_owned())]),
         };
         metadata.write_to(&mut model);

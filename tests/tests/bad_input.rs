@@ -204,6 +204,9 @@ async fn the_model_and_its_version_must_be_loaded() {
         asking(pb::Options { model: model.to_owned(), version: version.to_owned(), ..Default::default() })
     };
     case.refused(ask("vgn", ""), Code::NotFound, &format!("options.model is `vgn`, {there}")).await;
+    // A name is never a path.
+    let path = "../mirror-1.onnx";
+    case.refused(ask(path, ""), Code::NotFound, &format!("options.model is `{path}`, {there}")).await;
     case.refused(ask("mirror", "2"), Code::NotFound, &format!("options.version is `mirror 2`, {there}")).await;
     let message = "options.version is `1`, which needs a `model` that it is a version of";
     case.refused(ask("", "1"), Code::InvalidArgument, message).await;

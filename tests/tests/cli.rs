@@ -1,6 +1,7 @@
 //! The command line `grasp`.
 
 use std::fs::File;
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
@@ -221,6 +222,44 @@ fn the_hand_its_frame_and_its_ways_are_asked_for() {
     assert!(run(&server, &[&["detect", file][..], &hand, &["-0.03,-0.1,-0.1,0.03,0.1,0"]].concat()).status.success());
     let output = run(&server, &[&["detect", file][..], &hand, &["-0.03,-0.1,-0.1,0.03,0.1,0.06"]].concat());
     assert!(text(&output.stderr).contains("palm is 0.06 m, must be behind the fingertips"), "{}", text(&output.stderr));
+}
+
+#[test]
+fn what_cannot_be_answered_ends_no_watch_and_a_camera_that_moves_is_noticed() {
+    let server = Server::run(&[TestModel::new("mirror").resolution(40)], &[]);
+    let folder = tempfile::tempdir().unwrap();
+    depth_files(folder.path());
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let poses = |poses: [Isometry3<f64>; 2]| {
+        let rows = |pose: &Isometry3<f64>| {
+            pose.to_homogeneous().row_iter().map(|row| row.iter().copied().collect()).collect::<Vec<Vec<f64>>>()
+        };
+        // Into place at once, as graspd's models are.
+        std::fs::write(path("new.json"), serde_json::json!(poses.iter().map(rows).collect::<Vec<_>>()).to_string())
+            .unwrap();
+        std::fs::rename(path("new.json"), path("poses.json")).unwrap();
+    };
+    let stand = [camera(30.0, -90.0), camera(45.0, 60.0)];
+    // They look the other way.
+    poses(stand.map(|pose| Isometry3::rotation(Vector3::x() * std::f64::consts::PI) * pose));
+    let mut watch = Command::new(grasp())
+        .args(["watch", &path("m0.npy"), &path("m1.npy"), "--intrinsics", &path("k.npy")])
+        .args(["--camera-from-task", &path("poses.json"), "--json", "--threshold", "0.6"])
+        .args(["--every", "0.02", "--count", "1"])
+        .env("GRASPD_SERVER", server.grpc().to_string())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut complaint = String::new();
+    BufReader::new(watch.stderr.as_mut().unwrap()).read_line(&mut complaint).unwrap();
+    assert!(complaint.contains("views[0] is blind") && complaint.contains("waiting"), "{complaint}");
+    // The images stay the same; that the camera stands elsewhere is what changes.
+    poses(stand);
+    let output = watch.wait_with_output().unwrap();
+    assert!(output.status.success());
+    let answer: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert!(!answer["grasps"].as_array().unwrap().is_empty());
 }
 
 #[test]

@@ -81,6 +81,45 @@ async fn depth_is_answered_like_the_volume_that_it_makes() {
 }
 
 #[tokio::test]
+async fn a_network_that_wants_its_camera_on_one_side_has_it_there() {
+    let turned = TestModel::new("turned").camera_azimuth(-60.0);
+    let server = Server::run(&[TestModel::new("mirror"), turned], &[]);
+    let client = server.client().await;
+    let pose = Isometry3::new(Vector3::new(0.4, -0.2, 1.1), Vector3::new(0.0, 0.0, 2.0));
+    let workspace = Workspace { pose, size: None };
+    let eye = camera(40.0, -90.0);
+    let options = || asking(Asked { model: "turned".to_owned(), ..low().asked });
+    let detection = client.detect_from_depth(&[view(&eye)], &workspace, options()).await.unwrap();
+
+    // The cube turns about its middle by -30°, which brings the camera to -60° in it.
+    let middle = Isometry3::translation(0.15, 0.15, 0.0);
+    let turn = Isometry3::rotation(Vector3::z() * -30_f64.to_radians());
+    let task_from_cube = middle * turn * middle.inverse();
+    let volume = fused(&[eye * task_from_cube], RESOLUTION, pose * task_from_cube);
+    // Of what is seen in its corners only that is told which lies in the cube that was asked about.
+    let all = client.detect(&volume, options()).await.unwrap().grasps;
+    let between = |grasp: &Proposal| pose.inverse() * grasp.pose * Point3::new(0.0, 0.0, grasp::FINGER_DEPTH);
+    let inside = |grasp: &&Proposal| between(grasp).iter().all(|c| (0.0..=WORKSPACE_SIZE).contains(c));
+    let wanted: Vec<Proposal> = all.iter().filter(inside).cloned().collect();
+    assert!(detection.grasps.len() >= wanted.len() && !wanted.is_empty());
+    for grasp in &wanted {
+        let near = |other: &Proposal| (other.pose.translation.vector - grasp.pose.translation.vector).norm() < 1e-9;
+        assert!(detection.grasps.iter().any(near), "{grasp:?} is missing");
+    }
+    assert!(detection.grasps.iter().all(|grasp| inside(&grasp)), "outside of the workspace");
+
+    let models = client.list_models().await.unwrap();
+    let azimuth = |name: &str| models.iter().find(|model| model.name == name).unwrap().camera_azimuth;
+    assert_eq!((azimuth("mirror"), azimuth("turned")), (None, Some(-60.0)));
+    // A volume that was turned for one network is none for another.
+    let mut tracking = client.track(workspace).await.unwrap();
+    tracking.add(&[view(&eye)], options()).await.unwrap();
+    let (code, message) = refusal(tracking.add(&[], low()).await);
+    assert_eq!(code, Code::InvalidArgument);
+    assert!(message.starts_with("options.model is `mirror`, which reads another volume"), "{message}");
+}
+
+#[tokio::test]
 async fn points_are_answered_like_the_depth_that_they_were_seen_in() {
     let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS)], &[]);
     let client = server.client().await;
@@ -200,6 +239,18 @@ async fn planners_without_a_network_answer_by_their_names() {
         let coarse = client.detect(&volume, options()).await.unwrap();
         assert!(!coarse.grasps.is_empty(), "{planner}: {:?}", coarse.dropped);
     }
+    // What the classifier doubts comes to who asks for it.
+    let doubted = async |threshold| {
+        let asked = Asked { model: "gpd".to_owned(), threshold: Some(threshold), max_grasps: 1000, ..Asked::default() };
+        let detection = client.detect_from_depth(&views, &Workspace::default(), asking(asked)).await.unwrap();
+        detection.grasps.iter().any(|grasp| grasp.quality < 0.5)
+    };
+    assert_eq!((doubted(0.5).await, doubted(0.001).await), (false, true));
+    // Nothing lies on a table that is said to be as high as the block.
+    let table = Some(pb::CollisionCheck { mode: 0, table_height: Some(0.2) });
+    let asked = Asked { model: "shaf".to_owned(), collision: table, ..Asked::default() };
+    let none = client.detect_from_depth(&views, &Workspace::default(), asking(asked)).await.unwrap();
+    assert!(none.grasps.is_empty() && none.dropped.as_ref().unwrap().mask > 1000, "{:?}", none.dropped);
     let own =
         pb::Gripper { max_opening: 0.03, finger_depth: 0.05, finger_width: 0.01, finger_breadth: 0.02, palm: None };
     let asked = Asked { model: "shaf".to_owned(), gripper: Some(own), ..Asked::default() };

@@ -3,8 +3,9 @@
 use std::time::Duration;
 
 use grasp::Volume;
-use grasp_client::{Error, Options};
-use grasp_proto::pb::DetectGraspsRequest;
+use grasp_client::{Asked, Error, Options, Workspace};
+use grasp_proto::pb::{CollisionCheck, DetectGraspsRequest, collision_check};
+use grasp_tests::scene::{camera, view};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
 use nalgebra::Isometry3;
 use tokio::task::JoinSet;
@@ -50,6 +51,54 @@ async fn what_does_not_fit_the_queue_is_refused_at_once_and_the_rest_is_answered
     assert_eq!(server.metric("graspd_requests_total{code=\"RESOURCE_EXHAUSTED\",model=\"slow 1\"}"), refused as f64);
     assert_eq!(server.metric("graspd_requests_total{code=\"OK\",model=\"slow 1\"}"), (40 - refused) as f64);
     assert_eq!(server.metric("graspd_queue_requests{model=\"slow 1\"}"), 0.0);
+}
+
+#[tokio::test]
+async fn images_that_are_fused_more_slowly_than_they_come_are_refused_at_once() {
+    let server = Server::run(&[TestModel::new("mirror")], &["--queue", "1"]);
+    let client = server.client().await;
+    // Fusing takes milliseconds, the network microseconds: its queue is never full.
+    let views: Vec<_> = (0..24).map(|index| view(&camera(40.0, 15.0 * f64::from(index)))).collect();
+    let mut calls = JoinSet::new();
+    for _ in 0..40 {
+        let (client, views) = (client.clone(), views.clone());
+        calls.spawn(async move { client.detect_from_depth(&views, &Workspace::default(), Options::default()).await });
+    }
+    let outcomes = calls.join_all().await;
+    let refused = outcomes.iter().filter(|outcome| match outcome {
+        Ok(_) => false,
+        Err(error) => {
+            assert_eq!(error.code(), Some(Code::ResourceExhausted), "{error}");
+            true
+        }
+    });
+    assert!((1..40).contains(&refused.count()));
+}
+
+#[tokio::test]
+async fn the_hint_when_to_come_back_counts_all_the_work_on_an_answer() {
+    let server = Server::run(&[TestModel::new("mirror").resolution(96)], &["--queue", "1"]);
+    let client = server.client().await;
+    // Far more work for the decoding than for the network.
+    let centres: Vec<[usize; 3]> = (0..343).map(|i| [i / 49, i / 7 % 7, i % 7].map(|c| 12 + 12 * c)).collect();
+    let volume = blobs(96, Isometry3::identity(), &centres);
+    let flag = CollisionCheck { mode: collision_check::Mode::Flag.into(), table_height: None };
+    let asked = Asked { collision: Some(flag), max_grasps: 1000, ..Asked::default() };
+    let options = || Options { asked: asked.clone(), ..Options::default() };
+    let first = client.detect(&volume, options()).await.unwrap();
+    let mut calls = JoinSet::new();
+    for _ in 0..8 {
+        let (client, volume, options) = (client.clone(), volume.clone(), options());
+        calls.spawn(async move { client.detect(&volume, options).await });
+    }
+    let hints = calls.join_all().await.into_iter().filter_map(|outcome| match outcome {
+        Err(Error::Refused { retry_after, .. }) => retry_after,
+        _ => None,
+    });
+    let hint = hints.min().expect("one of eight is refused, where one is answered and two wait").as_secs_f64();
+    let latency = first.latency;
+    assert!(latency.postprocessing > latency.inference, "{latency:?}");
+    assert!(hint > latency.inference + 0.3 * latency.postprocessing, "{hint} s after {latency:?}");
 }
 
 #[tokio::test]

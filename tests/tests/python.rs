@@ -70,6 +70,17 @@ fn the_python_package_does_what_it_says() {
 }
 
 #[test]
+fn exports_are_what_other_programs_read_seen_from_python() {
+    let models = models();
+    let environment = [
+        ("GRASPD", graspd().as_os_str()),
+        ("GRASP", grasp().as_os_str()),
+        ("GRASPD_MODELS", models.path().as_os_str()),
+    ];
+    run("test_exports.py", &environment, "test_isaac_reads_its_format");
+}
+
+#[test]
 fn tritonclient_gets_the_maps_seen_from_python() {
     let models = models();
     let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.path().as_os_str())];

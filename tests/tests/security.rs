@@ -158,6 +158,8 @@ fn half_a_configuration_is_refused() {
         ),
         (vec!["--token-file", "/dev/null"], "--token-file (GRASPD_TOKEN_FILE) /dev/null holds no token"),
         (vec!["--stall-timeout", "soon"], "--stall-timeout (GRASPD_STALL_TIMEOUT) is `soon`"),
+        (vec!["--stall-timeout", "0"], "--stall-timeout (GRASPD_STALL_TIMEOUT) is 0, nobody could say a word"),
+        (vec!["--drain-timeout", "1e19"], "--drain-timeout (GRASPD_DRAIN_TIMEOUT) is `1e19`"),
     ] {
         let output = Command::new(graspd()).args(&flags).output().unwrap();
         assert_eq!(output.status.code(), Some(2));

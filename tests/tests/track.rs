@@ -86,23 +86,23 @@ async fn views_that_come_while_the_queue_is_full_are_kept() {
     let server = Server::run(&[TestModel::new("slow").convolutions(60)], &["--queue", "1"]);
     let client = server.client().await;
     let views = [-90.0, 90.0].map(|azimuth| view(&camera(40.0, azimuth)));
-    let mut tracking = client.track(Workspace::default()).await.unwrap();
-    tracking.add(&views[..1], low()).await.unwrap();
-
-    let mut callers = JoinSet::new();
     let volume = blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]]);
-    for _ in 0..12 {
-        let (client, volume) = (client.clone(), volume.clone());
-        callers.spawn(async move { client.detect(&volume, Options::default()).await });
-    }
-    server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 1.0).await;
-    let (status, message) = code(tracking.add(&views[1..], low()).await);
-    assert_eq!(status, Code::ResourceExhausted, "{message}");
-    callers.join_all().await;
+    let mut tracking = client.track(Workspace::default()).await.unwrap();
+    for seen in 1..=views.len() {
+        let mut callers = JoinSet::new();
+        for _ in 0..12 {
+            let (client, volume) = (client.clone(), volume.clone());
+            callers.spawn(async move { client.detect(&volume, Options::default()).await });
+        }
+        server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 1.0).await;
+        let (status, message) = code(tracking.add(&views[seen - 1..seen], low()).await);
+        assert_eq!(status, Code::ResourceExhausted, "{message}");
+        callers.join_all().await;
 
-    let kept = tracking.add(&[], low()).await.unwrap();
-    let wanted = client.detect_from_depth(&views, &Workspace::default(), low()).await.unwrap();
-    assert_eq!(kept.grasps, wanted.grasps);
+        let kept = tracking.add(&[], low()).await.unwrap();
+        let wanted = client.detect_from_depth(&views[..seen], &Workspace::default(), low()).await.unwrap();
+        assert_eq!(kept.grasps, wanted.grasps, "after {seen} views");
+    }
 }
 
 #[tokio::test]
@@ -115,12 +115,43 @@ async fn who_does_not_read_holds_no_volume_for_ever() {
         ..Default::default()
     };
     // Each is answered by several grasps; what a client does not read fills its window.
-    let more = std::iter::repeat_n(pb::TrackGraspsRequest::default(), 500);
+    const MORE: usize = 500;
+    let more = std::iter::repeat_n(pb::TrackGraspsRequest::default(), MORE);
     let requests = tokio_stream::iter(std::iter::once(first).chain(more)).chain(tokio_stream::pending());
-    let replies = server.raw().await.track_grasps(requests).await.unwrap();
+    let endpoint = tonic::transport::Channel::from_shared(format!("http://{}", server.grpc())).unwrap();
+    let channel = endpoint.initial_stream_window_size(1024).connect().await.unwrap();
+    let mut client = pb::grasp_service_client::GraspServiceClient::new(channel);
+    let replies = client.track_grasps(requests).await.unwrap();
     server.wait_for(TRACKED, 1.0).await;
     server.wait_for(TRACKED, 0.0).await;
+    let answered = server.metric("graspd_requests_total{code=\"OK\",model=\"mirror 1\"}");
+    assert!(answered < MORE as f64, "{answered} answers fit into the client's window, so nothing was held up");
     drop(replies);
+}
+
+#[tokio::test]
+async fn who_goes_meanwhile_is_counted() {
+    let server = Server::run(&[TestModel::new("slow").convolutions(60)], &["--queue", "8"]);
+    let client = server.client().await;
+    let tracked = {
+        let client = client.clone();
+        tokio::spawn(async move {
+            let mut tracking = client.track(Workspace::default()).await.unwrap();
+            tracking.add(&[view(&camera(40.0, -90.0))], low()).await
+        })
+    };
+    server.wait_for(TRACKED, 1.0).await;
+    let mut ahead = JoinSet::new();
+    for _ in 0..6 {
+        let client = client.clone();
+        let volume = blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]]);
+        ahead.spawn(async move { client.detect(&volume, Options::default()).await });
+    }
+    server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 6.0).await;
+    tracked.abort();
+    server.wait_for("graspd_requests_total{code=\"CANCELLED\",model=\"slow 1\"}", 1.0).await;
+    server.wait_for(TRACKED, 0.0).await;
+    assert!(ahead.join_all().await.iter().all(Result::is_ok), "nobody else is disturbed");
 }
 
 #[tokio::test]

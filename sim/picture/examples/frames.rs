@@ -86,7 +86,7 @@ fn frames() -> Sheet {
     }
     // Down on the cylinder, the fingertips 3 cm below its top.
     let grasp = Isometry3::new(Vector3::new(0.215, 0.19, TABLE + 0.07 + FINGER_DEPTH), Vector3::x() * PI);
-    sheet.solid.gripper(&grasp, 0.06, GREEN);
+    sheet.solid.gripper(&grasp, 0.06, FINGER_DEPTH, GREEN);
     sheet.cube(size);
 
     let camera = looking_at([-0.25, 0.27, 0.38], [0.16, 0.15, 0.08]);

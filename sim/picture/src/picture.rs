@@ -134,15 +134,15 @@ impl Picture {
 
     /// Adds a slender gripper, of which many may show at once.
     ///
-    /// Its frame: z towards the object, fingers apart along y, origin at the base of the
-    /// fingers; `width` metres between them.
-    pub fn gripper(&mut self, pose: &Isometry3<f64>, width: f64, color: Color) -> &mut Self {
-        self.add(fork(width, 0.006, 0.005).transformed(pose), color, true)
+    /// Its frame: z towards the object, fingers apart along y, origin at the base of the fingers, which are `depth` metres
+    /// long; `width` metres between them.
+    pub fn gripper(&mut self, pose: &Isometry3<f64>, width: f64, depth: f64, color: Color) -> &mut Self {
+        self.add(fork(width, depth, [0.006, 0.005]).transformed(pose), color, true)
     }
 
-    /// Adds a stout hand with the frame of [`Picture::gripper`], for the one that stands out.
+    /// Adds a stout hand with the frame of [`Picture::gripper`] and the Panda's fingers, for the one that stands out.
     pub fn hand(&mut self, pose: &Isometry3<f64>, width: f64, color: Color) -> &mut Self {
-        let mut hand = fork(width, 0.02, 0.009);
+        let mut hand = fork(width, grasp::FINGER_DEPTH, [0.02, 0.009]);
         let palm = Mesh::cuboid(Vector3::new(0.026, 0.10, 0.018));
         let flange = Mesh::cylinder(0.011, 0.05, 24);
         hand.append(&palm.transformed(&Isometry3::translation(0.0, 0.0, -0.016)));
@@ -400,12 +400,11 @@ fn refined(camera: &Intrinsics) -> Intrinsics {
 }
 
 /// Two fingers, the bar between them and a stem, in the grasp frame.
-fn fork(width: f64, breadth: f64, thickness: f64) -> Mesh {
-    const FINGER: f64 = grasp::FINGER_DEPTH;
+fn fork(width: f64, depth: f64, [breadth, thickness]: [f64; 2]) -> Mesh {
     let part =
         |size: [f64; 3], y: f64, z: f64| Mesh::cuboid(size.into()).transformed(&Isometry3::translation(0.0, y, z));
     let apart = (width + thickness) / 2.0;
-    let finger = |side: f64| part([breadth, thickness, FINGER], side * apart, FINGER / 2.0);
+    let finger = |side: f64| part([breadth, thickness, depth], side * apart, depth / 2.0);
     let bar = part([breadth, width + 2.0 * thickness, thickness], 0.0, -thickness / 2.0);
     let stem = part([breadth, thickness, 0.04], 0.0, -0.02 - thickness);
     Mesh::union([&finger(1.0), &finger(-1.0), &bar, &stem])
@@ -480,7 +479,7 @@ mod tests {
 
     #[test]
     fn a_gripper_reaches_its_width_and_depth() {
-        let (low, high) = fork(0.04, 0.006, 0.005).bounds();
+        let (low, high) = fork(0.04, grasp::FINGER_DEPTH, [0.006, 0.005]).bounds();
         assert!((high.z - 0.05).abs() < 1e-12 && (high.y - 0.025).abs() < 1e-12 && (low.y + 0.025).abs() < 1e-12);
     }
 

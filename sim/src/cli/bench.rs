@@ -7,7 +7,7 @@ use std::sync::{Mutex, PoisonError};
 
 use anyhow::Context;
 use clap::{Args, ValueEnum};
-use grasp::{Clearance, DecodeParams, Grasp};
+use grasp::{Clearance, DecodeParams, FINGER_DEPTH, Grasp};
 use grasp_models::{Choice, Options, Precision, Provider};
 use grasp_picture::{Picture, quality_color, save_sheet};
 use grasp_sim::TABLE_HEIGHT;
@@ -290,7 +290,7 @@ impl<'a> Watcher<'a> {
             let mut picture = Picture::of_workspace(480, 360, TABLE_HEIGHT);
             show(&mut picture, before).hand(&attempt.grasp.pose, attempt.grasp.width, color);
             for grasp in proposals.iter().skip(1) {
-                picture.gripper(&grasp.pose, grasp.width, quality_color(f64::from(grasp.quality)));
+                picture.gripper(&grasp.pose, grasp.width, FINGER_DEPTH, quality_color(f64::from(grasp.quality)));
             }
             picture
         };

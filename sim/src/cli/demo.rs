@@ -3,6 +3,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 use comfy_table::{CellAlignment, Table, presets};
+use grasp::FINGER_DEPTH;
 use grasp_client::{Asked, Client, DepthView, Detection, LocalServer, Options, Workspace};
 use grasp_picture::{Picture, quality_color};
 use grasp_sim::TABLE_HEIGHT;
@@ -136,7 +137,7 @@ fn draw(world: &World, detection: &Detection) -> Picture {
         if index == 0 {
             picture.hand(&grasp.pose, grasp.width, color);
         } else {
-            picture.gripper(&grasp.pose, grasp.width, color);
+            picture.gripper(&grasp.pose, grasp.width, FINGER_DEPTH, color);
         }
     }
     picture

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use anyhow::Context;
 use clap::Args;
-use grasp::DecodeParams;
+use grasp::{DecodeParams, Maps, RESOLUTION, Volume, WORKSPACE_SIZE, decode};
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Metadata, Options};
 use grasp_sim::benchmark::{Benchmark, Event};
@@ -16,6 +16,9 @@ use grasp_sim::planner::PlannerSpec;
 use grasp_sim::score::{Spread, Summary};
 use grasp_sim::tables::{EPSILON, EPSILONS, Game, LEARNT_BOTH, RELEASED, Results, SCENARIOS, VIEWS};
 use indicatif::{ProgressBar, ProgressStyle};
+use nalgebra::Isometry3;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
@@ -94,8 +97,8 @@ struct Task {
 impl Tables {
     pub fn run(self) -> anyhow::Result<()> {
         let entries = self.entries()?;
-        let simulator = fingerprint();
-        let tasks = self.tasks(&entries, &simulator);
+        let fingerprint = digest(&format!("{} {}", simulator(), decoding()));
+        let tasks = self.tasks(&entries, &fingerprint);
         let mut log = Log::open(&self.out.with_extension("jsonl"))?;
         let missing: Vec<&Task> = tasks.iter().filter(|task| !log.played.contains_key(&task.key)).collect();
         eprintln!("{} of {} games are to be played", missing.len(), tasks.len());
@@ -110,7 +113,7 @@ impl Tables {
         log.keep(&tasks)?;
 
         let results = self.results(&entries, &tasks, &log)?;
-        let text = self.head(&simulator) + &results.markdown();
+        let text = self.head(&fingerprint) + &results.markdown();
         fs::write(&self.out, text).with_context(|| self.out.display().to_string())?;
         println!("{}", self.out.display());
         Ok(())
@@ -154,7 +157,7 @@ impl Tables {
         Ok(entries)
     }
 
-    fn tasks(&self, entries: &[Entry], simulator: &str) -> Vec<Task> {
+    fn tasks(&self, entries: &[Entry], fingerprint: &str) -> Vec<Task> {
         let mut tasks = Vec::new();
         for entry in entries {
             for scenario in SCENARIOS {
@@ -164,35 +167,36 @@ impl Tables {
                 if crossed && of_proposals {
                     continue;
                 }
-                let mut add = |views: &str, epsilon, seed, timed| {
+                let mut add = |views: &str, epsilon, forced, seed, timed| {
                     let game = Game {
                         method: entry.method.clone(),
                         learnt: entry.learnt.map(str::to_owned),
                         scenario: scenario.to_owned(),
                         views: views.to_owned(),
                         epsilon,
+                        forced,
                     };
                     let file = &entry.sha256;
                     let kind = entry.planner.split(':').next().filter(|_| !is_network || of_proposals);
-                    let on = (scenario, views, seed, if timed { self.timed } else { self.rounds }, timed);
-                    let key = digest(&format!("{kind:?} {file:?} {on:?} {simulator} {:?}", params(&game)));
+                    let on =
+                        (scenario, views, epsilon, forced, seed, if timed { self.timed } else { self.rounds }, timed);
+                    let key = digest(&format!("{kind:?} {file:?} {on:?} {fingerprint}"));
                     tasks.push(Task { key, game, planner: entry.planner.clone(), seed, timed });
                 };
                 for (index, (views, _)) in VIEWS.into_iter().enumerate() {
                     let seeds = if index == 0 { self.seeds } else { self.seeds.min(SEEDS_ELSEWHERE) };
                     if index == 0 || is_network && !of_proposals && !crossed {
-                        (self.seed..self.seed + seeds).for_each(|seed| add(views, EPSILON, seed, false));
+                        (self.seed..self.seed + seeds).for_each(|seed| add(views, EPSILON, true, seed, false));
                     }
                 }
                 if is_network && !of_proposals && !crossed {
                     let seeds = self.seed..self.seed + self.seeds.min(SEEDS_ELSEWHERE);
-                    let others = EPSILONS.into_iter().filter(|&epsilon| epsilon != EPSILON);
-                    for (epsilon, seed) in others.flat_map(|epsilon| seeds.clone().map(move |seed| (epsilon, seed))) {
-                        add(VIEWS[0].0, epsilon, seed, false);
+                    for epsilon in EPSILONS {
+                        seeds.clone().for_each(|seed| add(VIEWS[0].0, epsilon, false, seed, false));
                     }
                 }
                 if !crossed {
-                    add(VIEWS[0].0, EPSILON, self.seed, true);
+                    add(VIEWS[0].0, EPSILON, true, self.seed, true);
                 }
             }
         }
@@ -269,7 +273,7 @@ impl Tables {
         Ok(results)
     }
 
-    fn head(&self, simulator: &str) -> String {
+    fn head(&self, fingerprint: &str) -> String {
         format!(
             "# The paper's tables, here and there\n\n\
              *6-DoF Robotic Grasping with Transformer*, Tables 1–4, beside what `make tables` measured: {} scenes of five unseen\n\
@@ -277,21 +281,23 @@ impl Tables {
              one side view, ε = 0.9, `force` down to 0.5, the best grasp first, out_th 0.1. GSR is the share of the grasps that\n\
              lifted an object, DR that of the objects cleared away; mean ± standard deviation over the seeds. VGN-R are VGN's\n\
              released weights; the paper states its times for an RTX 3090, here it is {} with {} cores,\n\
-             ONNX Runtime's CPU provider, one observation after another. Simulator {}.\n\n",
+             ONNX Runtime's CPU provider, one observation after another. Simulator and decoding {}.\n\n",
             self.rounds,
             self.seeds,
             self.seed,
             self.seeds.min(SEEDS_ELSEWHERE),
             processor(),
             std::thread::available_parallelism().map_or(1, |n| n.get()),
-            &simulator[..12],
+            &fingerprint[..12],
         )
     }
 }
 
 /// Between a network's output and the grasps, in a game.
 fn params(game: &Game) -> DecodeParams {
-    DecodeParams { threshold: f32::from(game.epsilon) / 100.0, ..DecodeParams::benchmark() }
+    let benchmark = DecodeParams::benchmark();
+    let force = benchmark.force.filter(|_| game.forced);
+    DecodeParams { threshold: f32::from(game.epsilon) / 100.0, force, ..benchmark }
 }
 
 /// What was played, in a file.
@@ -340,7 +346,7 @@ impl Log {
 }
 
 /// Changes when the simulator does: a hash of two labelled scenes.
-fn fingerprint() -> String {
+fn simulator() -> String {
     let scenes = [Scene::Pile, Scene::Packed].map(|scene| {
         let recipe = Recipe {
             kind: scene.kind(),
@@ -354,6 +360,38 @@ fn fingerprint() -> String {
         recipe.label(1)
     });
     digest(&format!("{scenes:?}"))
+}
+
+/// Changes when decoding does: a hash of what is found in a volume and maps by chance.
+fn decoding() -> String {
+    /// The edge of a block in which quality is the same: smoothing must leave something to be found.
+    const BLOCK: usize = 8;
+    let blocks = RESOLUTION / BLOCK;
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let mut draw = |count: usize| (0..count).map(|_| rng.random()).collect::<Vec<f32>>();
+    let (coarse, values) = (draw(blocks.pow(3)), draw(RESOLUTION.pow(3)));
+    let width: Vec<f32> = draw(RESOLUTION.pow(3)).iter().map(|width| 10.0 * width).collect();
+    let block =
+        |i: usize| [i / (RESOLUTION * RESOLUTION), i / RESOLUTION % RESOLUTION, i % RESOLUTION].map(|c| c / BLOCK);
+    let quality: Vec<f32> =
+        (0..RESOLUTION.pow(3)).map(block).map(|[x, y, z]| coarse[(x * blocks + y) * blocks + z]).collect();
+    let rotation = [[0.5; RESOLUTION.pow(3)]; 4].concat();
+    let maps = Maps { quality: &quality, rotation: &rotation, width: &width };
+    let voxel_size = WORKSPACE_SIZE / RESOLUTION as f64;
+    let volume = Volume::new(RESOLUTION, voxel_size, Isometry3::identity(), values).expect("values in [0, 1]");
+    let game = |forced| Game {
+        method: String::new(),
+        learnt: None,
+        scenario: String::new(),
+        views: String::new(),
+        epsilon: EPSILON,
+        forced,
+    };
+    let found = [true, false].map(|forced| {
+        let decoded = decode(&volume, &maps, &params(&game(forced))).expect("maps of the volume's size");
+        decoded.grasps
+    });
+    digest(&format!("{found:?}"))
 }
 
 fn digest(text: &str) -> String {

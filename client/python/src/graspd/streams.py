@@ -53,6 +53,10 @@ class Detecting:
             raise ended()
 
 
+# These are met only after the views were added: another workspace would start another volume.
+WAS_ADDED = (StatusCode.RESOURCE_EXHAUSTED, StatusCode.INTERNAL)
+
+
 class Adding:
     """The views of a volume that is tracked."""
 
@@ -67,9 +71,10 @@ class Adding:
         if reply is None:
             raise ended()
         outcome = methods.TRACK.answer(reply)
+        if not isinstance(outcome, Error) or outcome.code in WAS_ADDED:
+            self._workspace = None
         if isinstance(outcome, Error):
             raise outcome
-        self._workspace = None
         return outcome
 
 

@@ -218,21 +218,25 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
         Command::Watch(Watch { scene: args, wishes, every, count }) => {
             let asked = wishes.read()?;
             let client = connect().await?;
-            let stamps =
-                || args.files().iter().map(|path| fs::metadata(path)?.modified()).collect::<io::Result<Vec<_>>>();
+            let stamps = || args.files().map(|path| fs::metadata(path)?.modified()).collect::<io::Result<Vec<_>>>();
             let (mut seen, mut answers) = (None, 0);
             while count.is_none_or(|count| answers < count) {
                 // A file that is not there, or not whole yet, will be.
                 let now = stamps().ok();
                 if now.is_some() && now != seen {
-                    match args.read() {
-                        Ok(scene) => {
-                            if !print(&scene.detect(&client, options(&args, asked.clone())).await?)? {
+                    let answer = async {
+                        let scene = args.read()?;
+                        anyhow::Ok(scene.detect(&client, options(&args, asked.clone())).await?)
+                    };
+                    match answer.await {
+                        Ok(detection) => {
+                            if !print(&detection)? {
                                 break;
                             }
                             answers += 1;
                         }
-                        Err(error) => eprintln!("grasp: {error:#}; waiting for it to change"),
+                        // The next view may be a better one, and the server there again.
+                        Err(error) => eprintln!("grasp: {error:#}; waiting for a file to change"),
                     }
                     seen = now;
                 }
@@ -243,8 +247,9 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             // Hands are drawn by their finger base, whatever frame of them is asked for.
             let (scene, asked) = (args.read()?, Asked { convention: None, ..wishes.read()? });
             let table = asked.collision.and_then(|collision| collision.table_height);
+            let depth = asked.gripper.as_ref().map(|gripper| gripper.finger_depth);
             let detection = scene.detect(&connect().await?, options(&args, asked)).await?;
-            let path = view.write(&scene.volume()?, table, &detection)?;
+            let path = view.write(&scene.volume()?, table, depth, &detection)?;
             show::print(&format!("{} grasps in {}", detection.grasps.len(), path.display()))?;
         }
         Command::Bench(Bench { scene: args, wishes, callers, rate, seconds }) => {

@@ -14,7 +14,7 @@ use foxglove::messages::{
     Color, KeyValuePair, LinePrimitive, PackedElementField, Point3, PointCloud, Pose, Quaternion, SceneEntity,
     SceneUpdate, Timestamp, Vector3,
 };
-use grasp::{FINGER_DEPTH, SurfacePoint};
+use grasp::SurfacePoint;
 use grasp_client::{Detection, Proposal};
 use grasp_picture::quality_color;
 use mcap::Writer;
@@ -24,17 +24,17 @@ use nalgebra::Point3 as Point;
 /// How many points stand for a stroke of a hand.
 const DOTS: u32 = 32;
 
-/// Writes what was seen and the grasps in it, in the frame of the grasps.
-pub(crate) fn write(path: &Path, surface: &[SurfacePoint], detection: &Detection) -> anyhow::Result<()> {
+/// Writes what was seen and the grasps in it, in the frame of the grasps. The fingers are `depth` metres long.
+pub(crate) fn write(path: &Path, surface: &[SurfacePoint], depth: f64, detection: &Detection) -> anyhow::Result<()> {
     let file = File::create(path).with_context(|| path.display().to_string())?;
     let mut writer = Writer::new(BufWriter::new(file))?;
     let timestamp = Timestamp::try_from(detection.stamp.unwrap_or_else(SystemTime::now)).unwrap_or_default();
     let frame = if detection.frame_id.is_empty() { "task" } else { &detection.frame_id };
     let surface: Vec<_> = surface.iter().map(|point| (point.position, [90, 160, 200])).collect();
     add(&mut writer, "/surface", timestamp, &cloud(&surface, frame, timestamp))?;
-    add(&mut writer, "/grasps", timestamp, &scene(&detection.grasps, frame, timestamp))?;
+    add(&mut writer, "/grasps", timestamp, &scene(&detection.grasps, depth, frame, timestamp))?;
     // Once more as points: Rerun draws no scenes.
-    let dots: Vec<_> = detection.grasps.iter().flat_map(dots).collect();
+    let dots: Vec<_> = detection.grasps.iter().flat_map(|grasp| dots(grasp, depth)).collect();
     add(&mut writer, "/hands", timestamp, &cloud(&dots, frame, timestamp))?;
     writer.finish()?;
     Ok(())
@@ -82,7 +82,7 @@ fn cloud(points: &[(Point<f64>, [u8; 3])], frame: &str, timestamp: Timestamp) ->
     }
 }
 
-fn scene(grasps: &[Proposal], frame: &str, timestamp: Timestamp) -> SceneUpdate {
+fn scene(grasps: &[Proposal], depth: f64, frame: &str, timestamp: Timestamp) -> SceneUpdate {
     let entity = |(index, grasp): (usize, &Proposal)| {
         let [r, g, b] = quality_color(f64::from(grasp.quality)).map(|channel| f64::from(channel) / 255.0);
         let note = |key: &str, value: String| KeyValuePair { key: key.into(), value };
@@ -95,7 +95,7 @@ fn scene(grasps: &[Proposal], frame: &str, timestamp: Timestamp) -> SceneUpdate 
                 r#type: Type::LineList.into(),
                 pose: Some(pose(grasp.pose.translation.vector.into(), grasp.pose.rotation.coords.into())),
                 thickness: 0.003,
-                points: hand(grasp.width).map(|p| Point3 { x: p.x, y: p.y, z: p.z }).into(),
+                points: hand(grasp.width, depth).map(|p| Point3 { x: p.x, y: p.y, z: p.z }).into(),
                 color: Some(Color { r, g, b, a: 1.0 }),
                 ..LinePrimitive::default()
             }],
@@ -106,8 +106,8 @@ fn scene(grasps: &[Proposal], frame: &str, timestamp: Timestamp) -> SceneUpdate 
 }
 
 /// The strokes of a hand as points.
-fn dots(grasp: &Proposal) -> Vec<(Point<f64>, [u8; 3])> {
-    let (hand, color) = (hand(grasp.width), quality_color(f64::from(grasp.quality)));
+fn dots(grasp: &Proposal, depth: f64) -> Vec<(Point<f64>, [u8; 3])> {
+    let (hand, color) = (hand(grasp.width, depth), quality_color(f64::from(grasp.quality)));
     let along =
         |[from, to]: [Point<f64>; 2]| (0..=DOTS).map(move |dot| from + (to - from) * f64::from(dot) / f64::from(DOTS));
     hand.as_chunks().0.iter().copied().flat_map(along).map(|dot| (grasp.pose * dot, color)).collect()
@@ -118,8 +118,8 @@ fn pose([x, y, z]: [f64; 3], [qx, qy, qz, qw]: [f64; 4]) -> Pose {
 }
 
 /// Two fingers, the bar between them, and the wrist: pairs of points of the grasp frame.
-fn hand(width: f64) -> [Point<f64>; 8] {
-    let (y, tip) = (width / 2.0, FINGER_DEPTH);
+fn hand(width: f64, depth: f64) -> [Point<f64>; 8] {
+    let (y, tip) = (width / 2.0, depth);
     [[-y, 0.0, -y, tip], [y, 0.0, y, tip], [-y, 0.0, y, 0.0], [0.0, 0.0, 0.0, -0.04]]
         .map(|[y, z, to_y, to_z]| [Point::new(0.0, y, z), Point::new(0.0, to_y, to_z)])
         .as_flattened()

@@ -64,8 +64,16 @@ pub(crate) enum Scene {
 }
 
 impl SceneArgs {
-    pub fn files(&self) -> &[PathBuf] {
-        &self.files
+    /// All that is read.
+    pub fn files(&self) -> impl Iterator<Item = &PathBuf> {
+        let Self { files, intrinsics, camera_from_task, frame_from_camera, frame_from_cloud, workspace, .. } = self;
+        files
+            .iter()
+            .chain(intrinsics)
+            .chain(camera_from_task)
+            .chain(frame_from_camera)
+            .chain(frame_from_cloud)
+            .chain(workspace)
     }
 
     pub fn frame_id(&self) -> String {

@@ -33,7 +33,7 @@ pub(crate) fn detection(detection: &Detection) -> String {
     }
     if let Some(dropped) = &detection.dropped {
         let reasons = reasons(dropped).map(|(reason, voxels)| format!("{} {voxels}", reason.replace('_', " ")));
-        text += &format!("dropped voxels: {}\n", reasons.join(", "));
+        text += &format!("dropped: {}\n", reasons.join(", "));
     }
     let stages = stages(&detection.latency).map(|(stage, seconds)| format!("{stage} {:.2}", seconds * 1e3));
     text += &format!("{} {}; in ms: {}", detection.model, detection.version, stages.join(", "));

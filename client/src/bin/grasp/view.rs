@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::bail;
 use clap::Args;
-use grasp::{Fusion, SurfaceMesh, SurfacePoint, Volume};
+use grasp::{FINGER_DEPTH, Fusion, SurfaceMesh, SurfacePoint, Volume};
 use grasp_client::Detection;
 use grasp_picture::{Color, Mesh, Picture, quality_color};
 use grasp_proto::TABLE_HEIGHT;
@@ -34,13 +34,20 @@ pub(crate) struct ViewArgs {
 }
 
 impl ViewArgs {
-    /// Draws or records the observed surface and the grasps. `table` is its height above the volume's bottom, where it is
-    /// not the usual one.
-    pub fn write(&self, volume: &Volume, table: Option<f64>, detection: &Detection) -> anyhow::Result<&Path> {
+    /// Draws or records the observed surface and the grasps, as far as they are not the usual ones: `table` is its height
+    /// above the volume's bottom, `depth` the length of the hand's fingers, metres.
+    pub fn write(
+        &self,
+        volume: &Volume,
+        table: Option<f64>,
+        depth: Option<f64>,
+        detection: &Detection,
+    ) -> anyhow::Result<&Path> {
         let field = Fusion::of(volume);
+        let (table, depth) = (table.unwrap_or(TABLE_HEIGHT), depth.unwrap_or(FINGER_DEPTH));
         match self.out.extension().and_then(|extension| extension.to_str()) {
-            Some("png") => draw(volume, field.mesh(), table.unwrap_or(TABLE_HEIGHT), detection).save(&self.out)?,
-            Some("mcap") => record::write(&self.out, &placed(&field.surface(), volume.pose()), detection)?,
+            Some("png") => draw(volume, field.mesh(), table, depth, detection).save(&self.out)?,
+            Some("mcap") => record::write(&self.out, &placed(&field.surface(), volume.pose()), depth, detection)?,
             _ => bail!("{}: .png or .mcap is needed", self.out.display()),
         }
         Ok(&self.out)
@@ -54,7 +61,7 @@ fn placed(surface: &[SurfacePoint], pose: &Isometry3<f64>) -> Vec<SurfacePoint> 
 }
 
 /// In the volume's own frame, from a corner above it, from which all of the cube is seen.
-fn draw(volume: &Volume, mesh: SurfaceMesh, table: f64, detection: &Detection) -> Picture {
+fn draw(volume: &Volume, mesh: SurfaceMesh, table: f64, depth: f64, detection: &Detection) -> Picture {
     let size = volume.voxel_size() * volume.resolution() as f64;
     let [width, height] = SIZE;
     let (eye, target) = (Point3::new(1.75, -1.1, 1.8) * size, Point3::new(0.5, 0.5, 0.4) * size);
@@ -64,7 +71,7 @@ fn draw(volume: &Volume, mesh: SurfaceMesh, table: f64, detection: &Detection) -
     picture.mesh(&Mesh { vertices, triangles }, &Isometry3::identity(), 1.0, [206, 204, 198]);
     for grasp in detection.grasps.iter().take(SHOWN).rev() {
         let pose = volume.pose().inverse() * grasp.pose;
-        picture.gripper(&pose, grasp.width, quality_color(f64::from(grasp.quality)));
+        picture.gripper(&pose, grasp.width, depth, quality_color(f64::from(grasp.quality)));
     }
     picture
 }
