@@ -83,7 +83,8 @@ bench-serve: ## how fast the server answers, beside libtorch, OpenVINO, Triton a
 	$(CARGO) build --release $(WORKSPACE) --bins
 	$(with_libtorch) $(CARGO) build --release $(TRAIN)
 	$(with_onnxruntime) $(with_libtorch) GRASPD_PEERS="$$($(PYTHON) deploy/native.py peers)" && export GRASPD_PEERS && \
-		GRASP_TRAIN=$(RELEASE)/grasp-train $(CARGO) run --release --package grasp-tests --example serve --locked
+		GRASP_TRAIN=$(RELEASE)/grasp-train $(CARGO) run --release --package grasp-tests --example serve --locked -- \
+		5 $(CARGO_TARGET_DIR)/bench-serve.json
 
 soak: ## a minute of four times what the server can do, then 20 minutes of 80 % of it; MINUTES=N
 	$(with_onnxruntime) $(CARGO) run --release --package grasp-tests --example soak --locked -- $(MINUTES)

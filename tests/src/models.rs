@@ -32,6 +32,7 @@ pub struct TestModel {
     camera_azimuth: Option<f64>,
     breaks_at: Option<f32>,
     fails_at_zero: bool,
+    needs_fp32: bool,
 }
 
 impl TestModel {
@@ -47,6 +48,7 @@ impl TestModel {
             camera_azimuth: None,
             breaks_at: None,
             fails_at_zero: false,
+            needs_fp32: false,
         }
     }
 
@@ -90,6 +92,12 @@ impl TestModel {
     #[must_use]
     pub fn fails_at_zero(self) -> Self {
         Self { fails_at_zero: true, ..self }
+    }
+
+    /// Adds a large number to the volume and takes it off again, so that in bf16 little of the quality is left.
+    #[must_use]
+    pub fn needs_fp32(self) -> Self {
+        Self { needs_fp32: true, ..self }
     }
 
     /// Writes it into a folder.
@@ -141,7 +149,8 @@ impl TestModel {
             node(&mut graph, "Add", &[&delay, "nothing"], "delay_or_failure", vec![]);
             delay = "delay_or_failure".to_owned();
         }
-        node(&mut graph, "Add", &["tsdf", &delay], "quality", vec![]);
+        let volume = if self.needs_fp32 { there_and_back(&mut graph, "tsdf") } else { "tsdf" };
+        node(&mut graph, "Add", &[volume, &delay], "quality", vec![]);
 
         let mut model = ModelProto {
             ir_version: Some(8),
@@ -179,6 +188,20 @@ fn convolution(graph: &mut GraphProto, input: &str, output: &str, inputs: i64, o
     let attributes = vec![AttributeProto::ints("kernel_shape", &[5; 3]), AttributeProto::ints("pads", &[2; 6])];
     node(graph, "Conv", &[input, &weight], output, attributes);
     output.to_owned()
+}
+
+/// Changes nothing, but what is lost where numbers between 2^16 and 2^17 are rounded. Providers see through sums, not
+/// through convolutions.
+fn there_and_back(graph: &mut GraphProto, input: &str) -> &'static str {
+    for (name, scale, offset) in [("there", 256.0, 65_536.0), ("back", 1.0 / 256.0, -256.0)] {
+        graph.initializer.push(TensorProto::from_f32(&format!("{name}.weight"), &[1; 5], &[scale]));
+        graph.initializer.push(TensorProto::from_f32(&format!("{name}.bias"), &[1], &[offset]));
+    }
+    node(graph, "Conv", &[input, "there.weight", "there.bias"], "there", vec![]);
+    // A number that is not negative, so this is nothing but an end to what can be fused.
+    node(graph, "Relu", &["there"], "between", vec![]);
+    node(graph, "Conv", &["between", "back.weight", "back.bias"], "back", vec![]);
+    "back"
 }
 
 fn constant(graph: &mut GraphProto, name: &str, value: f32) {

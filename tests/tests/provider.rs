@@ -12,9 +12,9 @@ fn volume() -> Volume {
 }
 
 /// A graspd that does not get as far as listening: its exit code, and what it says.
-fn refused(args: &[&str]) -> (Option<i32>, String) {
+fn refused(model: &TestModel, args: &[&str]) -> (Option<i32>, String) {
     let models = tempfile::tempdir().unwrap();
-    TestModel::new("blobs").write(models.path());
+    model.write(models.path());
     let mut command = Command::new(graspd());
     command.arg("--models").arg(models.path()).args(["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"]).args(args);
     let output = command.output().unwrap();
@@ -47,18 +47,35 @@ async fn openvino_runs_where_it_was_asked_for() {
     assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 2);
 }
 
+/// Processors that multiply bf16 are where this could go wrong.
+#[tokio::test]
+async fn what_gives_other_answers_is_passed_over_or_refused() {
+    let model = TestModel::new("blobs").needs_fp32();
+    let server = Server::run(std::slice::from_ref(&model), &[]);
+    let client = server.client().await;
+    assert_eq!(client.list_models().await.unwrap()[0].precision, "fp32");
+    assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 2);
+
+    let (code, said) = refused(&model, &["--provider", "openvino", "--precision", "bf16"]);
+    assert_eq!(code, Some(1), "{said}");
+    let other_answers = said.contains("with openvino bf16 it gives other answers: `quality` differs by");
+    let not_there = said.contains("no provider `openvino`") || said.contains("does not compute in bf16");
+    assert!(other_answers || not_there, "{said}");
+}
+
 #[test]
 fn what_cannot_be_had_is_an_error_and_nothing_else_is_taken() {
+    let model = TestModel::new("blobs");
     for (args, expected) in [
         (&["--provider", "tensorrt"][..], "no provider `tensorrt`"),
         (&["--provider", "cpu", "--precision", "fp16"], "`cpu` does not compute in fp16"),
         (&["--precision", "int8"], "grasp-train export --precision int8"),
     ] {
-        let (code, said) = refused(args);
+        let (code, said) = refused(&model, args);
         assert_eq!(code, Some(1), "{said}");
         assert!(said.contains("blobs-1.onnx") && said.contains(expected), "{args:?}: {said}");
     }
-    let (code, said) = refused(&["--provider", "gpu", "--precision", "half"]);
+    let (code, said) = refused(&model, &["--provider", "gpu", "--precision", "half"]);
     assert_eq!(code, Some(2), "{said}");
     assert!(said.contains("--provider (GRASPD_PROVIDER) is `gpu`") && said.contains("--precision"), "{said}");
 }

@@ -1,14 +1,16 @@
 //! How fast the server answers, beside what it is made of and beside other servers, all in one run.
 //!
-//! `make bench-serve`, or `cargo run --release -p grasp-tests --example serve [SECONDS]` with `ORT_DYLIB_PATH` set; `SECONDS`
-//! is how long each load lasts, 5 by default. `GRASP_TRAIN` names grasp-train, for libtorch's eager mode; `GRASPD_PEERS`
-//! names a Python with the packages of tests/peers, for the other servers. What is not there is left out.
+//! `make bench-serve`, or `cargo run --release -p grasp-tests --example serve [SECONDS [FILE]]` with `ORT_DYLIB_PATH` set;
+//! `SECONDS` is how long each load lasts, 5 by default, and all that is printed is also written to `FILE`, as JSON.
+//! `GRASP_TRAIN` names grasp-train, for libtorch's eager mode; `GRASPD_PEERS` names a Python with the packages of
+//! tests/peers, for the other servers. What is not there is left out.
 //!
-//! The last line is one JSON object. Times are those of one machine that does nothing else; compare ratios.
+//! The last line is one JSON object, of the figures that count. Times are those of one machine that does nothing else;
+//! compare ratios.
 
 mod conditions;
+mod findings;
 mod peers;
-mod table;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -23,8 +25,8 @@ use nalgebra::Isometry3;
 use tempfile::TempDir;
 use tonic::Code;
 
+use crate::findings::{Aim, Findings, Table, milliseconds};
 use crate::peers::{Peer, eager, openvino};
-use crate::table::{Figures, Table, milliseconds};
 
 /// Calls of the identity network, of which only the hop is left.
 const HOPS: usize = 10_000;
@@ -36,20 +38,33 @@ const TURNS: usize = 5;
 const CROWDS: [usize; 3] = [1, 8, 32];
 /// The batch sizes of which the best is what a machine can do.
 const BATCHES: [usize; 4] = [1, 2, 4, 8];
+/// What the server is to reach. Beside libtorch, it is the share of the time that its eager mode takes in fp32.
+const AIMS: [(&str, Aim); 6] = [
+    ("hop_p50_ms", Aim::AtMost(0.6)),
+    ("hop_p99_ms", Aim::AtMost(1.5)),
+    ("vgn_vs_torch", Aim::AtMost(1.0 / 12.0)),
+    ("transformer_vs_torch", Aim::AtMost(1.0 / 5.5)),
+    ("openvino_ratio", Aim::AtMost(1.15)),
+    ("throughput_ratio", Aim::AtLeast(0.95)),
+];
 
 #[tokio::main(flavor = "current_thread")]
 async fn main() -> anyhow::Result<()> {
     let seconds = std::env::args().nth(1).map_or(Ok(5.0), |seconds| seconds.parse())?;
     let bench = Bench::new(Duration::from_secs_f64(seconds))?;
-    let mut figures = Figures::default();
-    println!("{}", conditions::describe(bench.threads)?);
-    bench.hop(&mut figures).await?;
+    let mut findings = Findings::new(conditions::describe(bench.threads)?);
+    bench.hop(&mut findings).await?;
     for network in ["vgn", "transformer"] {
-        bench.latency(network, &mut figures).await?;
+        bench.latency(network, &mut findings).await?;
     }
-    bench.throughput(&mut figures).await?;
-    bench.life(&mut figures)?;
-    println!("{}", figures.json());
+    bench.throughput(&mut findings).await?;
+    bench.life(&mut findings)?;
+    findings.compare(&AIMS);
+    if let Some(file) = std::env::args_os().nth(2) {
+        std::fs::write(&file, format!("{:#}\n", findings.json()))
+            .with_context(|| format!("cannot write {}", file.display()))?;
+    }
+    println!("{}", findings.figures());
     Ok(())
 }
 
@@ -97,7 +112,7 @@ impl Bench {
     }
 
     /// What gRPC costs: the identity network leaves nothing else.
-    async fn hop(&self, figures: &mut Figures) -> anyhow::Result<()> {
+    async fn hop(&self, findings: &mut Findings) -> anyhow::Result<()> {
         let mut network = Network::load(&self.file("mirror"), &Running::default())?;
         let server = self.serve("mirror", &["--provider", "cpu", "--threads", "1"])?;
         let client = Client::connect(server.grpc().to_string()).await?;
@@ -115,16 +130,16 @@ impl Bench {
             });
             table.row(&format!("gRPC beyond it, {name}"), hop);
             if dtype == DataType::F32 {
-                figures.add("hop_p50_ms", hop[0]);
-                figures.add("hop_p99_ms", hop[1]);
+                findings.figure("hop_p50_ms", hop[0]);
+                findings.figure("hop_p99_ms", hop[1]);
             }
         }
-        table.print();
+        findings.table(table);
         Ok(())
     }
 
     /// One caller: bare, in this process, and over gRPC, in turns; then what others take for the same.
-    async fn latency(&self, name: &str, figures: &mut Figures) -> anyhow::Result<()> {
+    async fn latency(&self, name: &str, findings: &mut Findings) -> anyhow::Result<()> {
         let mut network = Network::load(&self.file(name), &Running::auto(self.threads))?;
         let server = self.serve(name, &[])?;
         let client = Client::connect(server.grpc().to_string()).await?;
@@ -163,22 +178,22 @@ impl Bench {
                 "  its heads apart, as published",
                 [eager.published_p50_ms, f64::NAN, p50 / eager.published_p50_ms],
             );
-            figures.add(&format!("{name}_vs_torch"), p50 / eager.published_p50_ms);
+            findings.figure(&format!("{name}_vs_torch"), p50 / eager.published_p50_ms);
         }
         if let Some(latency) = openvino(&self.file(name), self.threads, backend.precision, count * TURNS)? {
             let row = format!("OpenVINO {} alone, {}", latency.version, backend.precision);
             table.row(&row, [latency.p50_ms, latency.p99_ms, p50 / latency.p50_ms]);
             if name == "vgn" {
-                figures.add("openvino_ratio", p50 / latency.p50_ms);
+                findings.figure("openvino_ratio", p50 / latency.p50_ms);
             }
         }
-        figures.add(&format!("{name}_p50_ms"), p50);
-        table.print();
+        findings.figure(&format!("{name}_p50_ms"), p50);
+        findings.table(table);
         Ok(())
     }
 
     /// Many callers, beside the best that this machine can do and beside other servers; then callers who come by chance.
-    async fn throughput(&self, figures: &mut Figures) -> anyhow::Result<()> {
+    async fn throughput(&self, findings: &mut Findings) -> anyhow::Result<()> {
         let max_batch = BATCHES.into_iter().max().unwrap_or(1);
         let running = Running { max_batch, ..Running::auto(self.threads) };
         let mut network = Network::load(&self.file("vgn"), &running)?;
@@ -201,7 +216,7 @@ impl Bench {
             }
         }
         drop(network);
-        table.print();
+        findings.table(table);
 
         let mut table = Table::new(
             &format!("vgn, {backend}, many callers, {:?} each", self.seconds),
@@ -226,7 +241,7 @@ impl Bench {
                 }
             }
         }
-        figures.add("throughput_ratio", capacity / best);
+        findings.figure("throughput_ratio", capacity / best);
         for kind in ["plain_grpc", "triton"] {
             let Some(peer) = Peer::run(kind, &self.file("vgn"), self.threads, backend)? else { continue };
             for callers in CROWDS {
@@ -234,17 +249,17 @@ impl Bench {
                 let throughput = crowd(kind, callers, &report);
                 ensure!(report.refusals() == 0, "{kind} refused {} calls", report.refusals());
                 if callers == 8 {
-                    figures.add(&format!("{kind}_ratio"), capacity / throughput);
+                    findings.figure(&format!("{kind}_ratio"), capacity / throughput);
                 }
             }
         }
-        table.print();
-        self.chance(capacity, bare_p50, figures).await
+        findings.table(table);
+        self.chance(capacity, bare_p50, findings).await
     }
 
     /// The highest rate at which callers who come by chance wait no longer than three bare inferences, but for one in a
     /// hundred.
-    async fn chance(&self, capacity: f64, bare_p50: f64, figures: &mut Figures) -> anyhow::Result<()> {
+    async fn chance(&self, capacity: f64, bare_p50: f64, findings: &mut Findings) -> anyhow::Result<()> {
         let server = self.serve("vgn", &[])?;
         let client = Client::connect(server.grpc().to_string()).await?;
         let mut table = Table::new(
@@ -261,14 +276,14 @@ impl Bench {
             table.row("", [rate, share, p50, p99, p99 / bare_p50]);
             if report.refusals() == 0 && p99 <= 3.0 * bare_p50 { good = share } else { bad = share }
         }
-        table.print();
-        figures.add("poisson_rate", good * capacity);
-        figures.add("poisson_share", good);
+        findings.table(table);
+        findings.figure("poisson_rate", good * capacity);
+        findings.figure("poisson_share", good);
         Ok(())
     }
 
     /// From nothing to the first answer, and the memory that took.
-    fn life(&self, figures: &mut Figures) -> anyhow::Result<()> {
+    fn life(&self, findings: &mut Findings) -> anyhow::Result<()> {
         let mut table = Table::new("graspd's life", &["s to ready", "MB at most"]);
         for network in ["vgn", "transformer"] {
             let started = Instant::now();
@@ -276,10 +291,10 @@ impl Bench {
             let ready = started.elapsed().as_secs_f64();
             let peak = peak_bytes(server.id()) as f64 / 1e6;
             table.row(network, [ready, peak]);
-            figures.add(&format!("{network}_ready_s"), ready);
-            figures.add(&format!("{network}_peak_mb"), peak);
+            findings.figure(&format!("{network}_ready_s"), ready);
+            findings.figure(&format!("{network}_peak_mb"), peak);
         }
-        table.print();
+        findings.table(table);
         Ok(())
     }
 
