@@ -288,7 +288,7 @@ impl Call {
 impl Drop for Call {
     fn drop(&mut self) {
         if !self.ended {
-            let expired = self.deadline.is_some_and(|Deadline(deadline)| deadline <= Instant::now());
+            let expired = self.deadline.is_some_and(Deadline::has_passed);
             let code = if expired { Code::DeadlineExceeded } else { Code::Cancelled };
             self.metrics.ended(&self.label, code);
             self.span.in_scope(|| info!(?code, "the caller has gone"));

@@ -2,8 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use tonic::metadata::MetadataMap;
-use tonic::{Extensions, Request, Status};
+use http::{Extensions, HeaderMap};
 
 /// The header (gRPC over HTTP/2, "Requests"): up to eight digits and a unit.
 const HEADER: &str = "grpc-timeout";
@@ -15,24 +14,25 @@ const MARGIN: Duration = Duration::from_millis(2);
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Deadline(pub Instant);
 
-/// The deadline that was [noted](note).
+impl Deadline {
+    pub fn has_passed(self) -> bool {
+        self.0 <= Instant::now()
+    }
+}
+
+/// The deadline of a request whose headers have just come: the message may take a while.
+pub(crate) fn read(headers: &HeaderMap) -> Option<Deadline> {
+    Some(Deadline(Instant::now() + timeout(headers)?.saturating_sub(MARGIN)))
+}
+
+/// The deadline that was read when the headers came.
 pub(crate) fn of(extensions: &Extensions) -> Option<Deadline> {
     extensions.get().copied()
 }
 
-/// Notes the deadline of a request, counted from its headers: the message may take a while to come.
-#[expect(clippy::unnecessary_wraps, reason = "the form of tonic's interceptors")]
-pub(crate) fn note(mut request: Request<()>) -> Result<Request<()>, Status> {
-    if let Some(timeout) = timeout(request.metadata()) {
-        let deadline = Deadline(Instant::now() + timeout.saturating_sub(MARGIN));
-        request.extensions_mut().insert(deadline);
-    }
-    Ok(request)
-}
-
 /// The timeout, if there is one that can be read.
-fn timeout(metadata: &MetadataMap) -> Option<Duration> {
-    let text = metadata.get(HEADER)?.to_str().ok()?;
+fn timeout(headers: &HeaderMap) -> Option<Duration> {
+    let text = headers.get(HEADER)?.to_str().ok()?;
     let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
     if digits.is_empty() || digits.len() > 8 || !digits.bytes().all(|byte| byte.is_ascii_digit()) {
         return None;
@@ -56,9 +56,9 @@ mod tests {
     #[test]
     fn timeouts_are_read_as_grpc_writes_them() {
         let read = |text: &str| {
-            let mut metadata = MetadataMap::new();
-            metadata.insert(HEADER, text.parse().unwrap());
-            timeout(&metadata)
+            let mut headers = HeaderMap::new();
+            headers.insert(HEADER, text.parse().unwrap());
+            timeout(&headers)
         };
         assert_eq!(read("2H"), Some(Duration::from_secs(7200)));
         assert_eq!(read("3M"), Some(Duration::from_secs(180)));
@@ -69,6 +69,6 @@ mod tests {
         for wrong in ["", "S", "10", "-1S", "1.5S", "123456789S", "5 S", "5s"] {
             assert_eq!(read(wrong), None, "{wrong}");
         }
-        assert_eq!(timeout(&MetadataMap::new()), None);
+        assert_eq!(timeout(&HeaderMap::new()), None);
     }
 }

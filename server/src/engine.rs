@@ -340,7 +340,7 @@ fn infer(network: &mut Network, own: DecodeParams, jobs: Vec<Job>, done: impl Fn
     let taken = done(started.elapsed());
     for (index, Job { scene, task, deadline, span, submitted }) in jobs.into_iter().enumerate() {
         let _entered = span.enter();
-        if task.is_closed() || deadline.is_some_and(|Deadline(deadline)| deadline <= Instant::now()) {
+        if task.is_closed() || deadline.is_some_and(Deadline::has_passed) {
             // Those behind it in the batch need not wait for what nobody does.
             task.fail(EngineError::Expired);
             continue;
@@ -370,7 +370,7 @@ fn plan(classical: &mut Classical, own: DecodeParams, job: Job, done: impl FnOnc
     match task {
         Task::Grasps(asked, reply) => {
             let started = Instant::now();
-            let wanted = || !reply.is_closed() && deadline.is_none_or(|Deadline(deadline)| Instant::now() < deadline);
+            let wanted = || !reply.is_closed() && !deadline.is_some_and(Deadline::has_passed);
             let decoded = caught(|| classical.plan(&scene, &asked, &asked.decode_params(own), wanted));
             let taken = done(started.elapsed());
             answer(reply, submitted, taken, || Ok(found(decoded?, scene.volume, &asked)));

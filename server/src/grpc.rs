@@ -68,8 +68,12 @@ pub(crate) async fn serve(
     let counted = Arc::clone(&metrics);
     let outgoing = MapResponseLayer::new(move |response| outgoing(intake::unreadable(response, &counted)));
     let intake = MapRequestLayer::new(move |request: http::Request<Body>| {
-        let (parts, body) = request.into_parts();
-        let body = Intake::new(parts.uri.path(), body, limits, Arc::clone(&metrics));
+        let (mut parts, body) = request.into_parts();
+        let deadline = deadline::read(&parts.headers);
+        if let Some(deadline) = deadline {
+            parts.extensions.insert(deadline);
+        }
+        let body = Intake::new(parts.uri.path(), body, deadline, limits, Arc::clone(&metrics));
         http::Request::from_parts(parts, Body::new(body))
     });
     let mut server = Server::builder();
@@ -86,8 +90,8 @@ pub(crate) async fn serve(
         .max_frame_size(MAX_FRAME)
         .max_concurrent_streams(MAX_STREAMS)
         .http2_keepalive_interval(Some(KEEPALIVE))
-        .add_service(InterceptedService::new(InterceptedService::new(grasps, deadline::note), guard.clone()))
-        .add_service(InterceptedService::new(InterceptedService::new(inference, deadline::note), guard.clone()))
+        .add_service(InterceptedService::new(grasps, guard.clone()))
+        .add_service(InterceptedService::new(inference, guard.clone()))
         // Whoever watches over this process has no token.
         .add_service(HealthServer::new(Health(state.clone())))
         .add_service(InterceptedService::new(reflection().build_v1()?, guard.clone()))

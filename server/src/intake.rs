@@ -12,6 +12,7 @@ use tonic::body::Body;
 use tonic::codegen::Bytes;
 use tonic::{Code, Status};
 
+use crate::deadline::Deadline;
 use crate::metrics::Metrics;
 
 /// A gRPC message's prefix: whether it is compressed, then its length, four bytes from the highest on.
@@ -35,6 +36,8 @@ pub(crate) struct Limits {
 /// The body of a request, held to the limits.
 pub(crate) struct Intake {
     body: Body,
+    /// When the caller gives up. tonic watches over it, too, and calls what it ends cancelled.
+    deadline: Option<Deadline>,
     limits: Limits,
     metrics: Arc<Metrics>,
     /// Whether messages may come whenever they like, as those of a stream do.
@@ -70,12 +73,15 @@ struct Message {
 
 impl Intake {
     /// The body of a request for a method at `path`.
-    pub fn new(path: &str, body: Body, limits: Limits, metrics: Arc<Metrics>) -> Self {
+    pub fn new(path: &str, body: Body, deadline: Option<Deadline>, limits: Limits, metrics: Arc<Metrics>) -> Self {
+        let rests = STREAMS.iter().any(|stream| path.ends_with(stream));
         Self {
             body,
+            // Answers of a stream may be worth having although its end never comes.
+            deadline: deadline.filter(|_| !rests),
             limits,
             metrics,
-            rests: STREAMS.iter().any(|stream| path.ends_with(stream)),
+            rests,
             message: Message::default(),
             since: None,
             waited: Duration::ZERO,
@@ -123,6 +129,10 @@ impl Intake {
             "the message has {bytes} bytes, at most {longest} are taken (--max-message-bytes)"
         ))
     }
+}
+
+fn late() -> Status {
+    Status::deadline_exceeded("the caller's time was up before its message had come")
 }
 
 /// Of what is no message tonic says `INTERNAL`, as if it were to blame, and nobody counts it. Its own errors are told from
@@ -204,6 +214,7 @@ impl http_body::Body for Intake {
     fn poll_frame(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
         let this = self.get_mut();
         match std::mem::replace(&mut this.state, State::Open) {
+            State::Open if this.deadline.is_some_and(Deadline::has_passed) => return this.refuse(late()),
             State::Open => {}
             State::Refusing(status) => return this.refuse(status),
             State::Refused => {
@@ -218,11 +229,12 @@ impl http_body::Body for Intake {
             if this.since.is_none() {
                 let (now, left) = (Instant::now(), this.left());
                 this.since = Some(now);
-                this.patience.as_mut().reset(now + left);
+                let until = this.deadline.map_or(now + left, |Deadline(deadline)| (now + left).min(deadline.into()));
+                this.patience.as_mut().reset(until);
             }
             ready!(this.patience.as_mut().poll(context));
-            let status = this.stalled();
-            return this.refuse(status);
+            let is_late = this.deadline.is_some_and(Deadline::has_passed);
+            return this.refuse(if is_late { late() } else { this.stalled() });
         };
         if let Some(since) = this.since.take() {
             this.waited += since.elapsed();

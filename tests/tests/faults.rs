@@ -165,6 +165,18 @@ async fn half_a_message_is_waited_for_no_longer_than_it_may_stand_still() {
 }
 
 #[tokio::test]
+async fn nobody_is_waited_for_beyond_their_own_deadline() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let mut h2 = connect(&server).await;
+    for timeout in ["1u", "100m"] {
+        let (code, message) = call_within(timeout, &mut h2, "DetectGrasps", &[&[0, 0]], Duration::ZERO, false).await;
+        assert_eq!(code, Code::DeadlineExceeded, "{timeout}: {message}");
+        assert_eq!(message, "the caller's time was up before its message had come");
+    }
+    assert_eq!(server.metric("graspd_requests_total{code=\"DEADLINE_EXCEEDED\",model=\"\"}"), 2.0);
+}
+
+#[tokio::test]
 async fn who_connects_and_says_nothing_is_not_waited_for() {
     let server = Server::run(&[TestModel::new("mirror")], &["--stall-timeout", "0.3"]);
     let mut silent =
@@ -254,8 +266,21 @@ async fn call(
     pause: Duration,
     ends: bool,
 ) -> (Code, String) {
+    call_within("1M", h2, method, pieces, pause, ends).await
+}
+
+/// The same by a caller who waits so long, as the header has it.
+async fn call_within(
+    timeout: &str,
+    h2: &mut SendRequest<Bytes>,
+    method: &str,
+    pieces: &[&[u8]],
+    pause: Duration,
+    ends: bool,
+) -> (Code, String) {
     let request = http::Request::post(format!("http://graspd/grasp.v1.GraspService/{method}"));
-    let request = request.header("content-type", "application/grpc").header("te", "trailers").body(()).unwrap();
+    let request = request.header("content-type", "application/grpc").header("te", "trailers");
+    let request = request.header("grpc-timeout", timeout).body(()).unwrap();
     let (response, mut body) = h2.clone().ready().await.unwrap().send_request(request, false).unwrap();
     for (index, piece) in pieces.iter().enumerate() {
         // The server may have ended it.
