@@ -116,7 +116,8 @@ class GraspService:
 
     def detect(self, request: Any, context: grpc.ServicerContext) -> Any:
         started = perf_counter()
-        if request.model not in ["", self.name] or request.version not in ["", self.version]:
+        options = request.options
+        if options.model not in ["", self.name] or options.version not in ["", self.version]:
             context.abort(grpc.StatusCode.NOT_FOUND, f"there is no such model, there is {self.name} {self.version}")
         try:
             volume = self.read(request.volume)
@@ -127,7 +128,6 @@ class GraspService:
             taken = perf_counter()
             quality, rotation, width = self.infer(volume)
             inferred = perf_counter()
-        options = request.options
         threshold = options.threshold if options.HasField("threshold") else THRESHOLD
         force = options.force if options.HasField("force") else None
         smooth = gaussian_filter(quality, SIGMA, mode="nearest")

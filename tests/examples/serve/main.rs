@@ -235,7 +235,7 @@ impl Bench {
                 let report =
                     ask(&client, &self.scene, Arrivals::Callers(callers), self.until(), Options::default()).await;
                 let throughput = crowd("graspd", callers, &report);
-                ensure!(report.refusals() == 0, "graspd refused {} calls", report.refusals());
+                ensure!(report.refusals() == 0, "graspd refused calls: {:?}", report.refused.keys());
                 if callers == 8 {
                     capacity = throughput;
                 }
@@ -247,7 +247,7 @@ impl Bench {
             for callers in CROWDS {
                 let report = peer.load(&self.scene, callers, self.until()).await?;
                 let throughput = crowd(kind, callers, &report);
-                ensure!(report.refusals() == 0, "{kind} refused {} calls", report.refusals());
+                ensure!(report.refusals() == 0, "{kind} refused calls: {:?}", report.refused.keys());
                 if callers == 8 {
                     findings.figure(&format!("{kind}_ratio"), capacity / throughput);
                 }
