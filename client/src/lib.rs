@@ -3,6 +3,29 @@
 //! [`Client`] speaks `grasp.v1` in the types of the domain: a [`grasp::Volume`], depth images or point clouds in, a
 //! [`Detection`] with [`Proposal`]s out. [`load`] makes many calls and says how they went.
 //! [`LocalServer`] runs a server of one's own for as long as it is needed.
+//!
+//! ```no_run
+//! use grasp_client::{Access, Asked, Client, Depth, DepthView, Extrinsics, Options, Retry, Workspace};
+//! use nalgebra::Isometry3;
+//!
+//! # async fn example(millimetres: Vec<u16>, k: [f64; 9], camera_from_task: Isometry3<f64>) -> Result<(), grasp_client::Error> {
+//! let access = Access { retry: Retry::RECOMMENDED, ..Access::default() };
+//! let client = Client::connect_with("127.0.0.1:50051", access).await?;
+//! let view = DepthView {
+//!     depth: Depth::Millimetres(millimetres),
+//!     width: 640,
+//!     height: 480,
+//!     k,
+//!     extrinsics: Extrinsics::CameraFromTask(camera_from_task),
+//! };
+//! let asked = Asked { max_grasps: 5, ..Asked::default() };
+//! let detection = client.detect_from_depth(&[view], &Workspace::default(), Options { asked, ..Options::default() }).await?;
+//! for grasp in &detection.grasps {
+//!     println!("{:.2} at {}", grasp.quality, grasp.pose);
+//! }
+//! # Ok(())
+//! # }
+//! ```
 
 mod access;
 mod client;

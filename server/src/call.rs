@@ -212,6 +212,7 @@ impl Call {
         }
         timings.total = self.started.elapsed();
         self.answered(&timings, 0);
+        self.recent.add(self.id.clone(), self.label.clone(), Outcome::Inferred(timings));
         self.ended = true;
         Ok((maps, timings))
     }

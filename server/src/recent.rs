@@ -32,7 +32,12 @@ pub(crate) struct Ended {
 /// How it ended.
 pub(crate) enum Outcome {
     Answered(Box<Answered>),
-    Refused { code: Code, message: String },
+    /// By a network's maps, which the caller decodes.
+    Inferred(Timings),
+    Refused {
+        code: Code,
+        message: String,
+    },
 }
 
 /// What was seen, and the grasps in it.
@@ -114,6 +119,11 @@ impl Ended {
                 "grasps": answered.grasps.len(),
                 "best": answered.grasps.first().map(|grasp| grasp.quality),
                 "latency": answered.timings.stages().collect::<BTreeMap<_, _>>(),
+            }),
+            Outcome::Inferred(timings) => json!({
+                "code": "OK",
+                "message": "The caller has the network's maps; no grasps were decoded here.",
+                "latency": timings.stages().collect::<BTreeMap<_, _>>(),
             }),
             Outcome::Refused { code, message } => json!({ "code": code_name(*code), "message": message }),
         };

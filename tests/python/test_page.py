@@ -23,6 +23,7 @@ import numpy as np
 import scene
 from server import Server
 from test_client import generate
+from tritonclient.grpc import InferenceServerClient, InferInput
 
 ROOT = Path(__file__).resolve().parents[2]
 # What is waited for takes a second on a quiet machine.
@@ -263,6 +264,19 @@ class PageTest(unittest.TestCase):
         red, green, blue = map(int, re.findall(r"\d+", colour))
         self.assertGreater(red, 2 * max(green, blue))
         self.browser.screenshot("refused")
+
+    def test_maps_are_told_from_grasps(self):
+        self.open(name="grasps")
+        tensor = InferInput("tsdf", [1, 1, *[scene.RESOLUTION] * 3], "FP32")
+        tensor.set_data_from_numpy(scene.volume(scene.camera(30, -90))[np.newaxis, np.newaxis])
+        with InferenceServerClient(self.server.grpc) as client:
+            client.infer("vgn-packed", [tensor], request_id="maps")
+        self.shows("maps")
+        _, model, code, grasps, best, milliseconds = self.browser.texts(f"{self.row('maps')} span")
+        self.assertEqual((model.split()[0], code, grasps, best), ("vgn-packed", "OK", "maps", "–"))
+        self.assertGreater(float(milliseconds), 0)
+        self.assertIn("no grasps were decoded", self.browser.text("#note"))
+        self.browser.screenshot("maps")
 
     def test_what_is_picked_stays_until_the_newest_is_wanted(self):
         self.open(name="earlier")
