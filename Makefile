@@ -80,13 +80,15 @@ bench-sim: ## how fast scenes are made, seen and labelled on one core
 	$(CARGO) run --release --package grasp-sim --example speed --locked
 
 bench-serve: ## how fast the server answers, beside libtorch, OpenVINO, Triton and a server in Python; quiet machines only
-	$(CARGO) build --release $(WORKSPACE) --bins --example serve
+	$(CARGO) build --release $(WORKSPACE) --bins
+	$(CARGO) build --release $(WORKSPACE) --example serve
 	$(with_libtorch) $(CARGO) build --release $(TRAIN)
 	$(with_onnxruntime) $(with_libtorch) GRASPD_PEERS="$$($(PYTHON) deploy/native.py peers)" && export GRASPD_PEERS && \
 		GRASP_TRAIN=$(RELEASE)/grasp-train $(RELEASE)/examples/serve 5 $(CARGO_TARGET_DIR)/bench-serve.json
 
 soak: ## a minute of four times what the server can do, then 20 minutes of 80 % of it; MINUTES=N
-	$(CARGO) build --release $(WORKSPACE) --bins --example soak
+	$(CARGO) build --release $(WORKSPACE) --bins
+	$(CARGO) build --release $(WORKSPACE) --example soak
 	$(with_onnxruntime) $(RELEASE)/examples/soak $(MINUTES)
 
 tables: ## play the paper's tables into docs/tables.md; VGN=DIR adds VGN's released weights
