@@ -129,11 +129,11 @@ async fn half_a_message_is_waited_for_no_longer_than_it_may_stand_still() {
 
     // A slow one is heard out, for it never stands still for long.
     let pieces: Vec<&[u8]> = bytes.chunks(bytes.len() / 4 + 1).collect();
-    let status = call(&mut h2, "DetectGrasps", &pieces, Duration::from_millis(100), true).await;
+    let status = call("1M", &mut h2, "DetectGrasps", &pieces, Duration::from_millis(100), true).await;
     assert_eq!(status, (Code::Ok, String::new()));
 
     for sent in [0, 3, 5, 1000, bytes.len() - 1] {
-        let (code, message) = call(&mut h2, "DetectGrasps", &[&bytes[..sent]], Duration::ZERO, false).await;
+        let (code, message) = call("1M", &mut h2, "DetectGrasps", &[&bytes[..sent]], Duration::ZERO, false).await;
         assert_eq!(code, Code::DeadlineExceeded);
         let missing =
             if sent < 5 { "its length is".to_owned() } else { format!("{} bytes of it are", bytes.len() - sent) };
@@ -145,18 +145,20 @@ async fn half_a_message_is_waited_for_no_longer_than_it_may_stand_still() {
     let many = bytes.repeat(12);
     let (first, rest) = many.split_at(bytes.len() + 3);
     let pieces: Vec<&[u8]> = std::iter::once(first).chain(rest.chunks(bytes.len())).collect();
-    let status = call(&mut h2, "DetectGraspsStream", &pieces, Duration::from_millis(100), true).await;
+    let status = call("1M", &mut h2, "DetectGraspsStream", &pieces, Duration::from_millis(100), true).await;
     assert_eq!(status, (Code::Ok, String::new()));
 
     // Fed a byte at a time it never stands still, and is refused all the same.
     let single: Vec<&[u8]> = bytes.chunks(1).collect();
-    let (code, message) = call(&mut h2, "DetectGrasps", &single, Duration::from_millis(10), true).await;
+    let (code, message) = call("1M", &mut h2, "DetectGrasps", &single, Duration::from_millis(10), true).await;
     assert_eq!(code, Code::DeadlineExceeded);
     assert!(message.starts_with("the message comes more slowly than 65536 bytes a second, "), "{message}");
 
     // Nor does it hold up the end.
     let stuck =
-        tokio::spawn(async move { call(&mut h2, "DetectGrasps", &[&bytes[..1000]], Duration::ZERO, false).await });
+        tokio::spawn(
+            async move { call("1M", &mut h2, "DetectGrasps", &[&bytes[..1000]], Duration::ZERO, false).await },
+        );
     tokio::task::yield_now().await;
     server.terminate().unwrap();
     assert_eq!(tokio::task::spawn_blocking(move || server.wait().unwrap().code()).await.unwrap(), Some(0));
@@ -169,7 +171,7 @@ async fn nobody_is_waited_for_beyond_their_own_deadline() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let mut h2 = connect(&server).await;
     for timeout in ["1u", "100m"] {
-        let (code, message) = call_within(timeout, &mut h2, "DetectGrasps", &[&[0, 0]], Duration::ZERO, false).await;
+        let (code, message) = call(timeout, &mut h2, "DetectGrasps", &[&[0, 0]], Duration::ZERO, false).await;
         assert_eq!(code, Code::DeadlineExceeded, "{timeout}: {message}");
         assert_eq!(message, "the caller's time was up before its message had come");
     }
@@ -197,10 +199,10 @@ async fn what_is_no_message_is_the_callers_fault_and_counted() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let mut h2 = connect(&server).await;
     // The fifth field of wire type 7, which there is none of.
-    let (code, message) = call(&mut h2, "DetectGrasps", &[&[0, 0, 0, 0, 1, 0x2f]], Duration::ZERO, true).await;
+    let (code, message) = call("1M", &mut h2, "DetectGrasps", &[&[0, 0, 0, 0, 1, 0x2f]], Duration::ZERO, true).await;
     assert_eq!(code, Code::InvalidArgument, "{message}");
     assert_eq!(server.metric("graspd_requests_total{code=\"INVALID_ARGUMENT\",model=\"\"}"), 1.0);
-    let (code, message) = call(&mut h2, "DetectGrasps", &[&[]], Duration::ZERO, true).await;
+    let (code, message) = call("1M", &mut h2, "DetectGrasps", &[&[]], Duration::ZERO, true).await;
     assert_eq!(code, Code::InvalidArgument, "{message}");
     assert_eq!(server.metric("graspd_requests_total{code=\"INVALID_ARGUMENT\",model=\"\"}"), 2.0);
     assert_eq!(server.metric("graspd_requests_total{code=\"INTERNAL\",model=\"\"}"), 0.0);
@@ -258,19 +260,9 @@ async fn connect(server: &Server) -> SendRequest<Bytes> {
     h2
 }
 
-/// Calls a method with these bytes, piece by piece; the status and its message.
+/// Calls a method with these bytes, piece by piece, as one who waits so long, as `grpc-timeout` has it; the status and its
+/// message.
 async fn call(
-    h2: &mut SendRequest<Bytes>,
-    method: &str,
-    pieces: &[&[u8]],
-    pause: Duration,
-    ends: bool,
-) -> (Code, String) {
-    call_within("1M", h2, method, pieces, pause, ends).await
-}
-
-/// The same by a caller who waits so long, as the header has it.
-async fn call_within(
     timeout: &str,
     h2: &mut SendRequest<Bytes>,
     method: &str,
