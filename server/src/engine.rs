@@ -58,10 +58,10 @@ pub(crate) struct Sessions(Mutex<Vec<JoinHandle<()>>>);
 
 /// Why a volume was not taken.
 #[derive(Debug, Error)]
-#[error("the model `{model}` has {waiting} requests waiting, no more are taken; come back in {retry_after:?}")]
+#[error("{what}, no more are taken; come back in {retry_after:?}")]
 pub(crate) struct Overloaded {
-    model: String,
-    waiting: usize,
+    /// What there is as much of as may be.
+    what: String,
     /// When a place in the queue should be free again.
     pub retry_after: Duration,
 }
@@ -225,19 +225,22 @@ impl Engine {
 
     /// Refuses where there is no place at this moment, so that nothing is prepared in vain.
     pub fn check_place(&self) -> Result<(), Overloaded> {
-        if self.queue.is_full() { Err(self.overloaded()) } else { Ok(()) }
+        if self.queue.is_full() { Err(self.full()) } else { Ok(()) }
     }
 
     fn push(&self, scene: Scene, task: Task, deadline: Option<Deadline>, span: Span) -> Result<Place<Job>, Overloaded> {
         // The queue is closed only when the engine goes.
         let job = Job { scene, task, deadline, span, submitted: Instant::now() };
-        self.queue.push(job).map_err(|Full| self.overloaded())
+        self.queue.push(job).map_err(|Full| self.full())
     }
 
-    /// What is said to whom there is no place for.
-    pub fn overloaded(&self) -> Overloaded {
-        let (model, waiting) = (self.source.name().to_owned(), self.capacity());
-        Overloaded { model, waiting, retry_after: self.pace.get() }
+    fn full(&self) -> Overloaded {
+        self.overloaded(format!("the model `{}` has {} requests waiting", self.source.name(), self.capacity()))
+    }
+
+    /// Refuses what there is no place for, here or on the way: when there may be one, its pace says.
+    pub fn overloaded(&self, what: String) -> Overloaded {
+        Overloaded { what, retry_after: self.pace.get() }
     }
 }
 

@@ -76,7 +76,10 @@ impl Inference {
             }
         }
         let batch = batches(request, n, max_batch(&engine))?;
-        let held = self.outbox.hold(batch.len() * MAPS_PER_VOXEL).ok_or_else(|| engine.overloaded())?;
+        let held = self.outbox.hold(batch.len() * MAPS_PER_VOXEL).ok_or_else(|| {
+            let most = Outbox::CAPACITY >> 20;
+            engine.overloaded(format!("of {most} MiB of maps too few were read yet by those who asked for them"))
+        })?;
         let volume = |values: &[f32]| {
             let volume = Volume::new(n, voxel_size, Isometry3::identity(), values.to_vec());
             volume.map_err(|error| {

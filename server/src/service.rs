@@ -161,7 +161,8 @@ impl Grasps {
     /// A turn to convert and fuse, or a refusal at once: where too many wait already, or the planner has no place.
     fn turn(&self, engine: &Engine) -> Result<OwnedSemaphorePermit, Refusal> {
         engine.check_place()?;
-        Ok(Arc::clone(&self.turns).try_acquire_owned().map_err(|_| engine.overloaded())?)
+        let turn = Arc::clone(&self.turns).try_acquire_owned();
+        Ok(turn.map_err(|_| engine.overloaded("too many requests wait to be converted and fused".to_owned()))?)
     }
 
     /// Waits for a place to do it, but no longer than anybody waits for the reply.
