@@ -1,6 +1,7 @@
 use nalgebra::{Isometry3, Translation3, Vector3};
 
-use crate::filter::{dilate, gaussian, is_window_maximum};
+use crate::filter::{dilate, gaussian, is_window_maximum, reaches};
+use crate::maps::PROBABLE;
 use crate::selection::{Decoded, Dropped, Selection};
 use crate::{Clearance, Constraints, DecodeError, FINGER_DEPTH, Grasp, Hand, Maps, Volume, VoxelOrigin, before};
 
@@ -95,11 +96,12 @@ pub fn decode(volume: &Volume, maps: &Maps, params: &DecodeParams) -> Result<Dec
     let n = volume.resolution();
     maps.check_quality(n)?;
 
-    let smooth = gaussian(maps.quality, n, params.sigma, params.radius);
     let near_surface = near_surface(volume, params);
-
     let selection = Selection::new(volume, params);
-    let above = |threshold| candidates(volume, maps, &smooth, &near_surface, &selection, threshold, params);
+    let above = |threshold| {
+        let smooth = gaussian(maps.quality, n, params.sigma, params.radius, threshold, *PROBABLE.end());
+        candidates(volume, maps, &smooth, &near_surface, &selection, threshold, params)
+    };
     let decoded = above(params.threshold)?;
     match params.floor() {
         Some(floor) if decoded.grasps.is_empty() => Ok(above(floor)?.best_alone()),
@@ -123,11 +125,16 @@ fn candidates(
     let mut dropped = Dropped::default();
     let mut quality = vec![0.0; smooth.len()];
     let mut passed = Vec::new();
-    for (index, &q) in smooth.iter().enumerate() {
+    // Few rows of z hold any.
+    let rows = smooth.chunks_exact(n).enumerate().filter(|(_, row)| reaches(row, threshold));
+    let mut reached = 0;
+    for (index, &q) in rows.flat_map(|(row, values)| (row * n..).zip(values)) {
+        if q < threshold || q <= 0.0 {
+            continue;
+        }
+        reached += 1;
         let width = maps.width[index];
-        let count = if q < threshold || q <= 0.0 {
-            &mut dropped.below_threshold
-        } else if !near_surface[index] {
+        let count = if !near_surface[index] {
             &mut dropped.mask
         } else if !(width >= params.min_width && width <= params.max_width)
             || f64::from(width) * volume.voxel_size() > opening
@@ -145,6 +152,7 @@ fn candidates(
         };
         *count += 1;
     }
+    dropped.below_threshold = smooth.len() - reached;
     let all = passed.len();
     passed.retain(|&(index, _)| is_window_maximum(&quality, n, index, params.nms_size));
     dropped.suppressed = all - passed.len();
@@ -155,10 +163,10 @@ fn candidates(
 /// The voxels in front of surfaces, grown a little, but not into objects.
 fn near_surface(volume: &Volume, params: &DecodeParams) -> Vec<bool> {
     let values = volume.values();
-    let outside = values.iter().map(|&v| v > params.outside_above).collect();
+    let outside: Vec<bool> = values.iter().map(|&v| v > params.outside_above).collect();
     let not_inside: Vec<bool> =
         values.iter().map(|&v| !(v > params.inside_above && v < params.outside_above)).collect();
-    dilate(outside, &not_inside, volume.resolution(), params.dilations)
+    dilate(&outside, &not_inside, volume.resolution(), params.dilations)
 }
 
 impl Border {

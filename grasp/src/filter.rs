@@ -12,109 +12,102 @@ fn gaussian_kernel(sigma: f32, radius: usize) -> Vec<f32> {
 }
 
 /// Separable Gaussian filter with the nearest voxel repeated past the border. `sigma` and `radius` in voxels.
-pub(crate) fn gaussian(values: &[f32], n: usize, sigma: f32, radius: usize) -> Vec<f32> {
+///
+/// Of `values` of at most `ceiling`, it is exact wherever it is at least `floor`, above 0, and less than that elsewhere:
+/// an average is no higher than its centre lets it be, so that most rows need not be computed to the end.
+pub(crate) fn gaussian(values: &[f32], n: usize, sigma: f32, radius: usize, floor: f32, ceiling: f32) -> Vec<f32> {
     if sigma <= 0.0 || radius == 0 {
         return values.to_vec();
     }
     let kernel = gaussian_kernel(sigma, radius);
-    let radius = kernel.len() / 2;
-    let mut a = vec![0.0; values.len()];
-    let mut b = vec![0.0; values.len()];
-    along_blocks(values, &mut a, n, n * n, &kernel);
-    for (source, target) in a.chunks_exact(n * n).zip(b.chunks_exact_mut(n * n)) {
-        along_blocks(source, target, n, n, &kernel);
+    // What a centre must be for its average to be `average` when all around it are at the ceiling, but for rounding.
+    let center = |average: f32| ceiling - (ceiling - average) / kernel[radius] - 1e-4;
+    let after_y = center(floor);
+    let after_x = center(after_y);
+    let clamped = |i: usize| i.saturating_sub(radius).min(n - 1);
+
+    let mut along_x = vec![0.0; values.len()];
+    for (x, target) in along_x.chunks_exact_mut(n * n).enumerate() {
+        weigh(target, &kernel, |k| &values[clamped(x + k) * n * n..][..n * n]);
     }
+    let mut along_y = vec![0.0; values.len()];
+    for (row, target) in along_y.chunks_exact_mut(n).enumerate() {
+        let (plane, y) = (&along_x[row / n * n * n..][..n * n], row % n);
+        if reaches(&plane[y * n..][..n], after_x) {
+            weigh(target, &kernel, |k| &plane[clamped(y + k) * n..][..n]);
+        }
+    }
+    let mut along_z = along_x;
     let mut padded = vec![0.0; n + 2 * radius];
-    for (source, target) in b.chunks_exact(n).zip(a.chunks_exact_mut(n)) {
-        padded[..radius].fill(source[0]);
-        padded[radius..radius + n].copy_from_slice(source);
-        padded[radius + n..].fill(source[n - 1]);
-        weigh(target, &kernel, |k| &padded[k..k + n]);
+    for (source, target) in along_y.chunks_exact(n).zip(along_z.chunks_exact_mut(n)) {
+        target.fill(0.0);
+        if reaches(source, after_y) {
+            padded[..radius].fill(source[0]);
+            padded[radius..radius + n].copy_from_slice(source);
+            padded[radius + n..].fill(source[n - 1]);
+            weigh(target, &kernel, |k| &padded[k..k + n]);
+        }
     }
-    a
+    along_z
 }
 
-/// Filters across `n` blocks of `block` values each: every output block is a weighted sum of whole blocks, which
-/// vectorises whatever the axis.
-fn along_blocks(source: &[f32], target: &mut [f32], n: usize, block: usize, kernel: &[f32]) {
-    let radius = kernel.len() / 2;
-    let mut blocks = Vec::with_capacity(kernel.len());
-    for (i, target) in target.chunks_exact_mut(block).enumerate() {
-        blocks.clear();
-        blocks.extend((i..=i + 2 * radius).map(|j| {
-            let j = j.saturating_sub(radius).min(n - 1);
-            &source[j * block..(j + 1) * block]
-        }));
-        weigh(target, kernel, |k| blocks[k]);
-    }
+/// Whether any value is at least `floor`. All are looked at, which vectorises; stopping at the first does not.
+pub(crate) fn reaches(values: &[f32], floor: f32) -> bool {
+    values.iter().fold(false, |any, &value| any | (value >= floor))
 }
-
-/// Values that are summed up together before they are written: few enough for the registers of any processor.
-const LANES: usize = 8;
 
 /// `target` becomes the sum of `source(k)`, each as long as it is, weighted by a kernel that is the same from both ends.
 fn weigh<'a>(target: &mut [f32], kernel: &[f32], source: impl Fn(usize) -> &'a [f32]) {
     let radius = kernel.len() / 2;
-    let (chunks, rest) = target.as_chunks_mut::<LANES>();
-    let done = chunks.len() * LANES;
-    for (chunk, target) in chunks.iter_mut().enumerate() {
-        // As long as the target, the source has this chunk, too.
-        let at = |k: usize| source(k)[chunk * LANES..].first_chunk::<LANES>().unwrap_or(&[0.0; LANES]);
-        let mut sums = at(radius).map(|value| kernel[radius] * value);
-        for (k, &weight) in kernel[..radius].iter().enumerate() {
-            let (before, after) = (at(k), at(2 * radius - k));
-            for lane in 0..LANES {
-                sums[lane] += weight * (before[lane] + after[lane]);
-            }
-        }
-        *target = sums;
+    for (sum, center) in target.iter_mut().zip(source(radius)) {
+        *sum = kernel[radius] * center;
     }
-    for (index, target) in rest.iter_mut().enumerate() {
-        *target = kernel.iter().enumerate().map(|(k, weight)| weight * source(k)[done + index]).sum();
+    for (k, &weight) in kernel[..radius].iter().enumerate() {
+        add_weighed(target, weight, source(k), source(2 * radius - k));
+    }
+}
+
+/// A function of its own, where the compiler knows that the slices are apart: it vectorises short rows, too.
+#[inline(never)]
+fn add_weighed(sums: &mut [f32], weight: f32, before: &[f32], after: &[f32]) {
+    for ((sum, before), after) in sums.iter_mut().zip(before).zip(after) {
+        *sum += weight * (before + after);
     }
 }
 
 /// Binary dilation by the 6-neighbourhood, `iterations` times, growing only where `allowed`.
-pub(crate) fn dilate(seed: Vec<bool>, allowed: &[bool], n: usize, iterations: usize) -> Vec<bool> {
-    let mut current = seed;
+pub(crate) fn dilate(seed: &[bool], allowed: &[bool], n: usize, iterations: usize) -> Vec<bool> {
+    // With a voxel more at the end of each row and a row more at the end of each plane, which nothing grows into, every
+    // neighbour is the whole array shifted, which vectorises.
+    let (row, plane) = (n + 1, (n + 1) * (n + 1));
+    let voxels = plane..(n + 1) * plane;
+    let rows = |x: usize| (0..n).map(move |y| ((x + 1) * plane + y * row, (x * n + y) * n));
+    let pad = |values: &[bool]| {
+        let mut padded = vec![false; (n + 2) * plane];
+        for (to, from) in (0..n).flat_map(rows) {
+            padded[to..to + n].copy_from_slice(&values[from..from + n]);
+        }
+        padded
+    };
+    let (mut current, allowed) = (pad(seed), pad(allowed));
     let mut next = current.clone();
     for _ in 0..iterations {
-        // A row at a time: each of the six neighbours of a row of z is a shifted row.
-        for row in 0..n * n {
-            let (x, y) = (row / n, row % n);
-            let range = row * n..(row + 1) * n;
-            let target = &mut next[range.clone()];
-            let mut grow = |from: usize| {
-                for (t, s) in target.iter_mut().zip(&current[from * n..(from + 1) * n]) {
-                    *t |= s;
-                }
-            };
-            if x > 0 {
-                grow(row - n);
-            }
-            if x + 1 < n {
-                grow(row + n);
-            }
-            if y > 0 {
-                grow(row - 1);
-            }
-            if y + 1 < n {
-                grow(row + 1);
-            }
-            let here = &current[range.clone()];
-            for (t, s) in target[1..].iter_mut().zip(here) {
-                *t |= s;
-            }
-            for (t, s) in target.iter_mut().zip(&here[1..]) {
-                *t |= s;
-            }
-            for ((t, s), allowed) in target.iter_mut().zip(here).zip(&allowed[range]) {
-                *t = *s | (*t & allowed);
-            }
+        let around = [1, row, plane].map(|step| (&current[voxels.start - step..], &current[voxels.start + step..]));
+        let target = next[voxels.clone()].iter_mut();
+        let centers = current[voxels.clone()].iter().zip(&allowed[voxels.clone()]);
+        let [(a, b), (c, d), (e, f)] = around;
+        for ((((target, (center, allowed)), (a, b)), (c, d)), (e, f)) in
+            target.zip(centers).zip(a.iter().zip(b)).zip(c.iter().zip(d)).zip(e.iter().zip(f))
+        {
+            *target = center | (allowed & (a | b | c | d | e | f));
         }
-        current.copy_from_slice(&next);
+        std::mem::swap(&mut current, &mut next);
     }
-    current
+    let mut dilated = vec![false; seed.len()];
+    for (from, to) in (0..n).flat_map(rows) {
+        dilated[to..to + n].copy_from_slice(&current[from..from + n]);
+    }
+    dilated
 }
 
 /// Whether a voxel is the largest of its `size`³ window, `-size/2 … size - size/2 - 1` as in
@@ -129,4 +122,53 @@ pub(crate) fn is_window_maximum(values: &[f32], n: usize, index: usize, size: us
             values[row + z.start..row + z.end].iter().all(|&other| other <= value)
         })
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const N: usize = 20;
+
+    #[test]
+    fn what_is_left_out_of_the_smoothing_is_below_the_floor() {
+        // Plateaus of certainty of several sizes, one at a corner, in a sea of doubt.
+        let ceiling = 1.001;
+        let mut values: Vec<f32> = (0..N.pow(3)).map(|i| (i * 7919 % 1000) as f32 / 2500.0).collect();
+        for (corner, size) in [([0, 0, 0], 3), ([8, 8, 8], 5), ([14, 3, 10], 4), ([4, 15, 2], 2)] {
+            for i in 0..N.pow(3) {
+                let inside =
+                    [i / (N * N), i / N % N, i % N].iter().zip(corner).all(|(&c, low)| (low..low + size).contains(&c));
+                if inside {
+                    values[i] = ceiling;
+                }
+            }
+        }
+        let whole = gaussian(&values, N, 1.0, 4, 0.0, ceiling);
+        for floor in [0.3, 0.5, 0.9, 0.95] {
+            let pruned = gaussian(&values, N, 1.0, 4, floor, ceiling);
+            assert!(whole.iter().any(|&value| value >= floor), "{floor} is reached");
+            for (exact, value) in whole.iter().zip(pruned) {
+                assert!(value == *exact || (value < floor && *exact < floor), "{exact} became {value}, floor {floor}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_dilation_stays_in_its_cube_and_out_of_what_is_forbidden() {
+        let at = |x: usize, y: usize, z: usize| (x * N + y) * N + z;
+        let mut seed = vec![false; N.pow(3)];
+        seed[at(0, 0, 0)] = true;
+        seed[at(5, 5, N - 1)] = true;
+        let mut allowed = vec![true; N.pow(3)];
+        allowed[at(1, 0, 0)] = false;
+        let dilated = dilate(&seed, &allowed, N, 2);
+        let steps = |a: [usize; 3], b: [usize; 3]| a.iter().zip(b).map(|(a, b)| a.abs_diff(b)).sum::<usize>();
+        for (i, grown) in dilated.into_iter().enumerate() {
+            let here = [i / (N * N), i / N % N, i % N];
+            // (2, 0, 0) is two steps away only through what is forbidden.
+            let near = steps(here, [0, 0, 0]) <= 2 && !matches!(here, [1 | 2, 0, 0]);
+            assert_eq!(grown, near || steps(here, [5, 5, N - 1]) <= 2, "{here:?}");
+        }
+    }
 }

@@ -4,7 +4,7 @@ use nalgebra::{Quaternion, UnitQuaternion};
 use thiserror::Error;
 
 /// Probabilities, with room for the rounding of low precisions.
-const PROBABLE: RangeInclusive<f32> = -1e-3..=1.001;
+pub(crate) const PROBABLE: RangeInclusive<f32> = -1e-3..=1.001;
 
 /// A network's output over a volume of N³ voxels, each array indexed `[channel][x][y][z]`, z fastest.
 #[derive(Clone, Copy, Debug)]

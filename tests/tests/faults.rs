@@ -1,7 +1,7 @@
 //! What goes wrong around a server, and inside it.
 
 use std::fs;
-use std::os::unix::fs::PermissionsExt;
+use std::process::Command;
 use std::time::Duration;
 
 use grasp::Volume;
@@ -68,10 +68,11 @@ async fn a_log_that_cannot_be_written_stops_nothing() {
     let folder = tempfile::tempdir().unwrap();
     TestModel::new("mirror").write(folder.path());
     let models = folder.path().to_str().unwrap();
-    // A disk that is always full.
-    let script = folder.path().join("graspd-with-full-disk");
-    fs::write(&script, format!("#!/bin/sh\nexec {} \"$@\" 2> /dev/full\n", graspd().display())).unwrap();
-    fs::set_permissions(&script, fs::Permissions::from_mode(0o755)).unwrap();
+    // A disk that is always full. Another process makes the script executable: had this one written it, a child that
+    // another test forks meanwhile would hold it open for writing, and it could not be run.
+    let (draft, script) = (folder.path().join("draft"), folder.path().join("graspd-with-full-disk"));
+    fs::write(&draft, format!("#!/bin/sh\nexec {} \"$@\" 2> /dev/full\n", graspd().display())).unwrap();
+    assert!(Command::new("install").arg("-m755").args([&draft, &script]).status().unwrap().success());
     let mut server =
         LocalServer::spawn(&script, ["--models", models, "--provider", "cpu", "--threads", "1", "--log", "trace"])
             .unwrap();

@@ -144,13 +144,15 @@ impl Bench {
         let server = self.serve(name, &[])?;
         let client = Client::connect(server.grpc().to_string()).await?;
         let (backend, params) = (network.backend(), network.metadata().decode_params());
-        let [mut bare, mut service, mut grpc] = [const { Vec::new() }; 3];
+        let [mut bare, mut decoding, mut service, mut grpc] = [const { Vec::new() }; 4];
         network.fill(&[&self.scene])?;
         let probe = times(WARM_UP, || network.run(1).map(drop))?;
         let typical = Report::quantile(&probe, 0.5);
         let count = (self.seconds.as_secs_f64() / typical.as_secs_f64()).ceil() as usize / TURNS + 1;
         for _ in 0..TURNS {
             bare.extend(times(count, || network.run(1).map(drop))?);
+            let output = network.infer(&[&self.scene])?;
+            decoding.extend(times(count, || decode(&self.scene, &output.maps(0), &params).map(drop))?);
             service.extend(times(count, || {
                 let output = network.infer(&[&self.scene])?;
                 decode(&self.scene, &output.maps(0), &params)?;
@@ -164,9 +166,10 @@ impl Bench {
         let title = format!("{name}, {backend}, {} calls, one at a time", count * TURNS);
         let mut table = Table::new(&title, &["p50 ms", "p99 ms", "gRPC's p50 to it"]);
         let mut p50 = 0.0;
-        for (row, times) in [("gRPC", &mut grpc), ("infer + decode", &mut service), ("session.run", &mut bare)] {
+        let rows = [("gRPC", grpc), ("infer + decode", service), ("session.run", bare), ("decode", decoding)];
+        for (row, mut times) in rows {
             times.sort_unstable();
-            let [median, p99] = [0.5, 0.99].map(|share| milliseconds(Report::quantile(times, share)));
+            let [median, p99] = [0.5, 0.99].map(|share| milliseconds(Report::quantile(&times, share)));
             if row == "gRPC" {
                 p50 = median;
             }
