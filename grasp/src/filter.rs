@@ -136,11 +136,10 @@ mod tests {
         let ceiling = 1.001;
         let mut values: Vec<f32> = (0..N.pow(3)).map(|i| (i * 7919 % 1000) as f32 / 2500.0).collect();
         for (corner, size) in [([0, 0, 0], 3), ([8, 8, 8], 5), ([14, 3, 10], 4), ([4, 15, 2], 2)] {
-            for i in 0..N.pow(3) {
-                let inside =
-                    [i / (N * N), i / N % N, i % N].iter().zip(corner).all(|(&c, low)| (low..low + size).contains(&c));
-                if inside {
-                    values[i] = ceiling;
+            for (i, value) in values.iter_mut().enumerate() {
+                let here = [i / (N * N), i / N % N, i % N];
+                if here.iter().zip(corner).all(|(&c, low)| (low..low + size).contains(&c)) {
+                    *value = ceiling;
                 }
             }
         }

@@ -115,7 +115,9 @@ impl Results {
         text.push_str("\n## Table 3: milliseconds to plan\n\n");
         self.times(&mut text);
         text.push_str("\n## Table 4: learnt from the other scenario\n\n");
-        text.push_str("A network that began with the weights of one for the other scenario has seen it: its card says so.\n\n");
+        text.push_str(
+            "A network that began with the weights of one for the other scenario has seen it: its card says so.\n\n",
+        );
         self.success(&mut text, &PUBLISHED_CROSSED, |game| !game.learnt_here());
         text.push_str("\n## How sure a grasp must be\n\n");
         self.epsilons(&mut text);
