@@ -51,7 +51,7 @@ use crate::oip::Inference;
 use crate::recent::Recent;
 use crate::service::Grasps;
 use crate::shutdown::{Signals, hangup};
-use crate::telemetry::Traces;
+use crate::telemetry::{Log, Traces};
 use crate::track::Kept;
 
 fn main() -> ExitCode {
@@ -63,14 +63,15 @@ fn main() -> ExitCode {
         }
     };
     let started = runtime(&config).and_then(|runtime| Ok((telemetry::init(&config, &runtime)?, runtime)));
-    let (traces, runtime) = match started {
+    // The log outlives all that logs.
+    let ((log, traces), runtime) = match started {
         Ok(started) => started,
         Err(error) => {
             eprintln!("graspd: {error:#}");
             return ExitCode::FAILURE;
         }
     };
-    match run(&config, runtime, &traces) {
+    match run(&config, runtime, &log, &traces) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             error!("{error:#}");
@@ -90,12 +91,12 @@ fn runtime(config: &Config) -> anyhow::Result<Runtime> {
 }
 
 /// From the configuration to the last session dropped.
-fn run(config: &Config, runtime: Runtime, traces: &Traces) -> anyhow::Result<()> {
+fn run(config: &Config, runtime: Runtime, log: &Log, traces: &Traces) -> anyhow::Result<()> {
     let connections = allow_connections(config.max_connections);
     let onnxruntime = grasp_models::init()?;
     info!(version = onnxruntime.version, library = %onnxruntime.library.display(), "ONNX Runtime");
 
-    let metrics = Arc::new(Metrics::new());
+    let metrics = Arc::new(Metrics::new(log.dropped.clone()));
     let sessions = Arc::new(Sessions::default());
     let served = runtime.block_on(serve(config, connections, &metrics, &sessions));
     traces.finish();

@@ -1,4 +1,5 @@
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use grasp_models::Backend;
@@ -9,6 +10,7 @@ use prometheus::{
     TextEncoder,
 };
 use tonic::Code;
+use tracing_appender::non_blocking::ErrorCounter;
 
 use crate::connections::Doors;
 use crate::engine::{Engine, Gauges};
@@ -40,13 +42,17 @@ pub(crate) struct Metrics {
     connections_refused: IntCounter,
     ready: IntGauge,
     tracked: IntGauge,
+    dropped_lines: IntCounter,
+    /// Of which `dropped_lines` has counted so many.
+    dropped: (ErrorCounter, AtomicU64),
 }
 
 impl Metrics {
     /// The format of [`render`](Self::render).
     pub const CONTENT_TYPE: &str = TEXT_FORMAT;
 
-    pub fn new() -> Self {
+    /// `dropped`: the lines that the log lost.
+    pub fn new(dropped: ErrorCounter) -> Self {
         const VALID: &str = "the names below are valid and differ";
         let stages = HistogramOpts::new("graspd_stage_duration_seconds", "Time a request spent in each stage.");
         let metrics = Self {
@@ -99,9 +105,15 @@ impl Metrics {
                 .expect(VALID),
             tracked: IntGauge::new("graspd_tracked_volumes", "Volumes that are kept for calls of TrackGrasps.")
                 .expect(VALID),
+            dropped_lines: IntCounter::new(
+                "graspd_log_lines_dropped_total",
+                "Lines of the log that were lost, because it was not read as fast as it was written.",
+            )
+            .expect(VALID),
+            dropped: (dropped, AtomicU64::new(0)),
         };
         let Self { registry, stages, requests, grasps, waiting, batches, models, reloads, rejected, .. } = &metrics;
-        let Self { connections, connections_limit, connections_refused, ready, tracked, .. } = &metrics;
+        let Self { connections, connections_limit, connections_refused, ready, tracked, dropped_lines, .. } = &metrics;
         registry.register(Box::new(stages.clone())).expect(VALID);
         registry.register(Box::new(requests.clone())).expect(VALID);
         registry.register(Box::new(grasps.clone())).expect(VALID);
@@ -115,6 +127,7 @@ impl Metrics {
         registry.register(Box::new(connections_refused.clone())).expect(VALID);
         registry.register(Box::new(ready.clone())).expect(VALID);
         registry.register(Box::new(tracked.clone())).expect(VALID);
+        registry.register(Box::new(dropped_lines.clone())).expect(VALID);
         // What has not happened yet is 0, lest its first time goes unseen by who looks at increases.
         for outcome in ["ok", "failed"] {
             metrics.reloads.with_label_values(&[outcome]);
@@ -189,6 +202,10 @@ impl Metrics {
     /// In Prometheus' text format.
     pub fn render(&self, state: State) -> String {
         self.ready.set((state == State::Ready).into());
+        let (lines, counted) = &self.dropped;
+        let lines = lines.dropped_lines() as u64;
+        // Two may look at the same time: each adds what the other has not.
+        self.dropped_lines.inc_by(lines.saturating_sub(counted.fetch_max(lines, Ordering::Relaxed)));
         TextEncoder::new().encode_to_string(&self.registry.gather()).expect("the encoder writes to memory")
     }
 }

@@ -12,6 +12,7 @@ use opentelemetry_sdk::trace::SdkTracerProvider;
 use tokio::runtime::Runtime;
 use tonic::metadata::MetadataMap;
 use tracing::{Span, warn};
+use tracing_appender::non_blocking::{ErrorCounter, NonBlockingBuilder, WorkerGuard};
 use tracing_opentelemetry::OpenTelemetrySpanExt;
 use tracing_subscriber::filter::filter_fn;
 use tracing_subscriber::layer::SubscriberExt;
@@ -27,16 +28,29 @@ const NAME: &str = env!("CARGO_PKG_NAME");
 /// The span of a request: the one that traces show.
 pub(crate) const REQUEST: &str = "detect";
 
+/// How many lines of the log may wait to be written.
+const LINES: usize = 8192;
+
+/// The log on its way to stderr. Dropping it writes what still waits, for a second at most.
+pub(crate) struct Log {
+    _writer: WorkerGuard,
+    /// Lines that found no room, because whoever reads the log does not.
+    pub dropped: ErrorCounter,
+}
+
 /// Where spans go besides the log.
 pub(crate) struct Traces(Option<SdkTracerProvider>);
 
 /// Sends the log to stderr, as stdout is for the process that started this one; and the spans of requests to a collector of
-/// OpenTelemetry, where there is one. They travel on the runtime's threads.
-pub(crate) fn init(config: &Config, runtime: &Runtime) -> anyhow::Result<Traces> {
+/// OpenTelemetry, where there is one. They travel on the runtime's threads; the log has one of its own, as a pipe that
+/// nobody reads holds up who writes to it.
+pub(crate) fn init(config: &Config, runtime: &Runtime) -> anyhow::Result<(Log, Traces)> {
+    let (writer, guard) = NonBlockingBuilder::default().buffered_lines_limit(LINES).thread_name("log").finish(stderr());
+    let dropped = writer.error_counter();
     let log = tracing_subscriber::fmt::layer()
-        .with_writer(stderr)
+        .with_writer(writer)
         .with_ansi(stderr().is_terminal())
-        // It would tell stderr that stderr cannot be written, and panic over that: a full disk is no reason to stop.
+        // They would be told on stderr by the thread that met them, which is to wait for nobody.
         .log_internal_errors(false);
     let log = match config.log_format {
         LogFormat::Text => log.boxed(),
@@ -51,7 +65,7 @@ pub(crate) fn init(config: &Config, runtime: &Runtime) -> anyhow::Result<Traces>
         layer.with_filter(filter_fn(|metadata| metadata.is_span() && metadata.name() == REQUEST))
     });
     tracing_subscriber::registry().with(log.with_filter(EnvFilter::new(&config.log))).with(traces).init();
-    Ok(Traces(provider))
+    Ok((Log { _writer: guard, dropped }, Traces(provider)))
 }
 
 fn collector(url: &str, runtime: &Runtime) -> anyhow::Result<SdkTracerProvider> {

@@ -10,5 +10,5 @@ mod volumes;
 
 pub use binaries::{grasp, grasp_sim, graspd};
 pub use models::{RESOLUTION, TestModel, WIDTH};
-pub use server::{Server, peak_bytes, resident_bytes};
+pub use server::{Server, metric, peak_bytes, resident_bytes};
 pub use volumes::{blobs, expected};

@@ -1,5 +1,5 @@
 use std::io::{Read, Write};
-use std::net::TcpStream;
+use std::net::{SocketAddr, TcpStream};
 use std::ops::{Deref, DerefMut};
 
 use grasp_client::{Client, LocalServer};
@@ -81,25 +81,16 @@ impl Server {
     /// When there is no answer.
     #[must_use]
     pub fn get(&self, path: &str) -> (u16, String) {
-        let mut stream = TcpStream::connect(self.http()).expect("graspd listens");
-        write!(stream, "GET {path} HTTP/1.1\r\nHost: graspd\r\nConnection: close\r\n\r\n").expect("it reads");
-        let mut response = String::new();
-        stream.read_to_string(&mut response).expect("it answers");
-        let (head, body) = response.split_once("\r\n\r\n").expect("a head and a body");
-        let status = head.split(' ').nth(1).and_then(|status| status.parse().ok());
-        (status.expect("a status line"), body.to_owned())
+        get(self.http(), path)
     }
 
-    /// The value of one metric, 0 as long as it has none; `series` as Prometheus writes it, labels in their order.
+    /// The value of one metric, as [`metric`] has it.
     ///
     /// # Panics
     /// When the metrics cannot be read.
     #[must_use]
     pub fn metric(&self, series: &str) -> f64 {
-        let (status, text) = self.get("/metrics");
-        assert_eq!(status, 200);
-        let value = text.lines().find_map(|line| line.strip_prefix(series)?.strip_prefix(' '));
-        value.map_or(0.0, |value| value.parse().expect("a metric is a number"))
+        metric(self.http(), series)
     }
 
     /// Waits until a metric has a value.
@@ -121,6 +112,28 @@ impl Server {
     pub fn models(&self) -> &std::path::Path {
         self.models.path()
     }
+}
+
+/// The value of one metric of a graspd, 0 as long as it has none; `series` as Prometheus writes it, labels in their order.
+///
+/// # Panics
+/// When the metrics cannot be read.
+#[must_use]
+pub fn metric(http: SocketAddr, series: &str) -> f64 {
+    let (status, text) = get(http, "/metrics");
+    assert_eq!(status, 200);
+    let value = text.lines().find_map(|line| line.strip_prefix(series)?.strip_prefix(' '));
+    value.map_or(0.0, |value| value.parse().expect("a metric is a number"))
+}
+
+fn get(http: SocketAddr, path: &str) -> (u16, String) {
+    let mut stream = TcpStream::connect(http).expect("graspd listens");
+    write!(stream, "GET {path} HTTP/1.1\r\nHost: graspd\r\nConnection: close\r\n\r\n").expect("it reads");
+    let mut response = String::new();
+    stream.read_to_string(&mut response).expect("it answers");
+    let (head, body) = response.split_once("\r\n\r\n").expect("a head and a body");
+    let status = head.split(' ').nth(1).and_then(|status| status.parse().ok());
+    (status.expect("a status line"), body.to_owned())
 }
 
 /// The memory that a process has in use.

@@ -7,10 +7,11 @@ use std::time::Duration;
 use grasp::Volume;
 use grasp_client::{Client, DataType, Error, LocalServer, Options};
 use grasp_proto::{encode, pb};
-use grasp_tests::{RESOLUTION, Server, TestModel, blobs, graspd, resident_bytes};
+use grasp_tests::{RESOLUTION, Server, TestModel, blobs, graspd, metric, resident_bytes};
 use h2::client::SendRequest;
 use nalgebra::Isometry3;
 use prost::Message;
+use tempfile::TempDir;
 use tokio::io::AsyncWriteExt;
 use tokio::net::TcpStream;
 use tokio::sync::mpsc;
@@ -63,22 +64,45 @@ async fn when_a_batch_fails_only_its_requests_do_and_they_say_which_they_were() 
     assert_eq!(server.metric("graspd_requests_total{code=\"OK\",model=\"fragile 1\"}"), 2.0);
 }
 
-#[tokio::test]
-async fn a_log_that_cannot_be_written_stops_nothing() {
+/// A graspd that logs all there is to log, to wherever the shell puts it.
+fn log_to(redirection: &str) -> (LocalServer, TempDir) {
     let folder = tempfile::tempdir().unwrap();
     TestModel::new("mirror").write(folder.path());
     let models = folder.path().to_str().unwrap();
-    // A disk that is always full. Another process makes the script executable: had this one written it, a child that
-    // another test forks meanwhile would hold it open for writing, and it could not be run.
-    let (draft, script) = (folder.path().join("draft"), folder.path().join("graspd-with-full-disk"));
-    fs::write(&draft, format!("#!/bin/sh\nexec {} \"$@\" 2> /dev/full\n", graspd().display())).unwrap();
+    // Another process makes the script executable: had this one written it, a child that another test forks meanwhile
+    // would hold it open for writing, and it could not be run.
+    let (draft, script) = (folder.path().join("draft"), folder.path().join("graspd-with-a-log"));
+    fs::write(&draft, format!("#!/bin/sh\nexec {} \"$@\" {redirection}\n", graspd().display())).unwrap();
     assert!(Command::new("install").arg("-m755").args([&draft, &script]).status().unwrap().success());
-    let mut server =
-        LocalServer::spawn(&script, ["--models", models, "--provider", "cpu", "--threads", "1", "--log", "trace"])
-            .unwrap();
+    let args = ["--models", models, "--provider", "cpu", "--threads", "1", "--log", "trace"];
+    (LocalServer::spawn(&script, args).unwrap(), folder)
+}
+
+#[tokio::test]
+async fn a_log_that_cannot_be_written_stops_nothing() {
+    // A disk that is always full.
+    let (mut server, _folder) = log_to("2> /dev/full");
     let client = Client::connect(server.grpc().to_string()).await.unwrap();
     for _ in 0..100 {
         assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 1);
+    }
+    server.terminate().unwrap();
+    assert_eq!(server.wait().unwrap().code(), Some(0));
+}
+
+#[tokio::test]
+async fn a_log_that_nobody_reads_holds_up_nobody_and_what_it_loses_is_counted() {
+    let pipes = tempfile::tempdir().unwrap();
+    let pipe = pipes.path().join("pipe");
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    // Opened for reading, too, lest the shell wait for a reader.
+    let (mut server, _folder) = log_to(&format!("2<> {}", pipe.display()));
+    let client = Client::connect(server.grpc().to_string()).await.unwrap();
+    let mut calls = 0;
+    while metric(server.http(), "graspd_log_lines_dropped_total") == 0.0 {
+        assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 1);
+        calls += 1;
+        assert!(calls < 10_000, "the pipe never filled");
     }
     server.terminate().unwrap();
     assert_eq!(server.wait().unwrap().code(), Some(0));
