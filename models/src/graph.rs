@@ -118,7 +118,7 @@ impl Builder {
             name: Some(name),
             op_type: Some(op.to_owned()),
             attribute,
-            domain: None,
+            ..NodeProto::default()
         });
         output
     }
@@ -179,7 +179,7 @@ impl Builder {
             producer_version: Some(env!("CARGO_PKG_VERSION").to_owned()),
             graph: Some(self.graph),
             opset_import: vec![OperatorSetIdProto { domain: Some(String::new()), version: Some(OPSET) }],
-            metadata_props: vec![],
+            ..ModelProto::default()
         }
     }
 }

@@ -1,7 +1,8 @@
 //! The part of the ONNX file format that grasp networks use, as Protocol Buffers messages.
 //!
 //! Field numbers are those of `onnx.proto` (proto2, hence the optional scalars); what is not declared here is skipped
-//! when a file is read.
+//! when a file is read. Remarks that mean nothing to the network are declared all the same: exporters write many, and a
+//! file of which nothing is skipped may be written anew.
 
 mod file;
 mod tensor;
@@ -23,6 +24,15 @@ pub struct ModelProto {
     /// That program's version.
     #[prost(string, optional, tag = "3")]
     pub producer_version: Option<String>,
+    /// Whose network it is.
+    #[prost(string, optional, tag = "4")]
+    pub domain: Option<String>,
+    /// The network's version, which nobody keeps.
+    #[prost(int64, optional, tag = "5")]
+    pub model_version: Option<i64>,
+    /// A remark.
+    #[prost(string, optional, tag = "6")]
+    pub doc_string: Option<String>,
     /// The network.
     #[prost(message, optional, tag = "7")]
     pub graph: Option<GraphProto>,
@@ -68,12 +78,21 @@ pub struct GraphProto {
     /// Weights and constants.
     #[prost(message, repeated, tag = "5")]
     pub initializer: Vec<TensorProto>,
+    /// A remark.
+    #[prost(string, optional, tag = "10")]
+    pub doc_string: Option<String>,
     /// What must be given.
     #[prost(message, repeated, tag = "11")]
     pub input: Vec<ValueInfoProto>,
     /// What is computed.
     #[prost(message, repeated, tag = "12")]
     pub output: Vec<ValueInfoProto>,
+    /// What is known of the values in between, which need not be said.
+    #[prost(message, repeated, tag = "13")]
+    pub value_info: Vec<ValueInfoProto>,
+    /// Remarks by name.
+    #[prost(message, repeated, tag = "16")]
+    pub metadata_props: Vec<StringStringEntryProto>,
 }
 
 /// One operation.
@@ -94,9 +113,15 @@ pub struct NodeProto {
     /// Its settings.
     #[prost(message, repeated, tag = "5")]
     pub attribute: Vec<AttributeProto>,
+    /// A remark.
+    #[prost(string, optional, tag = "6")]
+    pub doc_string: Option<String>,
     /// The operator set; empty for the standard one.
     #[prost(string, optional, tag = "7")]
     pub domain: Option<String>,
+    /// Remarks by name.
+    #[prost(message, repeated, tag = "9")]
+    pub metadata_props: Vec<StringStringEntryProto>,
 }
 
 /// One setting of a node.
@@ -123,6 +148,9 @@ pub struct AttributeProto {
     /// Whole numbers.
     #[prost(int64, repeated, packed = "false", tag = "8")]
     pub ints: Vec<i64>,
+    /// A remark.
+    #[prost(string, optional, tag = "13")]
+    pub doc_string: Option<String>,
     /// Which of the above holds the value.
     #[prost(enumeration = "AttributeType", optional, tag = "20")]
     pub r#type: Option<i32>,
@@ -172,12 +200,18 @@ pub struct TensorProto {
     /// The values' bytes, little-endian.
     #[prost(bytes = "vec", optional, tag = "9")]
     pub raw_data: Option<Vec<u8>>,
+    /// A remark.
+    #[prost(string, optional, tag = "12")]
+    pub doc_string: Option<String>,
     /// Where in another file the values lie, as `location`, `offset` and `length`.
     #[prost(message, repeated, tag = "13")]
     pub external_data: Vec<StringStringEntryProto>,
     /// 1 when the values lie in another file, which is not supported.
     #[prost(int32, optional, tag = "14")]
     pub data_location: Option<i32>,
+    /// Remarks by name.
+    #[prost(message, repeated, tag = "16")]
+    pub metadata_props: Vec<StringStringEntryProto>,
 }
 
 /// The element types that are used here.
@@ -209,6 +243,12 @@ pub struct ValueInfoProto {
     /// Type.
     #[prost(message, optional, tag = "2")]
     pub r#type: Option<TypeProto>,
+    /// A remark.
+    #[prost(string, optional, tag = "3")]
+    pub doc_string: Option<String>,
+    /// Remarks by name.
+    #[prost(message, repeated, tag = "4")]
+    pub metadata_props: Vec<StringStringEntryProto>,
 }
 
 /// The type of a value: here always a tensor.
@@ -217,6 +257,9 @@ pub struct TypeProto {
     /// Element type and shape.
     #[prost(message, optional, tag = "1")]
     pub tensor_type: Option<TensorTypeProto>,
+    /// A remark on what it is.
+    #[prost(string, optional, tag = "6")]
+    pub denotation: Option<String>,
 }
 
 /// Element type and shape of a tensor.
@@ -244,6 +287,9 @@ pub struct Dimension {
     /// Its size, if anything is known of it.
     #[prost(oneof = "DimensionValue", tags = "1, 2")]
     pub value: Option<DimensionValue>,
+    /// A remark on what it is.
+    #[prost(string, optional, tag = "3")]
+    pub denotation: Option<String>,
 }
 
 /// The size of a dimension.
@@ -305,13 +351,13 @@ impl Dimension {
     /// A fixed size.
     #[must_use]
     pub fn size(size: i64) -> Self {
-        Self { value: Some(DimensionValue::Size(size)) }
+        Self { value: Some(DimensionValue::Size(size)), ..Self::default() }
     }
 
     /// A free size, known by a name.
     #[must_use]
     pub fn named(name: &str) -> Self {
-        Self { value: Some(DimensionValue::Name(name.to_owned())) }
+        Self { value: Some(DimensionValue::Name(name.to_owned())), ..Self::default() }
     }
 }
 
@@ -321,7 +367,11 @@ impl ValueInfoProto {
     pub fn tensor(name: &str, dim: Vec<Dimension>) -> Self {
         let shape = Some(TensorShapeProto { dim });
         let tensor_type = Some(TensorTypeProto { elem_type: Some(DataType::Float.into()), shape });
-        Self { name: Some(name.to_owned()), r#type: Some(TypeProto { tensor_type }) }
+        Self {
+            name: Some(name.to_owned()),
+            r#type: Some(TypeProto { tensor_type, ..TypeProto::default() }),
+            ..Self::default()
+        }
     }
 
     /// What a free dimension is called, if it is free and has a name.

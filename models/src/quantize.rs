@@ -61,7 +61,8 @@ pub fn quantized_activations(model: &ModelProto) -> Vec<String> {
 pub fn with_int8(model: &ModelProto, ranges: &HashMap<String, Range>) -> Result<ModelProto, QuantizeError> {
     let Some(graph) = &model.graph else { return Ok(model.clone()) };
     let products = products(graph);
-    let mut quantized = GraphProto { node: Vec::new(), initializer: Vec::new(), ..graph.clone() };
+    let mut quantized =
+        GraphProto { node: Vec::new(), initializer: Vec::new(), value_info: Vec::new(), ..graph.clone() };
     let mut activations = HashMap::new();
     for name in products.iter().flat_map(|product| [product.input(), product.output(graph)]) {
         let range = ranges.get(name).ok_or_else(|| QuantizeError::Range(name.to_owned()))?;

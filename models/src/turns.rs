@@ -59,7 +59,7 @@ pub fn averaged_over_turns(model: &ModelProto) -> Result<ModelProto, TurnsError>
             nodes.average(&answers, answer);
         }
     }
-    let graph = GraphProto { node: nodes.list, ..graph.clone() };
+    let graph = GraphProto { node: nodes.list, value_info: Vec::new(), ..graph.clone() };
     Ok(ModelProto { graph: Some(graph), ..model.clone() })
 }
 
@@ -85,7 +85,7 @@ impl Nodes {
             name: Some(format!("turns.{}", self.list.len())),
             op_type: Some(op.to_owned()),
             attribute,
-            domain: None,
+            ..NodeProto::default()
         });
     }
 

@@ -43,7 +43,7 @@ pub(crate) fn with_upsampling_folded(model: &ModelProto) -> Option<ModelProto> {
     let mut initializer = graph.initializer.clone();
     initializer.extend(weights);
     initializer.retain(|tensor| nodes.iter().any(|node| node.input.iter().any(|input| input == tensor.name())));
-    let graph = GraphProto { node: nodes, initializer, ..graph.clone() };
+    let graph = GraphProto { node: nodes, initializer, value_info: Vec::new(), ..graph.clone() };
     Some(ModelProto { graph: Some(graph), ..model.clone() })
 }
 
@@ -119,6 +119,10 @@ impl<'a> Facts<'a> {
         self.constants.get(name)?.to_f32().ok()
     }
 
+    fn whole_numbers(&self, name: &str) -> Option<Vec<i64>> {
+        self.constants.get(name)?.to_i64().ok()
+    }
+
     fn edge_after(&self, node: &NodeProto) -> Option<usize> {
         let edge = *self.edges.get(node.input.first()?.as_str())?;
         match node.op_type() {
@@ -126,7 +130,7 @@ impl<'a> Facts<'a> {
             // Only one that turns an array round leaves its size.
             "Slice" => {
                 let all = |input: usize, value: i64| {
-                    let values = self.constants.get(node.input.get(input)?.as_str())?.to_i64().ok()?;
+                    let values = self.whole_numbers(node.input.get(input)?)?;
                     values.iter().all(|&one| one == value).then_some(())
                 };
                 (all(1, -1), all(2, i64::MIN), all(4, -1)).eq(&(Some(()), Some(()), Some(()))).then_some(edge)
@@ -147,7 +151,43 @@ impl<'a> Facts<'a> {
         says("mode", "nearest")
             && says("coordinate_transformation_mode", "asymmetric")
             && says("nearest_mode", "floor")
-            && scales.is_some_and(|scales| scales == [1.0, 1.0, 2.0, 2.0, 2.0])
+            && node.attribute("axes").is_none()
+            && (scales.is_some_and(|scales| scales == [1.0, 1.0, 2.0, 2.0, 2.0]) || self.sizes_double(node))
+    }
+
+    /// Whether the sizes that a node is given are those of its input, and twice as large along each axis: what
+    /// `torch.onnx.export` makes of `interpolate(x, 40)`, where x has an edge of 20.
+    fn sizes_double(&self, node: &NodeProto) -> bool {
+        let [of, _, _, sizes] = node.input.as_slice() else { return false };
+        let (Some(sizes), Some(&edge)) = (self.makers.get(sizes.as_str()), self.edges.get(of.as_str())) else {
+            return false;
+        };
+        let [kept, doubled] = sizes.input.as_slice() else { return false };
+        sizes.op_type() == "Concat"
+            && self.whole_numbers(doubled).is_some_and(|sizes| sizes == [2 * edge as i64; 3])
+            && self.is_batch_and_channels(kept, of)
+    }
+
+    /// Whether a value is the first two dimensions of another, in the words of either of torch's exporters.
+    fn is_batch_and_channels(&self, value: &str, of: &str) -> bool {
+        let shape = |name: &str| {
+            let node = self.makers.get(name)?;
+            (node.op_type() == "Shape" && node.input == [of]).then(|| {
+                let says = |name: &str| node.attribute(name).map(AttributeProto::i);
+                (says("start").unwrap_or(0), says("end"))
+            })
+        };
+        let Some(node) = self.makers.get(value) else { return false };
+        match (node.op_type(), node.input.as_slice()) {
+            ("Shape", _) => shape(value) == Some((0, Some(2))),
+            ("Slice", [all, start, end, axes]) => {
+                shape(all) == Some((0, None))
+                    && [(start, 0), (end, 2), (axes, 0)]
+                        .into_iter()
+                        .all(|(name, value)| self.whole_numbers(name).is_some_and(|values| values == [value]))
+            }
+            _ => false,
+        }
     }
 
     /// What takes the place of a node, if something better does.
@@ -360,5 +400,79 @@ mod tests {
         let turns = averaged_over_turns(&vgn).unwrap();
         assert_eq!(count(&with_upsampling_folded(&turns).unwrap(), "Resize"), 1);
         assert!(with_upsampling_folded(&Architecture::TransformerSmall.build(40, 0).unwrap()).is_none());
+    }
+
+    /// The graph with its Resizes in the words of torch's exporters: `interpolate(x, 2 · edge)`.
+    fn in_torchs_words(model: &ModelProto, edges: &[i64], words: fn(&str, &str) -> Vec<NodeProto>) -> ModelProto {
+        let mut model = model.clone();
+        let graph = model.graph.as_mut().unwrap();
+        let mut edges = edges.iter();
+        for mut resize in std::mem::take(&mut graph.node) {
+            if resize.op_type() == "Resize" {
+                let (x, name) = (resize.input[0].clone(), resize.output[0].clone());
+                graph.node.extend(words(&x, &name));
+                let size = TensorProto::from_i64(&format!("{name}.size"), &[3], &[*edges.next().unwrap(); 3]);
+                graph.initializer.push(size);
+                let sizes = vec![format!("{name}.kept"), format!("{name}.size")];
+                let axis = AttributeProto::int("axis", 0);
+                graph.node.push(node("Concat", sizes, &format!("{name}.sizes"), vec![axis]));
+                resize.input = vec![x, String::new(), String::new(), format!("{name}.sizes")];
+            }
+            graph.node.push(resize);
+        }
+        model
+    }
+
+    fn shape(x: &str, output: &str, end: Option<i64>) -> NodeProto {
+        let between = |end| vec![AttributeProto::int("start", 0), AttributeProto::int("end", end)];
+        node("Shape", vec![x.to_owned()], output, end.map_or_else(Vec::new, between))
+    }
+
+    fn of_today(x: &str, name: &str) -> Vec<NodeProto> {
+        vec![shape(x, &format!("{name}.kept"), Some(2))]
+    }
+
+    fn of_yesterday(x: &str, name: &str) -> Vec<NodeProto> {
+        let [all, from, to, axes] = ["all", "from", "to", "axes"].map(|what| format!("{name}.{what}"));
+        let number = |name: &String, value| {
+            node(
+                "Constant",
+                vec![],
+                name,
+                vec![AttributeProto::tensor("value", TensorProto::from_i64("", &[1], &[value]))],
+            )
+        };
+        let numbers = [number(&from, 0), number(&to, 2), number(&axes, 0)];
+        let slice = node("Slice", vec![all.clone(), from, to, axes], &format!("{name}.kept"), vec![]);
+        [shape(x, &all, None)].into_iter().chain(numbers).chain([slice]).collect()
+    }
+
+    #[test]
+    fn what_torch_exports_is_folded_into_the_same() {
+        let vgn = Architecture::Vgn.build(40, 0).unwrap();
+        let folded = with_upsampling_folded(&vgn).unwrap().graph.unwrap();
+        let gained = |folded: &GraphProto| -> Vec<TensorProto> {
+            folded.initializer.iter().filter(|tensor| tensor.is_float()).cloned().collect()
+        };
+        for words in [of_today, of_yesterday] {
+            let torchs = with_upsampling_folded(&in_torchs_words(&vgn, &[10, 20, 40], words)).unwrap().graph.unwrap();
+            assert!(gained(&torchs) == gained(&folded), "the same weights");
+            let count = |op: &str| torchs.node.iter().filter(|node| node.op_type() == op).count();
+            assert_eq!(
+                (count("Resize"), count("Concat"), count("Shape")),
+                (1, 1, 1),
+                "over 3³ there is nothing to gain"
+            );
+
+            let trebled = in_torchs_words(&vgn, &[10, 20, 60], words);
+            let left = with_upsampling_folded(&trebled).unwrap().graph.unwrap();
+            assert_eq!(left.node.iter().filter(|node| node.op_type() == "Resize").count(), 2, "no mere doubling");
+        }
+        // Sizes of another value, or of other dimensions, say nothing.
+        let another: fn(&str, &str) -> Vec<NodeProto> = |_, name| vec![shape("tsdf", &format!("{name}.kept"), Some(2))];
+        let others: fn(&str, &str) -> Vec<NodeProto> = |x, name| vec![shape(x, &format!("{name}.kept"), Some(3))];
+        for words in [another, others] {
+            assert!(with_upsampling_folded(&in_torchs_words(&vgn, &[10, 20, 40], words)).is_none());
+        }
     }
 }
