@@ -215,6 +215,6 @@ fn node(graph: &mut GraphProto, op: &str, inputs: &[&str], output: &str, attribu
         name: Some(output.to_owned()),
         op_type: Some(op.to_owned()),
         attribute,
-        domain: None,
+        ..NodeProto::default()
     });
 }

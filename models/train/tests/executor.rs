@@ -33,7 +33,7 @@ fn node(op: &str, inputs: &[&str], output: &str, attribute: Vec<AttributeProto>)
         name: Some(output.to_owned()),
         op_type: Some(op.to_owned()),
         attribute,
-        domain: None,
+        ..NodeProto::default()
     }
 }
 
