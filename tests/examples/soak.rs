@@ -3,7 +3,7 @@
 //! `make soak`, or `cargo run --release -p grasp-tests --example soak [MINUTES]` with `ORT_DYLIB_PATH` set. First a minute in
 //! which four times as many ask as can be answered, then, for 20 minutes unless told otherwise, callers who come by chance
 //! at 80 % of what it can do. The callers have a processor of their own, where there are two: what they take is no work of
-//! the server's. The last line is one JSON object.
+//! the server's. What other machines on the host took meanwhile is said of each minute. The last line is one JSON object.
 
 use std::fs;
 use std::io;
@@ -15,7 +15,7 @@ use grasp_client::{Arrivals, DataType, LocalServer, Report, Until, load};
 use grasp_proto::encode;
 use grasp_proto::pb::DetectGraspsRequest;
 use grasp_proto::pb::grasp_service_client::GraspServiceClient;
-use grasp_tests::{blobs, graspd};
+use grasp_tests::{Stolen, blobs, graspd};
 use nalgebra::Isometry3;
 use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 use serde_json::json;
@@ -72,21 +72,24 @@ async fn main() -> anyhow::Result<()> {
     );
 
     println!(
-        "\n{:.1} a second for {minutes} minutes\nminute   answered  refused  p50 ms  p99 ms      MB  files",
+        "\n{:.1} a second for {minutes} minutes\nminute   answered  refused  p50 ms  p99 ms      MB  files  stolen %",
         SOAK * capacity
     );
     let (mut course, mut refusals) = (Vec::new(), 0);
+    let started = Stolen::so_far();
     for minute in 1..=minutes {
+        let stolen = Stolen::so_far();
         let report = caller.load(Arrivals::Rate(SOAK * capacity), MINUTE).await;
         refusals += report.refusals();
         let [p50, p99] = [0.5, 0.99].map(|share| Report::quantile(&report.answered, share).as_secs_f64() * 1e3);
         let used = Use::of(&server)?;
         println!(
-            "{minute:6} {:10} {:8} {p50:7.2} {p99:7.2} {:7.1} {:6}",
+            "{minute:6} {:10} {:8} {p50:7.2} {p99:7.2} {:7.1} {:6} {:9.1}",
             report.answered.len(),
             report.refusals(),
             used.megabytes,
-            used.files
+            used.files,
+            stolen.percent_until(Stolen::so_far())
         );
         course.push((p99, used));
     }
@@ -101,6 +104,7 @@ async fn main() -> anyhow::Result<()> {
         "memory_growth": last.megabytes / first.megabytes - 1.0,
         "files_first": first.files,
         "files_last": last.files,
+        "stolen_percent": started.percent_until(Stolen::so_far()),
     });
     println!("{figures}");
     Ok(())

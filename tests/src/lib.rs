@@ -6,9 +6,11 @@ mod binaries;
 mod models;
 pub mod scene;
 mod server;
+mod stolen;
 mod volumes;
 
 pub use binaries::{grasp, grasp_sim, graspd};
 pub use models::{RESOLUTION, TestModel, WIDTH};
 pub use server::{Server, metric, peak_bytes, resident_bytes};
+pub use stolen::Stolen;
 pub use volumes::{blobs, expected};

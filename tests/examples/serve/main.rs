@@ -20,7 +20,7 @@ use anyhow::{Context, ensure};
 use grasp::{Volume, decode};
 use grasp_client::{Arrivals, Client, DataType, LocalServer, Options, Report, Until, load};
 use grasp_models::{Architecture, Network, Options as Running};
-use grasp_tests::{TestModel, blobs, graspd, peak_bytes};
+use grasp_tests::{Stolen, TestModel, blobs, graspd, peak_bytes};
 use nalgebra::Isometry3;
 use tempfile::TempDir;
 use tonic::Code;
@@ -53,6 +53,7 @@ async fn main() -> anyhow::Result<()> {
     let seconds = std::env::args().nth(1).map_or(Ok(5.0), |seconds| seconds.parse())?;
     let bench = Bench::new(Duration::from_secs_f64(seconds))?;
     let mut findings = Findings::new(conditions::describe(bench.threads)?);
+    let started = Stolen::so_far();
     bench.hop(&mut findings).await?;
     for network in ["vgn", "transformer"] {
         bench.latency(network, &mut findings).await?;
@@ -60,6 +61,9 @@ async fn main() -> anyhow::Result<()> {
     bench.throughput(&mut findings).await?;
     bench.life(&mut findings)?;
     findings.compare(&AIMS);
+    let stolen = started.percent_until(Stolen::so_far());
+    println!("\nOther machines on the host took {stolen:.1} % of the processors' time.");
+    findings.figure("stolen_percent", stolen);
     if let Some(file) = std::env::args_os().nth(2) {
         std::fs::write(&file, format!("{:#}\n", findings.json()))
             .with_context(|| format!("cannot write {}", file.display()))?;
