@@ -87,7 +87,7 @@ pub struct GraphProto {
     /// What is computed.
     #[prost(message, repeated, tag = "12")]
     pub output: Vec<ValueInfoProto>,
-    /// What is known of the values in between, which need not be said.
+    /// What is known of the values in between, which need not be said: it is left out where nodes are replaced.
     #[prost(message, repeated, tag = "13")]
     pub value_info: Vec<ValueInfoProto>,
     /// Remarks by name.

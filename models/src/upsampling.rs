@@ -163,7 +163,10 @@ impl<'a> Facts<'a> {
             return false;
         };
         let [kept, doubled] = sizes.input.as_slice() else { return false };
-        sizes.op_type() == "Concat"
+        // Any other policy would keep the proportions of all dimensions, the batch's among them.
+        let stretches = |policy: &AttributeProto| policy.s() == b"stretch";
+        node.attribute("keep_aspect_ratio_policy").is_none_or(stretches)
+            && sizes.op_type() == "Concat"
             && self.whole_numbers(doubled).is_some_and(|sizes| sizes == [2 * edge as i64; 3])
             && self.is_batch_and_channels(kept, of)
     }
@@ -468,6 +471,11 @@ mod tests {
             let left = with_upsampling_folded(&trebled).unwrap().graph.unwrap();
             assert_eq!(left.node.iter().filter(|node| node.op_type() == "Resize").count(), 2, "no mere doubling");
         }
+        let mut kept = in_torchs_words(&vgn, &[10, 20, 40], of_today);
+        for node in kept.graph.as_mut().unwrap().node.iter_mut().filter(|node| node.op_type() == "Resize") {
+            node.attribute.push(AttributeProto::string("keep_aspect_ratio_policy", "not_larger"));
+        }
+        assert!(with_upsampling_folded(&kept).is_none());
         // Sizes of another value, or of other dimensions, say nothing.
         let another: fn(&str, &str) -> Vec<NodeProto> = |_, name| vec![shape("tsdf", &format!("{name}.kept"), Some(2))];
         let others: fn(&str, &str) -> Vec<NodeProto> = |x, name| vec![shape(x, &format!("{name}.kept"), Some(3))];

@@ -18,7 +18,9 @@ impl Stolen {
     /// The share, in percent, of what went by between two readings.
     #[must_use]
     pub fn percent_until(self, later: Self) -> f64 {
-        100.0 * (later.stolen - self.stolen) as f64 / (later.ticks - self.ticks).max(1) as f64
+        // Some of these counters may go back a little (proc(5)).
+        let [stolen, ticks] = [later.stolen.saturating_sub(self.stolen), later.ticks.saturating_sub(self.ticks)];
+        100.0 * stolen as f64 / ticks.max(1) as f64
     }
 
     fn read(stat: &str) -> Self {
