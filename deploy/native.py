@@ -129,7 +129,7 @@ def python() -> Path:
     if sys.version_info < (3, 11):
         version = "{}.{}".format(*sys.version_info)
         raise Unavailable(f"The Python client's tests need Python 3.11 or newer; {sys.executable} is {version}.")
-    return interpreter("python", sys.executable, "The Python packages of the tests", 131, "GRASPD_PYTHON")
+    return interpreter("python", sys.executable, "The Python packages of the tests", 234, "GRASPD_PYTHON")
 
 
 def peers() -> Path:

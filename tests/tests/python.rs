@@ -108,6 +108,17 @@ fn a_client_in_cpp_is_built_and_gets_grasps_seen_from_python() {
 }
 
 #[test]
+fn the_second_simulator_does_what_it_says_seen_from_python() {
+    let models = models();
+    let environment = [
+        ("GRASPD", graspd().as_os_str()),
+        ("GRASP_SIM", grasp_sim().as_os_str()),
+        ("GRASPD_MODELS", models.path().as_os_str()),
+    ];
+    run("test_pybullet.py", &environment, "test_a_cube_is_lifted");
+}
+
+#[test]
 fn python_reads_and_writes_our_data() {
     run("test_data.py", &[("GRASP_SIM", grasp_sim().as_os_str())], "test_processed_data_load_with_pandas");
 }

@@ -1,0 +1,105 @@
+"""Where grasps come from: each planner looks at the same depth images and proposes grasps, best first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from camera import Array, is_within_reach, points
+from graspd import Client, DepthView, Options, Pose
+from hand import MAX_OPENING
+
+FINGER_DEPTH = 0.05
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """A proposal."""
+
+    pose: Pose
+    width: float
+    quality: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a planner makes of an observation."""
+
+    grasps: list[Grasp]
+    """Best first."""
+    fusion: float = 0.0
+    """Seconds of the planning that went into fusing the images."""
+
+
+class Planner(Protocol):
+    """Proposes grasps in the task frame."""
+
+    def plan(self, views: Sequence[DepthView]) -> Plan:
+        """For what was seen."""
+
+
+class Served:
+    """A running graspd, which is sent the depth images."""
+
+    def __init__(self, address: str, options: Options | None = None) -> None:
+        self.options = options
+        self.client = Client(address)
+
+    def plan(self, views: Sequence[DepthView]) -> Plan:
+        """Asks for grasps. `graspd.Error` if the server refuses or is not there."""
+        found = self.client.detect_from_depth(views, options=self.options)
+        grasps = [Grasp(grasp.pose, grasp.width, grasp.quality) for grasp in found.grasps]
+        return Plan(grasps, found.latency.fusion)
+
+
+class Random:
+    """A random point of the observed surface, approached against its normal, at a random depth and yaw."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+
+    def plan(self, views: Sequence[DepthView]) -> Plan:
+        """One grasp, or none where no surface can be reached."""
+        positions, normals = graspable(views)
+        if not len(positions):
+            return Plan([])
+        index = self.rng.integers(len(positions))
+        z = -normals[index]
+        depth = self.rng.uniform(-0.1, 1.1) * FINGER_DEPTH
+        yaw = self.rng.uniform(0.0, math.pi)
+        # Along x as far as the approach lets it, then turned about the approach.
+        x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9999 else np.array([0.0, 1.0, 0.0])
+        y = np.cross(z, x) / np.linalg.norm(np.cross(z, x))
+        x = np.cross(y, z)
+        turned = math.cos(yaw) * x + math.sin(yaw) * y
+        matrix = np.eye(4)
+        matrix[:3, :3] = np.column_stack([turned, np.cross(z, turned), z])
+        matrix[:3, 3] = positions[index] - depth * z
+        return Plan([Grasp(Pose.from_matrix(matrix), MAX_OPENING, 0.5)])
+
+
+def graspable(views: Sequence[DepthView]) -> tuple[Array, Array]:
+    """Points of the observed surface within reach that do not face down, and their normals.
+
+    A point a voxel of 2.5 mm, however many pixels show it, as in the fine volume of VGN's code."""
+    clouds = [surface(view) for view in views]
+    positions = np.concatenate([cloud[0] for cloud in clouds])
+    normals = np.concatenate([cloud[1] for cloud in clouds])
+    keep = is_within_reach(positions) & (normals[:, 2] > -0.1)
+    positions, normals = positions[keep], normals[keep]
+    _, first = np.unique(np.floor(positions / 0.0025).astype(int), axis=0, return_index=True)
+    return positions[first], normals[first]
+
+
+def surface(view: DepthView) -> tuple[Array, Array]:
+    """A point and its normal for every pixel whose neighbours, two pixels away, are on the same surface."""
+    seen = points(view)
+    across, down = seen[2:-2, 4:] - seen[2:-2, :-4], seen[4:, 2:-2] - seen[:-4, 2:-2]
+    # Further apart, there is an edge between them.
+    smooth = (np.linalg.norm(across, axis=-1) < 0.02) & (np.linalg.norm(down, axis=-1) < 0.02)
+    # Rows run down and columns right in the image, so that this is towards the camera.
+    normals = np.cross(down, across)[smooth]
+    return seen[2:-2, 2:-2][smooth], normals / np.linalg.norm(normals, axis=-1, keepdims=True)

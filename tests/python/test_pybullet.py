@@ -1,0 +1,293 @@
+"""The second simulator, sim/pybullet, and what its documents tell people to type.
+
+    GRASPD=target/release/graspd GRASP_SIM=target/release/grasp-sim GRASPD_MODELS=models/zoo \\
+    ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
+    $(python3 deploy/native.py python) -m unittest discover --start-directory tests/python --pattern test_pybullet.py
+"""
+
+import atexit
+import importlib.util
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+import unittest
+from pathlib import Path
+
+import numpy as np
+from server import Server
+
+ROOT = Path(__file__).resolve().parents[2]
+SIMULATOR = ROOT / "sim/pybullet"
+PORT = "127.0.0.1:50051"
+HAS_PYBULLET = importlib.util.find_spec("pybullet") is not None
+without_pybullet = unittest.skipUnless(
+    HAS_PYBULLET, "there is no pybullet: it has a wheel for Python 3.11 on Linux and x86-64 alone"
+)
+
+if HAS_PYBULLET:
+    INSTALLED = tempfile.TemporaryDirectory()
+    atexit.register(INSTALLED.cleanup)
+    # As a user would, but with the packages that are here.
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*pip, "--target", INSTALLED.name, ROOT / "client/python"], check=True)
+    sys.path[:0] = [INSTALLED.name, str(SIMULATOR)]
+
+    import camera
+    import replay
+    import score
+    from graspd import Pose
+    from planners import Random
+    from world import World
+
+CUBE = """<robot name="cube"><link name="cube">
+  <contact><lateral_friction value="1"/></contact>
+  <inertial><mass value="0.05"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+  <visual><geometry><box size="0.04 0.04 0.04"/></geometry></visual>
+  <collision><geometry><box size="0.04 0.04 0.04"/></geometry></collision>
+</link></robot>"""
+DOWN = (1.0, 0.0, 0.0, 0.0)
+
+
+@without_pybullet
+class CubeTest(unittest.TestCase):
+    """A cube of 4 cm in the middle of the table."""
+
+    def setUp(self):
+        self.urdf = Path(self.enterContext(tempfile.TemporaryDirectory())) / "cube.urdf"
+        self.urdf.write_text(CUBE)
+        self.world = World()
+        self.addCleanup(self.world.close)
+        (self.cube,) = self.world.place([(self.urdf, 1.0, Pose((0.15, 0.15, 0.07)))])
+        self.world.settle()
+
+    def test_a_cube_is_lifted(self):
+        attempt = self.world.execute(Pose((0.15, 0.15, 0.12), DOWN))
+        self.assertEqual((attempt.outcome, attempt.object, attempt.short_by), ("lifted", "cube", 0.0))
+        self.assertTrue(attempt.success and attempt.rose and not attempt.touched)
+        # Bullet's margins are between them.
+        self.assertAlmostEqual(attempt.opening, 0.04, delta=0.003)
+        self.assertAlmostEqual(attempt.rise, 0.1, delta=0.005)
+        self.assertEqual(self.world.objects, {})
+
+    def test_a_hand_that_meets_the_cube_is_blocked_where_that_counts(self):
+        on_the_cube = Pose((0.15, 0.195, 0.12), DOWN)
+        state = self.world.save()
+        forbidden = self.world.execute(on_the_cube, allow_contact=False, remove=False)
+        self.assertEqual((forbidden.outcome, forbidden.success), ("blocked_on_approach", False))
+        # Its top is 2 cm above where the fingertips shall go.
+        self.assertAlmostEqual(forbidden.short_by, 0.02, delta=0.004)
+        self.world.restore(state)
+        allowed = self.world.execute(on_the_cube, remove=False)
+        self.assertEqual((allowed.outcome, allowed.short_by), ("closed_on_nothing", forbidden.short_by))
+
+    def test_other_grasps_fail_as_they_should(self):
+        state = self.world.save()
+        for pose, outcome in [
+            (Pose((0.25, 0.25, 0.12), DOWN), "closed_on_nothing"),
+            (Pose((0.15, 0.15, 0.06), DOWN), "blocked_on_approach"),
+            (Pose((0.15, 0.195, 0.08), DOWN), "blocked_at_pregrasp"),
+        ]:
+            attempt = self.world.execute(pose, allow_contact=False, remove=False)
+            self.assertEqual((attempt.outcome, attempt.rose), (outcome, False))
+            self.world.restore(state)
+
+    def test_a_state_that_is_restored_gives_the_same_again(self):
+        state = self.world.save()
+        attempts = []
+        for _ in range(2):
+            attempts.append(self.world.execute(Pose((0.15, 0.16, 0.13), DOWN), remove=False))
+            self.world.restore(state)
+        self.assertEqual(*attempts)
+        self.assertTrue(attempts[0].rose)
+
+    def test_the_camera_sees_the_cube_where_it_is(self):
+        for views in [camera.side(), camera.side(np.pi / 2), camera.circle(2)]:
+            for view in camera.observe(self.world, views):
+                seen = camera.points(view)[camera.is_within_reach(camera.points(view))]
+                np.testing.assert_allclose(seen.max(axis=0)[2], 0.09, atol=2e-3)
+                self.assertTrue(np.all(np.abs(seen[:, :2] - 0.15) < 0.023))
+        views = camera.observe(self.world, camera.side())
+        (noisy,) = camera.observe(self.world, camera.side(), np.random.default_rng(2))
+        self.assertTrue(0.001 < np.std(noisy.depth - views[0].depth) < 0.1)
+        self.assertTrue(camera.sees_anything(views))
+        self.world.clear()
+        self.assertFalse(camera.sees_anything(camera.observe(self.world, camera.side())))
+
+    def test_chance_grasps_what_is_seen(self):
+        views = camera.observe(self.world, camera.side())
+        planner = Random(np.random.default_rng(1))
+        for _ in range(20):
+            (grasp,) = planner.plan(views).grasps
+            tips = (grasp.pose.matrix() @ [0, 0, 0.05, 1])[:3]
+            self.assertLess(np.linalg.norm(tips - (0.15, 0.15, 0.07)), 0.1)
+        self.world.clear()
+        self.assertEqual(planner.plan(camera.observe(self.world, camera.side())).grasps, [])
+
+    def test_mistakes_are_told(self):
+        with self.assertRaisesRegex(FileNotFoundError, "no file nowhere.urdf"):
+            self.world.add("nowhere.urdf", Pose())
+        wrong = self.urdf.with_name("wrong.urdf")
+        wrong.write_text("cube")
+        with self.assertRaisesRegex(ValueError, "wrong.urdf is not a URDF"):
+            self.world.add(wrong, Pose())
+
+
+@without_pybullet
+class FiguresTest(unittest.TestCase):
+    def test_intervals_hold_the_share(self):
+        self.assertEqual(score.wilson(0, 0), (0.0, 1.0))
+        low, high = score.wilson(50, 100)
+        self.assertAlmostEqual(low, 0.404, delta=1e-3)
+        self.assertAlmostEqual(high, 0.596, delta=1e-3)
+
+    def test_grasps_are_shaken_by_as_much_as_asked(self):
+        rng = np.random.default_rng(1)
+        grasp = Pose((0.1, 0.2, 0.3), DOWN)
+        self.assertEqual(replay.shaken(grasp, (0.0, 0.0), rng), grasp)
+        moved = [replay.shaken(grasp, (0.002, 0.05), rng).matrix() for _ in range(1000)]
+        shifts = [pose[:3, 3] - grasp.position for pose in moved]
+        cosines = [(np.trace(pose[:3, :3] @ grasp.matrix()[:3, :3].T) - 1) / 2 for pose in moved]
+        self.assertAlmostEqual(np.sqrt(np.mean(np.square(shifts)) * 3), 0.002, delta=2e-4)
+        self.assertAlmostEqual(np.sqrt(np.mean(np.square(np.arccos(np.clip(cosines, -1, 1))))), 0.05, delta=5e-3)
+
+
+@without_pybullet
+class CommandTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        """A folder like the root of a checkout, with our objects in it, and the programs of the documents."""
+        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
+        (cls.folder / "sim").symlink_to(ROOT / "sim")
+        (cls.folder / "bin").mkdir()
+        # Documents may set PYTHONPATH themselves; the package is found beside that.
+        for name, variable, program in [
+            ("grasp-sim", "", os.path.abspath(os.environ["GRASP_SIM"])),
+            ("python3", f'PYTHONPATH="$PYTHONPATH:{INSTALLED.name}" ', sys.executable),
+        ]:
+            script = cls.folder / "bin" / name
+            script.write_text(f'#!/bin/sh\n{variable}exec {shlex.quote(program)} "$@"\n')
+            script.chmod(0o755)
+        cls.run_sh("grasp-sim objects --objects test --out objects")
+        cls.urdfs = sorted((cls.folder / "objects").glob("*.urdf"))
+
+    @classmethod
+    def run_sh(cls, code):
+        """What it prints."""
+        path = f"{cls.folder / 'bin'}{os.pathsep}{os.environ['PATH']}"
+        environment = {**os.environ, "PATH": path, "PYTHONPATH": "", "PYTHONDONTWRITEBYTECODE": "1"}
+        command = ["sh", "-euc", code]
+        result = subprocess.run(command, cwd=cls.folder, env=environment, capture_output=True, text=True)
+        if result.returncode:
+            raise AssertionError(f"{code}: {result.stdout}{result.stderr}")
+        return result.stdout
+
+    def last(self, printed):
+        return json.loads(printed.splitlines()[-1])
+
+    def blocks(self, path):
+        """Language and text of each, but for what would fetch packages."""
+        for language, code in re.findall(r"^```(\w*)\n(.*?)^```$", path.read_text(), re.MULTILINE | re.DOTALL):
+            if not code.startswith("pip install"):
+                yield language, code
+
+    def test_scenes_are_the_same_for_the_same_seed(self):
+        world = World()
+        self.addCleanup(world.close)
+
+        def scene(make, seed):
+            make(self.urdfs, 3, np.random.default_rng(seed))
+            return [(name, world.position(body)) for body, name in world.objects.items()]
+
+        for make in [world.packed, world.pile]:
+            first = scene(make, 1)
+            self.assertTrue(first)
+            self.assertNotEqual(scene(make, 2), first)
+            self.assertEqual(scene(make, 1), first)
+
+    def test_a_served_network_clears_tables(self):
+        server = self.enterContext(Server())
+        printed = self.run_sh(
+            f"python3 sim/pybullet/clear.py --objects objects --planner grpc:{server.grpc} --rounds 2 --seed 3 "
+            "--jobs 2 --attempts attempts.jsonl --pictures pictures --out summary.json"
+        )
+        told = self.last(printed)
+        self.assertEqual(told, json.loads((self.folder / "summary.json").read_text()))
+        attempts = [json.loads(line) for line in (self.folder / "attempts.jsonl").read_text().splitlines()]
+        self.assertEqual((told["rounds"], told["attempts"]), (2, len(attempts)))
+        self.assertEqual(told["successes"], sum(attempt["success"] for attempt in attempts))
+        self.assertEqual(told["rose"], sum(attempt["rose"] for attempt in attempts))
+        self.assertTrue(told["rose"] <= told["successes"] <= told["objects"] <= 10)
+        self.assertAlmostEqual(told["gsr"], told["successes"] / max(told["attempts"], 1))
+        self.assertAlmostEqual(told["dr"], told["successes"] / told["objects"])
+        failures = [told[name] for name in ["blocked_at_pregrasp", "closed_on_nothing", "lost_in_lift"]]
+        self.assertEqual(sum(failures) + told["successes"], told["attempts"])
+        endings = [told[name] for name in ["cleared", "nothing_seen", "nothing_proposed", "gave_up"]]
+        self.assertEqual(sum(endings), 2)
+        self.assertEqual(told["seeds"]["gsr"]["each"], [told["gsr"]])
+        self.assertEqual(len(list((self.folder / "pictures").glob("packed-3-*.png"))), len(attempts))
+        self.assertTrue(all(attempt["quality"] >= 0.5 and attempt["round"] < 2 for attempt in attempts))
+
+    def test_figures_have_the_names_of_the_first_simulator(self):
+        flags = "--objects objects --planner random --rounds 1 --attempts"
+        first = self.last(self.run_sh(f"grasp-sim bench {flags} first.jsonl"))
+        second = self.last(self.run_sh(f"python3 sim/pybullet/clear.py {flags} second.jsonl"))
+        self.assertEqual(set(first) - {"provider"}, set(second) - {"rose"})
+        files = [self.folder / "first.jsonl", self.folder / "second.jsonl"]
+        ours, theirs = (set(json.loads(file.read_text().splitlines()[0])) for file in files)
+        self.assertLessEqual(ours, theirs)
+
+    def test_mistakes_are_told(self):
+        for arguments, wanted in [
+            ("--objects bin", "--objects is bin: there is no .urdf file"),
+            ("--objects objects --views top", "must be side, side:DEGREES"),
+            ("--objects objects --planner grpc", "must be random or grpc:HOST:PORT"),
+            ("--objects objects --threshold 2", "must be above 0 and at most 1"),
+            ("--objects objects --hand no.urdf", "there is no file no.urdf"),
+        ]:
+            with self.subTest(arguments), self.assertRaisesRegex(AssertionError, re.escape(wanted)):
+                self.run_sh(f"python3 sim/pybullet/clear.py --rounds 1 {arguments}")
+
+    def test_what_the_readme_says_is_true(self):
+        printed = [self.run_sh(code) for language, code in self.blocks(SIMULATOR / "README.md") if language == "sh"]
+        told = self.last(printed[-1])
+        for label in ["success_kept", "failure_kept"]:
+            self.assertTrue(0 < told[label]["n"] <= 20 and 0 <= told[label]["percent"] <= 100, told)
+            low, high = told[label]["interval"]
+            self.assertTrue(low <= told[label]["percent"] <= high)
+        self.assertEqual(told["scenes"], 2)
+        # Where contacts are allowed, what was executed counts before the label.
+        scenes = [json.loads(line) for line in (self.folder / "labels.jsonl").read_text().splitlines()]
+        for scene in scenes:
+            for trial in scene["trials"]:
+                trial["executed"] = 1
+        (self.folder / "executed.jsonl").write_text("".join(f"{json.dumps(scene)}\n" for scene in scenes[:1]))
+        flags = "--objects bin objects --limit 3 --shake 1,1 --records records.jsonl"
+        executed = self.run_sh(f"python3 sim/pybullet/replay.py executed.jsonl --contact allow {flags}")
+        self.assertEqual([self.last(executed)[label]["n"] for label in ["success_kept", "failure_kept"]], [3, 0])
+        self.assertEqual(len((self.folder / "records.jsonl").read_text().splitlines()), 3)
+
+    def test_what_own_scene_says_is_true(self):
+        server = self.enterContext(Server())
+        blocks = list(self.blocks(ROOT / "docs/own-scene.md"))
+        printed = []
+        for language, code in blocks:
+            code = code.replace(PORT, server.grpc)
+            if language == "python":
+                (self.folder / "scene.py").write_text(code)
+            elif language == "sh":
+                printed.append(self.run_sh(code))
+        _, program, cleared = printed
+        self.assertRegex(program, r"(?m)^0\.\d\d: (lifted \w+|closed_on_nothing|lost_in_lift|blocked_at_pregrasp) ?$")
+        self.assertEqual(self.last(cleared)["rounds"], 2)
+        self.assertTrue(list((self.folder / "pictures").glob("packed-1-*.png")))
+
+    def test_the_types_are_right(self):
+        self.run_sh(f"python3 -m mypy --strict --cache-dir {self.folder / 'cache'} sim/pybullet")
+
+
+if __name__ == "__main__":
+    unittest.main()
