@@ -4,6 +4,12 @@
 //! `label`, `width`, `object` (an index into the objects: whose surface the point was drawn from), and of the yaws that
 //! were tried `yaws`, what came of each, and `yaw`, which of them `pose` has. Yaw k is k · 36° about the grasp's z. A pose
 //! is `[x, y, z, qx, qy, qz, qw]` in the task frame, metres.
+//!
+//! `share` is the share of the tries of `pose` that held, in [0, 1]: 0 of a failure, 1 of a success that was not tried
+//! again. `clearance` is the smallest distance between the open hand on its way to `pose` and the objects, metres, at most
+//! 0.02; 0 where it is not known. `executed`, where it was tried, is 1 if the grasp of `pose`, executed as in evaluation
+//! (the hand closes where its approach met something), lifted an object, else 0; for `label` an approach that met something
+//! is a failure. Older files have none of the three.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, BufRead, BufReader, Seek, SeekFrom, Write};
@@ -52,6 +58,20 @@ pub struct Trial {
     pub yaw: usize,
     /// What came of each yaw.
     pub yaws: [u8; YAWS],
+    /// The share of the tries of `pose` that held; [`read`] takes it from the label where a file does not say.
+    #[serde(default = "not_said")]
+    pub share: f32,
+    /// The smallest distance between the open hand on its way and the objects, metres; 0 where it is not known.
+    #[serde(default)]
+    pub clearance: f32,
+    /// 1 if `pose`, executed as in evaluation, lifted an object; none where that was not tried.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub executed: Option<u8>,
+}
+
+/// JSON has no such number.
+fn not_said() -> f32 {
+    f32::NAN
 }
 
 impl Line {
@@ -73,6 +93,9 @@ impl Line {
                     object: point.object,
                     yaw: point.yaw,
                     yaws: point.lifted.map(u8::from),
+                    share: point.share,
+                    clearance: point.clearance,
+                    executed: None,
                 })
                 .collect(),
         }
@@ -141,7 +164,38 @@ pub fn read(path: &Path) -> anyhow::Result<Vec<Line>> {
     lines
         .map(|(index, line)| {
             let context = || format!("{}, line {}", path.display(), index + 1);
-            serde_json::from_str(&line.with_context(context)?).with_context(context)
+            let mut line: Line = serde_json::from_str(&line.with_context(context)?).with_context(context)?;
+            for trial in line.trials.iter_mut().filter(|trial| trial.share.is_nan()) {
+                trial.share = f32::from(trial.label);
+            }
+            Ok(line)
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_that_do_not_say_how_much_room_there_was_are_read_too() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("scenes.jsonl");
+        let trial = |label: u8, more: &str| {
+            format!(
+                r#"{{"pose":[0,0,0,0,0,0,1],"label":{label},"width":0.04,"object":0,"yaw":0,"yaws":[{label},0,0,0,0,0]{more}}}"#
+            )
+        };
+        let known = trial(1, r#","share":0.75,"clearance":0.0125,"executed":0"#);
+        let trials = [trial(1, ""), trial(0, ""), known.clone()].join(",");
+        std::fs::write(&path, format!(r#"{{"scene":7,"objects":[],"trials":[{trials}]}}"#) + "\n").unwrap();
+        let line = read(&path).unwrap().remove(0);
+        let found: Vec<_> = line.trials.iter().map(|trial| (trial.share, trial.clearance, trial.executed)).collect();
+        assert_eq!(found, [(1.0, 0.0, None), (0.0, 0.0, None), (0.75, 0.0125, Some(0))]);
+
+        // And written again they say the same.
+        let written = |index: usize| serde_json::to_string(&line.trials[index]).unwrap();
+        assert!(written(2).ends_with(r#""share":0.75,"clearance":0.0125,"executed":0}"#), "{}", written(2));
+        assert!(!written(0).contains("executed"), "{}", written(0));
+    }
 }

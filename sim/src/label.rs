@@ -81,6 +81,10 @@ pub struct Point {
     pub yaw: usize,
     /// Which yaws lifted something.
     pub lifted: [bool; YAWS],
+    /// The share of the tries of the grasp that held, see [`Trial::share`].
+    pub share: f32,
+    /// Of the open hand on its way to the grasp, metres, see [`Trial::clearance`].
+    pub clearance: f32,
     /// The object whose surface the point was drawn from: an index into the scene's objects.
     pub object: Option<usize>,
 }
@@ -92,12 +96,15 @@ impl Point {
         self.lifted.contains(&true)
     }
 
-    /// The grasp to learn in voxels of `voxel_size`, or with 1 in metres, and which turns of it hold too.
+    /// The grasp to learn in voxels of `voxel_size`, or with 1 in metres, which turns of it hold too, and with how much
+    /// room to spare.
     #[must_use]
     pub fn trial(&self, voxel_size: f64) -> Trial {
         let turns = (1..TURNS).filter(|turn| self.success() && self.lifted[(self.yaw + turn) % TURNS]);
         Trial {
             turns: turns.fold(0, |bits, turn| bits | 1 << turn),
+            share: self.share,
+            clearance: self.clearance,
             ..Trial::new(&self.grasp, self.success(), voxel_size)
         }
     }
@@ -220,7 +227,9 @@ fn try_point(world: &World, cloud: &[SurfacePoint], rng: &mut impl Rng) -> Point
     let best = middle_of_widest_run(&lifted).and_then(|yaw| widths[yaw].map(|width| (yaw, width)));
     let (yaw, width) = best.unwrap_or((0, MAX_OPENING));
     let quality = if best.is_some() { 1.0 } else { 0.0 };
-    Point { grasp: Grasp { pose: turned(yaw), width, quality }, yaw, lifted, object }
+    // Nothing is tried again yet.
+    let (share, clearance) = (quality as f32, 0.0);
+    Point { grasp: Grasp { pose: turned(yaw), width, quality }, yaw, lifted, share, clearance, object }
 }
 
 /// The middle of the first longest run of successes, as `scipy.signal.find_peaks` places it.

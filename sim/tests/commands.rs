@@ -163,6 +163,7 @@ fn an_export_can_be_replayed() {
             let grasp = trial.grasp(0.3 / 40.0);
             assert_eq!(exported.label == 1, trial.success);
             assert_eq!(exported.yaws.contains(&1), trial.success);
+            assert_eq!((exported.share, exported.clearance), (trial.share, trial.clearance));
             assert!((exported.width - grasp.width).abs() < 1e-6);
             let position = grasp.pose.translation.vector;
             assert!((0..3).all(|axis| (exported.pose[axis] - position[axis]).abs() < 1e-6));

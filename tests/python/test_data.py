@@ -13,6 +13,9 @@ import pandas as pd
 
 INTRINSIC = {"width": 640, "height": 480, "K": [540.0, 0.0, 320.0, 0.0, 540.0, 240.0, 0.0, 0.0, 1.0]}
 
+# The share of a grasp's tries that held, and its clearance: columns that VGN and GIGA do not have.
+ROOM = ["share", "clearance"]
+
 
 def sim(*arguments):
     command = [os.environ["GRASP_SIM"], *map(str, arguments)]
@@ -36,10 +39,12 @@ class DataTest(unittest.TestCase):
     def test_processed_data_load_with_pandas(self):
         root = self.label("processed")
         grasps = pd.read_csv(root / "grasps.csv", dtype={"scene_id": str})
-        self.assertEqual(list(grasps), ["scene_id", "qx", "qy", "qz", "qw", "i", "j", "k", "width", "label"])
+        self.assertEqual(list(grasps), ["scene_id", "qx", "qy", "qz", "qw", "i", "j", "k", "width", "label", *ROOM])
         self.assertEqual(len(grasps), 4 * 30)
         self.assertLess(0, grasps["label"].sum())
         self.assertTrue(grasps["label"].isin([0, 1]).all())
+        self.assertTrue(grasps["share"].between(0, 1).all() and (grasps.loc[grasps["label"] == 0, "share"] == 0).all())
+        self.assertTrue(grasps["clearance"].between(0, 0.02).all())
         np.testing.assert_allclose(np.linalg.norm(grasps[["qx", "qy", "qz", "qw"]], axis=1), 1.0, atol=1e-6)
         self.assertTrue((grasps.loc[grasps["label"] == 0, "width"] - 0.08 / 0.0075).abs().max() < 1e-4)
         self.assertTrue(grasps.loc[grasps["label"] == 1, "width"].between(0.008 / 0.0075, 0.08 / 0.0075).all())
@@ -55,7 +60,7 @@ class DataTest(unittest.TestCase):
         self.assertEqual(setup["size"], 0.3)
         self.assertEqual({key: setup["intrinsic"][key] for key in INTRINSIC}, INTRINSIC)
         grasps = pd.read_csv(root / "grasps.csv", dtype={"scene_id": str})
-        self.assertEqual(list(grasps), ["scene_id", "qx", "qy", "qz", "qw", "x", "y", "z", "width", "label"])
+        self.assertEqual(list(grasps), ["scene_id", "qx", "qy", "qz", "qw", "x", "y", "z", "width", "label", *ROOM])
         self.assertTrue((grasps["width"] <= 0.08).all())
         for scene in grasps["scene_id"].unique():
             with np.load(root / "scenes" / f"{scene}.npz") as archive:
@@ -87,6 +92,7 @@ class DataTest(unittest.TestCase):
         grasps = pd.read_csv(fused / "grasps.csv", dtype={"scene_id": str})
         before = pd.read_csv(raw / "grasps.csv", dtype={"scene_id": str})
         inside = before[["x", "y", "z"]].apply(lambda column: column.between(0.02, 0.28)).all(axis=1)
+        np.testing.assert_allclose(grasps[ROOM], before.loc[inside, ROOM], atol=1e-6)
         np.testing.assert_allclose(grasps[["i", "j", "k"]], before.loc[inside, ["x", "y", "z"]] / 0.0075, atol=1e-4)
         for scene in grasps["scene_id"].unique():
             with np.load(fused / "scenes" / f"{scene}.npz") as a, np.load(ours / "scenes" / f"{scene}.npz") as b:
@@ -115,6 +121,7 @@ class DataTest(unittest.TestCase):
         np.testing.assert_allclose(
             grasps[columns[1:]].sort_values("i"), pd.DataFrame(rows, columns=columns)[columns[1:]].sort_values("i"), atol=1e-4
         )
+        self.assertTrue((grasps["share"] == grasps["label"]).all() and (grasps["clearance"] == 0).all(), "as nothing is known")
         found = sorted(np.load(back / "scenes" / f"{scene}.npz")["grid"].sum() for scene in grasps["scene_id"].unique())
         np.testing.assert_allclose(found, sorted(grid.sum() for grid in grids.values()), rtol=1e-3)
 

@@ -219,11 +219,13 @@ impl Dataset {
             hash.update(&id);
             hash.update((trials.len() as u64).to_le_bytes());
             hash.update((self.volumes(scene) as u64).to_le_bytes());
-            for Trial { position, rotation, width, success, turns } in &trials {
+            for Trial { position, rotation, width, success, turns, share, clearance } in &trials {
                 for number in position.coords.iter().chain(rotation.coords.iter()).chain([width]) {
                     hash.update(number.to_le_bytes());
                 }
                 hash.update([u8::from(*success) | turns]);
+                hash.update(share.to_le_bytes());
+                hash.update(clearance.to_le_bytes());
             }
         }
         hash.finalize().iter().take(8).map(|byte| format!("{byte:02x}")).collect()

@@ -22,7 +22,7 @@ pub use candidates::Candidates;
 pub use dataset::{Dataset, Form};
 pub use error::DataError;
 pub use setup::{Provenance, Setup};
-pub use trial::{TURNS, Trial};
+pub use trial::{MAX_CLEARANCE, TURNS, Trial};
 
 /// A scene as a network sees it, with what came of trying it.
 #[derive(Clone, Debug, PartialEq)]

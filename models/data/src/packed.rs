@@ -1,6 +1,6 @@
 //! The packed form: a few large files that only ever grow.
 //!
-//! A folder holds `setup.json` and `scenes-NNNNN.pack`. A file is a header, 16 bytes (`graspack`, the version 2 and N as
+//! A folder holds `setup.json` and `scenes-NNNNN.pack`. A file is a header, 16 bytes (`graspack`, the version 3 and N as
 //! little-endian u32), and records one after the other, each a scene:
 //!
 //! | bytes | what |
@@ -9,8 +9,11 @@
 //! | 4 | its CRC-32 |
 //! | 8 | the scene's number |
 //! | 4, 4 | how many trials, how many volumes |
-//! | 33 a trial | position (voxels), quaternion x y z w, width (voxels): eight f32; bit 0: a success; bit k: turned by k · 36° about its approach it is one too |
+//! | 41 a trial | position (voxels), quaternion x y z w, width (voxels): eight f32; a byte, bit 0: a success, bit k: turned by k · 36° about its approach it is one too; the share of the tries that held and the clearance (metres): two f32 |
 //! | N³ a volume | [`quantise`]d values, `[x][y][z]` |
+//!
+//! In versions 1 and 2 a trial has 33 bytes, without the share and the clearance: all tries of a success held, and the
+//! clearance is not known. In version 1 no turns are known either. A folder may hold files of several versions.
 //!
 //! All numbers are little-endian. A record that is not complete yet, at the end of a file, is not there for a reader. A
 //! run that goes on after it was cut off starts a new file, so that a file that someone has mapped never shrinks.
@@ -27,12 +30,13 @@ use crate::error::{At, DataError};
 use crate::{Setup, Trial, edge_of, quantise};
 
 const MAGIC: &[u8; 8] = b"graspack";
-/// Version 1 knew nothing of turns.
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 const HEADER: usize = 16;
 /// Length and checksum, before a record's content.
 const PREFIX: usize = 8;
-const TRIAL: usize = 33;
+/// A trial as it is written, and as it was before the share and the clearance were kept.
+const TRIAL: usize = 41;
+const SHORT_TRIAL: usize = 33;
 
 /// Size at which the writer begins the next file.
 const FILE_SIZE: u64 = 1 << 30;
@@ -86,12 +90,14 @@ impl Writer {
         self.record.extend(number.to_le_bytes());
         self.record.extend((trials.len() as u32).to_le_bytes());
         self.record.extend((volumes.len() as u32).to_le_bytes());
-        for Trial { position: p, rotation, width, success, turns } in trials {
+        for Trial { position: p, rotation, width, success, turns, share, clearance } in trials {
             let q = rotation.coords;
             for number in [p.x, p.y, p.z, q.x, q.y, q.z, q.w, *width] {
                 self.record.extend((number as f32).to_le_bytes());
             }
             self.record.push(u8::from(*success) | turns);
+            self.record.extend(share.to_le_bytes());
+            self.record.extend(clearance.to_le_bytes());
         }
         volumes.iter().for_each(|volume| self.record.extend(volume));
         let content = &self.record[PREFIX..];
@@ -157,6 +163,8 @@ struct Part {
     path: PathBuf,
     map: Mmap,
     edge: usize,
+    /// Bytes of a trial.
+    trial: usize,
     /// End of the last complete record.
     end: usize,
 }
@@ -199,9 +207,9 @@ impl Reader {
                 continue;
             }
             let map = map(&path)?;
-            let edge = check_header(&path, &map)?;
+            let (edge, trial) = check_header(&path, &map)?;
             let end = known.map_or(HEADER, |part| part.end);
-            let mut part = Part { path, map, edge, end };
+            let mut part = Part { path, map, edge, trial, end };
             // The records before stay where they are.
             self.scenes.extend(part.read_on(index)?);
             match self.parts.get_mut(index) {
@@ -248,27 +256,34 @@ impl Reader {
         let scene = &self.scenes[index];
         let part = &self.parts[scene.part];
         let size = part.edge.pow(3);
-        &part.map[scene.start + scene.trials * TRIAL + look * size..][..size]
+        &part.map[scene.start + scene.trials * part.trial + look * size..][..size]
     }
 
     /// The trials of scene `index`.
     #[must_use]
     pub fn trials(&self, index: usize) -> Vec<Trial> {
         let scene = &self.scenes[index];
-        let bytes = &self.parts[scene.part].map[scene.start..][..scene.trials * TRIAL];
-        bytes
-            .chunks_exact(TRIAL)
-            .map(|trial| {
-                let [x, y, z, qx, qy, qz, qw, width] = std::array::from_fn(|i| f64::from(f32_at(trial, 4 * i)));
-                Trial {
-                    position: Point3::new(x, y, z),
-                    rotation: UnitQuaternion::from_quaternion(Quaternion::new(qw, qx, qy, qz)),
-                    width,
-                    success: trial[32] & 1 != 0,
-                    turns: trial[32] & !1,
-                }
-            })
-            .collect()
+        let part = &self.parts[scene.part];
+        part.map[scene.start..][..scene.trials * part.trial].chunks_exact(part.trial).map(trial).collect()
+    }
+}
+
+/// A trial of either length.
+fn trial(bytes: &[u8]) -> Trial {
+    let [x, y, z, qx, qy, qz, qw, width] = std::array::from_fn(|i| f64::from(f32_at(bytes, 4 * i)));
+    let success = bytes[32] & 1 != 0;
+    let [share, clearance] = match bytes.len() {
+        SHORT_TRIAL => [if success { 1.0 } else { 0.0 }, 0.0],
+        _ => [f32_at(bytes, 33), f32_at(bytes, 37)],
+    };
+    Trial {
+        position: Point3::new(x, y, z),
+        rotation: UnitQuaternion::from_quaternion(Quaternion::new(qw, qx, qy, qz)),
+        width,
+        success,
+        turns: bytes[32] & !1,
+        share,
+        clearance,
     }
 }
 
@@ -291,7 +306,7 @@ impl Part {
                 Some(counts) => [u32_at(counts, 0), u32_at(counts, 4)].map(|count| count as usize),
                 None => return Err(damaged(format!("a scene of {length} bytes is too short"))),
             };
-            if length != 16 + trials * TRIAL + volumes * self.edge.pow(3) {
+            if length != 16 + trials * self.trial + volumes * self.edge.pow(3) {
                 return Err(damaged(format!("{trials} trials and {volumes} volumes do not make {length} bytes")));
             }
             let number = u64::from(u32_at(content, 0)) | u64::from(u32_at(content, 4)) << 32;
@@ -302,15 +317,18 @@ impl Part {
     }
 }
 
-fn check_header(path: &Path, bytes: &[u8]) -> Result<usize, DataError> {
+/// The edge of a file's volumes, and the bytes of its trials.
+fn check_header(path: &Path, bytes: &[u8]) -> Result<(usize, usize), DataError> {
     let damaged = |reason: String| DataError::Damaged { path: path.to_owned(), offset: 0, reason };
     if &bytes[..8] != MAGIC {
         return Err(damaged("the file does not begin with `graspack`".to_owned()));
     }
-    match u32_at(bytes, 8) {
-        1..=VERSION => Ok(u32_at(bytes, 12) as usize),
-        version => Err(damaged(format!("version {version}, this program reads up to {VERSION}"))),
-    }
+    let trial = match u32_at(bytes, 8) {
+        1 | 2 => SHORT_TRIAL,
+        VERSION => TRIAL,
+        version => return Err(damaged(format!("version {version}, this program reads up to {VERSION}"))),
+    };
+    Ok((u32_at(bytes, 12) as usize, trial))
 }
 
 #[expect(

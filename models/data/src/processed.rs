@@ -1,8 +1,8 @@
 //! The processed format of VGN and GIGA:
 //!
 //! - `setup.json`: [`Setup`];
-//! - `grasps.csv`: `scene_id,qx,qy,qz,qw,i,j,k,width,label`, a row a trial; i, j, k = position / voxel size, width in
-//!   voxels;
+//! - `grasps.csv`: `scene_id,qx,qy,qz,qw,i,j,k,width,label,share,clearance`, a row a trial; i, j, k = position / voxel
+//!   size, width in voxels, clearance in metres; VGN and GIGA have neither `share` nor `clearance`, see [`Trial`];
 //! - `scenes/ID.npz`: `grid`, `[1, N, N, N]` f32, the observed volume.
 
 use std::fs;

@@ -1,7 +1,8 @@
 //! The raw format of VGN and GIGA:
 //!
 //! - `setup.json`: [`Setup`], with the camera's intrinsics;
-//! - `grasps.csv`: `scene_id,qx,qy,qz,qw,x,y,z,width,label`, a row a trial, lengths in metres;
+//! - `grasps.csv`: `scene_id,qx,qy,qz,qw,x,y,z,width,label,share,clearance`, a row a trial, lengths in metres; VGN and
+//!   GIGA have neither `share` nor `clearance`, see [`Trial`];
 //! - `scenes/ID.npz`: `depth_imgs` `[n, height, width]` f32, metres, 0 where nothing was seen, and `extrinsics` `[n, 7]`,
 //!   `T_camera_task` as qx, qy, qz, qw, tx, ty, tz.
 

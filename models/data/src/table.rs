@@ -1,4 +1,5 @@
-//! `grasps.csv`: a row a trial, the same in both of VGN's formats but for the unit of its lengths.
+//! `grasps.csv`: a row a trial, the same in both of VGN's formats but for the unit of its lengths. Columns are found by
+//! their names. VGN's and GIGA's tables have no `share` and no `clearance`, which is in metres in both formats.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -7,10 +8,10 @@ use std::io::{self, BufRead, BufReader, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use nalgebra::{Point3, Quaternion, UnitQuaternion};
-use serde::Deserialize;
+use serde::{Deserialize, Deserializer};
 
-use crate::Trial;
 use crate::error::{At, DataError};
+use crate::{MAX_CLEARANCE, Trial};
 
 pub(crate) const FILE: &str = "grasps.csv";
 
@@ -22,25 +23,42 @@ pub(crate) enum Unit {
 }
 
 impl Unit {
+    /// As it is written.
     fn header(self) -> &'static str {
         match self {
-            Self::Metres => "scene_id,qx,qy,qz,qw,x,y,z,width,label",
-            Self::Voxels => "scene_id,qx,qy,qz,qw,i,j,k,width,label",
+            Self::Metres => "scene_id,qx,qy,qz,qw,x,y,z,width,label,share,clearance",
+            Self::Voxels => "scene_id,qx,qy,qz,qw,i,j,k,width,label,share,clearance",
         }
+    }
+
+    /// What every table has.
+    fn required(self) -> impl Iterator<Item = &'static str> {
+        self.header().split(',').filter(|column| !["share", "clearance"].contains(column))
     }
 
     fn columns(self) -> &'static str {
         match self {
-            Self::Metres => "scene_id,qx,qy,qz,qw,x,y,z,width,label, with x, y, z and width in metres",
-            Self::Voxels => "scene_id,qx,qy,qz,qw,i,j,k,width,label, with i, j, k and width in voxels",
+            Self::Metres => {
+                "scene_id,qx,qy,qz,qw,x,y,z,width,label, with x, y, z and width in metres, \
+                 optionally share,clearance, with clearance in metres"
+            }
+            Self::Voxels => {
+                "scene_id,qx,qy,qz,qw,i,j,k,width,label, with i, j, k and width in voxels, \
+                 optionally share,clearance, with clearance in metres"
+            }
         }
     }
 
     /// The unit of a folder's table by its header.
     pub(crate) fn of(folder: &Path) -> Option<Self> {
-        let mut header = String::new();
-        BufReader::new(File::open(folder.join(FILE)).ok()?).read_line(&mut header).ok()?;
-        [Self::Metres, Self::Voxels].into_iter().find(|unit| header.trim_end() == unit.header())
+        let mut reader = csv::Reader::from_path(folder.join(FILE)).ok()?;
+        let header = reader.headers().ok()?;
+        [Self::Metres, Self::Voxels].into_iter().find(|unit| unit.missing(header).is_none())
+    }
+
+    /// A column that a table must have and has not.
+    fn missing(self, header: &csv::StringRecord) -> Option<&'static str> {
+        self.required().find(|&column| header.iter().all(|found| found != column))
     }
 }
 
@@ -57,6 +75,9 @@ impl TableWriter {
         let path = folder.join(FILE);
         let mut file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path).at(&path)?;
         let (kept, last) = last_scene(&file).at(&path)?;
+        if kept > 0 {
+            check_columns(&path, unit)?;
+        }
         file.set_len(kept).at(&path)?;
         file.seek(SeekFrom::End(0)).at(&path)?;
         if kept == 0 {
@@ -68,17 +89,31 @@ impl TableWriter {
     /// Appends a scene's trials, in the table's unit, in one write.
     pub(crate) fn append(&mut self, id: &str, trials: &[Trial]) -> Result<(), DataError> {
         let mut rows = String::new();
-        for Trial { position: p, rotation, width, success, .. } in trials {
+        for Trial { position: p, rotation, width, success, share, clearance, .. } in trials {
             let (q, label) = (rotation.coords, u8::from(*success));
             // Writing to a string cannot fail.
             let _ = writeln!(
                 rows,
-                "{id},{:.7},{:.7},{:.7},{:.7},{:.6},{:.6},{:.6},{width:.6},{label}",
+                "{id},{:.7},{:.7},{:.7},{:.7},{:.6},{:.6},{:.6},{width:.6},{label},{share:.6},{clearance:.6}",
                 q.x, q.y, q.z, q.w, p.x, p.y, p.z
             );
         }
         self.file.write_all(rows.as_bytes()).at(&self.path)
     }
+}
+
+/// Rows as they are written now must not follow those of an earlier version, which are shorter.
+fn check_columns(path: &Path, unit: Unit) -> Result<(), DataError> {
+    let mut header = String::new();
+    BufReader::new(File::open(path).at(path)?).read_line(&mut header).at(path)?;
+    if header.trim_end() == unit.header() {
+        return Ok(());
+    }
+    let reason = format!(
+        "the table was begun with other columns than `{}`, which cannot be added to it: write into another folder",
+        unit.header()
+    );
+    Err(DataError::Row { path: path.to_owned(), line: 1, reason, columns: unit.columns() })
 }
 
 /// Length of the table without the rows of its last scene, which may be unfinished, and that scene's number.
@@ -116,6 +151,15 @@ struct Row {
     z: f64,
     width: f64,
     label: f64,
+    #[serde(default, deserialize_with = "number")]
+    share: Option<f32>,
+    #[serde(default, deserialize_with = "number")]
+    clearance: Option<f32>,
+}
+
+/// A column may be missing, but where it is there, so is its value: an empty one is of a row that was cut off.
+fn number<'de, D: Deserializer<'de>>(value: D) -> Result<Option<f32>, D::Error> {
+    f32::deserialize(value).map(Some)
 }
 
 /// Reads a folder's table: the trials of each scene, in the table's unit.
@@ -124,8 +168,7 @@ pub(crate) fn read(folder: &Path, unit: Unit) -> Result<BTreeMap<String, Vec<Tri
     let wrong = |line, reason| DataError::Row { path: path.clone(), line, reason, columns: unit.columns() };
     let mut reader = csv::Reader::from_reader(File::open(&path).at(&path)?);
     let header = reader.headers().map_err(|error| wrong(1, error.to_string()))?;
-    let missing = unit.header().split(',').find(|&column| header.iter().all(|found| found != column));
-    if let Some(column) = missing {
+    if let Some(column) = unit.missing(header) {
         return Err(wrong(1, format!("there is no column `{column}`")));
     }
     let mut trials: BTreeMap<String, Vec<Trial>> = BTreeMap::new();
@@ -144,7 +187,7 @@ pub(crate) fn read(folder: &Path, unit: Unit) -> Result<BTreeMap<String, Vec<Tri
 
 impl Row {
     fn check(self) -> Result<Trial, String> {
-        let Self { qx, qy, qz, qw, x, y, z, width, label, .. } = self;
+        let Self { qx, qy, qz, qw, x, y, z, width, label, share, clearance, .. } = self;
         for (name, value) in [("the position", x), ("the position", y), ("the position", z), ("width", width)] {
             if !value.is_finite() {
                 return Err(format!("{name} is {value}"));
@@ -159,12 +202,25 @@ impl Row {
             1.0 => true,
             _ => return Err(format!("label is {label}, must be 0 or 1")),
         };
+        let share = share.unwrap_or(if success { 1.0 } else { 0.0 });
+        if !(0.0..=1.0).contains(&share) {
+            return Err(format!("share is {share}, must be from 0 to 1"));
+        }
+        if !success && share != 0.0 {
+            return Err(format!("share is {share} although label is 0: a failure's must be 0"));
+        }
+        let clearance = clearance.unwrap_or(0.0);
+        if !(0.0..=MAX_CLEARANCE).contains(&clearance) {
+            return Err(format!("clearance is {clearance}, must be from 0 to {MAX_CLEARANCE} metres"));
+        }
         Ok(Trial {
             position: Point3::new(x, y, z),
             rotation: UnitQuaternion::from_quaternion(rotation),
             width,
             success,
             turns: 0,
+            share,
+            clearance,
         })
     }
 }

@@ -4,7 +4,10 @@ use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 /// Turns of the hand about its approach at which a point is tried, evenly over half a turn, after which it is the same.
 pub const TURNS: usize = 5;
 
-/// A grasp that was tried, in the volume's frame, lengths in voxels.
+/// Where [`Trial::clearance`] is capped, metres: more room than this makes a grasp no safer.
+pub const MAX_CLEARANCE: f32 = 0.02;
+
+/// A grasp that was tried, in the volume's frame, lengths in voxels but for the clearance.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Trial {
     /// Where, in voxels (position / voxel size, not rounded).
@@ -18,10 +21,18 @@ pub struct Trial {
     /// Of a success: which turns about its approach held too, bit k for k/[`TURNS`] of half a turn, from 1 on. None in the
     /// forms of VGN and GIGA, which do not say.
     pub turns: u8,
+    /// The share of the tries that held, in [0, 1], when a success was tried several times with small errors of its pose.
+    /// Of a failure 0; of a success that was not tried again 1.
+    pub share: f32,
+    /// The smallest distance between the open hand on its way to the grasp and the objects, up to [`MAX_CLEARANCE`]; 0
+    /// where it is not known, or the hand touches something. In metres in every form, for it is of the hand and the
+    /// objects, whatever a voxel measures.
+    pub clearance: f32,
 }
 
 impl Trial {
-    /// A grasp in the volume's frame (metres), in voxels of `voxel_size` metres, of whose turns nothing is known.
+    /// A grasp in the volume's frame (metres), in voxels of `voxel_size` metres, of which nothing more is known: none of its
+    /// turns, no other tries, no clearance.
     #[must_use]
     pub fn new(grasp: &Grasp, success: bool, voxel_size: f64) -> Self {
         Self {
@@ -30,6 +41,8 @@ impl Trial {
             width: grasp.width / voxel_size,
             success,
             turns: 0,
+            share: if success { 1.0 } else { 0.0 },
+            clearance: 0.0,
         }
     }
 

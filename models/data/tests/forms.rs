@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use grasp_data::{DataError, Dataset, Form, Provenance, Setup, Trial, packed, processed, raw};
+use grasp_data::{DataError, Dataset, Form, MAX_CLEARANCE, Provenance, Scene, Setup, Trial, packed, processed, raw};
 use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 
 const N: usize = 8;
@@ -24,14 +24,16 @@ fn setup() -> Setup {
 
 fn trials(number: u64) -> Vec<Trial> {
     let rotation = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 0.1 * number as f64);
-    let trial = |success, turns| Trial {
+    let trial = |success, turns, share, clearance| Trial {
         position: Point3::new(1.5, 2.0, number as f64),
         rotation,
         width: 3.25,
         success,
         turns,
+        share,
+        clearance,
     };
-    vec![trial(true, 0b1_0010), trial(false, 0)]
+    vec![trial(true, 0b1_0010, 0.75, 0.0125), trial(false, 0, 0.0, MAX_CLEARANCE)]
 }
 
 fn volumes(number: u64) -> Vec<Vec<f32>> {
@@ -46,6 +48,7 @@ fn assert_same(read: &[Trial], written: &[Trial]) {
         assert!(read.rotation.angle_to(&written.rotation) < 1e-5);
         assert!((read.width - written.width).abs() < 1e-5);
         assert_eq!(read.success, written.success);
+        assert_eq!((read.share, read.clearance), (written.share, written.clearance));
     }
 }
 
@@ -76,16 +79,52 @@ fn packed_scenes_are_read_as_they_were_written() {
     }
 }
 
+/// A file with one scene, as an earlier version wrote it: nothing follows the flags of a trial.
+fn of_version(version: u8, bytes: &[u8], trials: usize) -> Vec<u8> {
+    let (header, record) = bytes.split_at(16);
+    let (counts, rest) = record[8..].split_at(16);
+    let (tried, volumes) = rest.split_at(41 * trials);
+    let tried: Vec<u8> = tried.chunks_exact(41).flat_map(|trial| &trial[..33]).copied().collect();
+    let content = [counts, &tried, volumes].concat();
+    let prefix = [(content.len() as u32).to_le_bytes(), crc32fast::hash(&content).to_le_bytes()].concat();
+    let mut header = header.to_vec();
+    header[8] = version;
+    [header, prefix, content].concat()
+}
+
 #[test]
-fn the_first_version_of_the_packed_form_is_read_too() {
-    let folder = tempfile::tempdir().unwrap();
-    let first: Vec<Trial> = trials(0).into_iter().map(|trial| Trial { turns: 0, ..trial }).collect();
-    packed::Writer::open(folder.path(), &setup()).unwrap().append(0, &volumes(0), &first).unwrap();
-    let path = folder.path().join("scenes-00000.pack");
-    let mut bytes = fs::read(&path).unwrap();
-    bytes[8] = 1;
-    fs::write(&path, bytes).unwrap();
-    assert_same(&Dataset::open(&[folder.path().to_owned()]).unwrap().trials(0), &first);
+fn earlier_versions_of_the_packed_form_are_read_too() {
+    for (version, turns) in [(1, 0), (2, 0b1_0010)] {
+        let folder = tempfile::tempdir().unwrap();
+        let written: Vec<Trial> = trials(0).into_iter().map(|trial| Trial { turns, ..trial }).collect();
+        packed::Writer::open(folder.path(), &setup()).unwrap().append(0, &volumes(0), &written).unwrap();
+        let path = folder.path().join("scenes-00000.pack");
+        let bytes = fs::read(&path).unwrap();
+        fs::write(&path, of_version(version, &bytes, 2)).unwrap();
+        // A run that goes on writes the version of today.
+        pack(folder.path(), [0, 1]);
+        let dataset = Dataset::open(&[folder.path().to_owned()]).unwrap();
+        let share = |success| if success { 1.0 } else { 0.0 };
+        let known = written.iter().map(|trial| Trial { share: share(trial.success), clearance: 0.0, ..*trial });
+        assert_same(&dataset.trials(0), &known.collect::<Vec<_>>());
+        assert_eq!(dataset.trials(0)[0].turns, turns, "version {version}");
+        assert_eq!(dataset.volume(0, 1), grasp_data::quantise(&volumes(0)[1]));
+        assert_same(&dataset.trials(1), &trials(1));
+        assert_eq!(dataset.volume(1, 0), grasp_data::quantise(&volumes(1)[0]));
+    }
+}
+
+#[test]
+fn a_data_set_with_other_shares_or_clearances_is_another() {
+    let fingerprint = |change: fn(&mut Trial)| {
+        let mut trials = trials(0);
+        change(&mut trials[0]);
+        let volumes = volumes(0).iter().map(|volume| grasp_data::quantise(volume)).collect();
+        Dataset::of(vec![Scene { id: "a".into(), volumes, trials }]).unwrap().fingerprint()
+    };
+    let same = fingerprint(|_| {});
+    assert_ne!(fingerprint(|trial| trial.share = 0.5), same);
+    assert_ne!(fingerprint(|trial| trial.clearance = 0.01), same);
 }
 
 #[test]
@@ -181,8 +220,9 @@ fn a_processed_run_cut_off_anywhere_goes_on_without_a_lost_or_doubled_scene() {
     write();
     let table = folder.path().join("grasps.csv");
     let whole = fs::read_to_string(&table).unwrap();
-    let header = "scene_id,qx,qy,qz,qw,i,j,k,width,label\n";
-    let first = "00000000,0.0000000,0.0000000,0.0000000,1.0000000,1.500000,2.000000,0.000000,3.250000,1\n";
+    let header = "scene_id,qx,qy,qz,qw,i,j,k,width,label,share,clearance\n";
+    let first =
+        "00000000,0.0000000,0.0000000,0.0000000,1.0000000,1.500000,2.000000,0.000000,3.250000,1,0.750000,0.012500\n";
     assert!(whole.starts_with(&format!("{header}{first}")), "{whole}");
     // In a row, between two, or in a scene's number.
     for length in header.len()..whole.len() {
@@ -249,10 +289,16 @@ fn what_cannot_be_read_is_named() {
     let line = good.lines().nth(2).unwrap();
     for (bad, said) in [
         (line.replace("00000001,", "00000009,"), "00000009.npz"),
-        ("00000001,0,0,0,1,1,2,3,4,2".to_owned(), "line 4: label is 2"),
-        ("00000001,0,0,0,0.5,1,2,3,4,1".to_owned(), "line 4: the quaternion has length 0.5"),
-        ("00000001,0,0,0,1,nan,2,3,4,1".to_owned(), "line 4: the position is NaN"),
-        ("00000001,0,0,0,1,one,2,3,4,1".to_owned(), "line 4:"),
+        ("00000001,0,0,0,1,1,2,3,4,2,1,0".to_owned(), "line 4: label is 2"),
+        ("00000001,0,0,0,0.5,1,2,3,4,1,1,0".to_owned(), "line 4: the quaternion has length 0.5"),
+        ("00000001,0,0,0,1,nan,2,3,4,1,1,0".to_owned(), "line 4: the position is NaN"),
+        ("00000001,0,0,0,1,one,2,3,4,1,1,0".to_owned(), "line 4:"),
+        ("00000001,0,0,0,1,1,2,3,4,1,1.5,0".to_owned(), "line 4: share is 1.5, must be from 0 to 1"),
+        ("00000001,0,0,0,1,1,2,3,4,1,nan,0".to_owned(), "line 4: share is NaN"),
+        ("00000001,0,0,0,1,1,2,3,4,0,0.5,0".to_owned(), "line 4: share is 0.5 although label is 0"),
+        ("00000001,0,0,0,1,1,2,3,4,1,1,0.03".to_owned(), "line 4: clearance is 0.03, must be from 0 to 0.02 metres"),
+        ("00000001,0,0,0,1,1,2,3,4,1,1,-0.01".to_owned(), "line 4: clearance is -0.01"),
+        ("00000001,0,0,0,1,1,2,3,4,1,1,".to_owned(), "line 4:"),
         ("00000001,0,0,0".to_owned(), "line 4:"),
     ] {
         fs::write(&table, format!("{good}{bad}\n")).unwrap();
@@ -263,6 +309,36 @@ fn what_cannot_be_read_is_named() {
     fs::write(&table, &good).unwrap();
     fs::write(folder.path().join("scenes/00000001.npz"), "no archive").unwrap();
     assert!(error().contains("00000001.npz"), "{}", error());
+}
+
+#[test]
+fn columns_are_found_by_their_names_and_share_and_clearance_may_be_missing() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut writer = processed::Writer::open(folder.path(), &setup()).unwrap();
+    writer.append("00000001", &volumes(1)[0], &trials(1)).unwrap();
+    let table = folder.path().join("grasps.csv");
+    let read = |text: &str| {
+        fs::write(&table, text).unwrap();
+        let trials = Dataset::open(&[folder.path().to_owned()]).map(|dataset| dataset.trials(0));
+        trials.map(|trials| trials.iter().map(|trial| (trial.share, trial.clearance)).collect::<Vec<_>>())
+    };
+    // As VGN and GIGA write.
+    let old = "scene_id,qx,qy,qz,qw,i,j,k,width,label\n00000001,0,0,0,1,1,2,3,4,1\n00000001,0,0,0,1,1,2,3,4,0\n";
+    assert_eq!(read(old).unwrap(), [(1.0, 0.0), (0.0, 0.0)]);
+    let one = "label,share,scene_id,qx,qy,qz,qw,more,i,j,k,width\n1,0.25,00000001,0,0,0,1,7,1,2,3,4\n";
+    assert_eq!(read(one).unwrap(), [(0.25, 0.0)]);
+    let other = "scene_id,qx,qy,qz,qw,i,j,k,width,clearance,label\n00000001,0,0,0,1,1,2,3,4,0.01,1\n";
+    assert_eq!(read(other).unwrap(), [(1.0, 0.01)]);
+    assert!(read(&other.replace("width", "wide")).unwrap_err().to_string().contains("holds no grasps"));
+
+    // Rows of today do not follow a header of before.
+    let old = format!("{old}00000002,0,0,0,1,1,2,3,4,1\n");
+    fs::write(&table, &old).unwrap();
+    let Err(DataError::Row { line: 1, reason, .. }) = processed::Writer::open(folder.path(), &setup()) else {
+        panic!("a table of other columns is gone on with")
+    };
+    assert!(reason.contains("write into another folder"), "{reason}");
+    assert_eq!(fs::read_to_string(&table).unwrap(), old, "nothing is lost");
 }
 
 #[test]

@@ -7,7 +7,7 @@ use std::time::Instant;
 use grasp::VoxelOrigin;
 use grasp_data::Trial;
 use grasp_models::build;
-use grasp_train::{Adam, Execution, Executor, Targets, Weights};
+use grasp_train::{Adam, Execution, Executor, Quality, Targets, Weights};
 use nalgebra::{Point3, UnitQuaternion};
 use tch::{Device, Kind, Tensor};
 
@@ -27,8 +27,10 @@ fn main() -> anyhow::Result<()> {
         for label in 0..24 {
             let position = Point3::from([5, 7, 11].map(|step| f64::from(label * step % 36 + 2)));
             let rotation = UnitQuaternion::identity();
-            let label = Trial { position, rotation, width: 5.0, success: label % 2 == 0, turns: 0 };
-            targets.push(index, &label, 40, VoxelOrigin::Corner);
+            let success = label % 2 == 0;
+            let share = if success { 1.0 } else { 0.0 };
+            let label = Trial { position, rotation, width: 5.0, success, turns: 0, share, clearance: 0.0 };
+            targets.push(index, &label, 40, VoxelOrigin::Corner, Quality::Label);
         }
     }
 

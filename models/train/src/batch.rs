@@ -8,6 +8,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::augment::Transform;
 use crate::loss::Targets;
+use crate::settings::Quality;
 use crate::teacher::{Teacher, TeacherError};
 
 /// Batches that are read ahead of the one at work.
@@ -40,6 +41,7 @@ impl Batch {
         dataset: &Dataset,
         examples: &[Example],
         origin: VoxelOrigin,
+        quality: Quality,
         mut teacher: Option<&mut Teacher>,
     ) -> Result<Self, TeacherError> {
         let n = dataset.resolution();
@@ -49,7 +51,7 @@ impl Batch {
             let &Example { scene, look, transform, voxels } = example;
             transform.volume(dataset.volume(scene, look), n, out);
             for trial in dataset.trials(scene) {
-                targets.push(index, &transform.trial(&trial, n), n, origin);
+                targets.push(index, &transform.trial(&trial, n), n, origin, quality);
             }
             if let Some(teacher) = teacher.as_deref_mut() {
                 teacher.answer(index, out, &mut ChaCha8Rng::seed_from_u64(voxels), &mut answers)?;
@@ -64,6 +66,7 @@ pub(crate) fn read_ahead<R>(
     dataset: &Dataset,
     plan: &[&[Example]],
     origin: VoxelOrigin,
+    quality: Quality,
     mut teacher: Option<&mut Teacher>,
     take: impl FnOnce(mpsc::IntoIter<Result<Batch, TeacherError>>) -> R,
 ) -> R {
@@ -72,7 +75,7 @@ pub(crate) fn read_ahead<R>(
         scope.spawn(move || {
             for examples in plan {
                 // Nobody takes it when training was stopped.
-                if sender.send(Batch::read(dataset, examples, origin, teacher.as_deref_mut())).is_err() {
+                if sender.send(Batch::read(dataset, examples, origin, quality, teacher.as_deref_mut())).is_err() {
                     break;
                 }
             }

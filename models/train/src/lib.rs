@@ -30,6 +30,6 @@ pub use examples::Examples;
 pub use execute::{ExecuteError, Execution, Executor, Outputs};
 pub use loss::{Loss, LossError, Sums, Targets, Weights};
 pub use record::{Record, Success, Validation};
-pub use settings::Settings;
+pub use settings::{Quality, Settings};
 pub use teacher::{Teacher, TeacherError};
 pub use trainer::{Epoch, TrainError, Trainer};

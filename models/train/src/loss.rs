@@ -8,6 +8,7 @@ use tch::{Kind, Reduction, TchError, Tensor};
 use thiserror::Error;
 
 use crate::execute::Outputs;
+use crate::settings::Quality;
 
 /// Weight of the width's squared error, voxels², against the other two parts. The paper's equation leaves it out.
 const WIDTH_WEIGHT: f64 = 0.01;
@@ -19,6 +20,8 @@ pub struct Targets {
     cells: Vec<i64>,
     /// 1 for a success, 0 for a failure; a network's answer lies between.
     labels: Vec<f32>,
+    /// What the quality should be: the label, or the share of the tries that held.
+    qualities: Vec<f32>,
     /// The rotations that hold, each also turned by 180° about its z: x y z w; where there are fewer, the first again.
     rotations: Vec<[[[f32; 4]; 2]; TURNS]>,
     /// Voxels.
@@ -83,10 +86,11 @@ pub enum LossError {
 
 impl Targets {
     /// Adds a grasp in the volume number `index` of the batch; without effect when it lies outside the volume.
-    pub fn push(&mut self, index: usize, trial: &Trial, n: usize, origin: VoxelOrigin) {
+    pub fn push(&mut self, index: usize, trial: &Trial, n: usize, origin: VoxelOrigin, quality: Quality) {
         let Some(cell) = voxel_of(trial, n, origin) else { return };
         self.cells.push((index * n.pow(3) + cell) as i64);
         self.labels.push(f32::from(u8::from(trial.success)));
+        self.qualities.push(quality.of(trial));
         let both = |rotation: &UnitQuaternion<f64>| both_ways(rotation.coords.map(|c| c as f32).into());
         let mut rotations = [both(&trial.rotation); TURNS];
         trial.rotations().zip(&mut rotations).for_each(|(rotation, place)| *place = both(&rotation));
@@ -98,6 +102,7 @@ impl Targets {
     pub(crate) fn push_answer(&mut self, cell: usize, quality: f32, rotation: [f32; 4], width: f32) {
         self.cells.push(cell as i64);
         self.labels.push(quality);
+        self.qualities.push(quality);
         self.rotations.push([both_ways(rotation); TURNS]);
         self.widths.push(width);
     }
@@ -120,8 +125,9 @@ impl Targets {
         self.cells.is_empty()
     }
 
-    /// The loss of a network's outputs at [these voxels](Self::cells): L = c·(BCE(q, q*) + q*·(ρ·(1 − max |r·r*|) +
-    /// 0.01·(w − w*)²)), averaged over them, with c the weight of the voxel's class and ρ that of the rotation.
+    /// The loss of a network's outputs at [these voxels](Self::cells): L = c·(BCE(q, q*) + s·(ρ·(1 − max |r·r*|) +
+    /// 0.01·(w − w*)²)), averaged over them, with s 1 for a success and 0 for a failure, c the weight of that class and ρ
+    /// that of the rotation. In the paper q* is s; see [`Quality`] for the other choice.
     ///
     /// # Errors
     /// [`LossError`] when the outputs are not numbers, or of other voxels.
@@ -135,7 +141,8 @@ impl Targets {
         }
         let [failure, success] = weights.classes;
         let of_voxels = &labels * (success - failure) + failure;
-        let quality_loss = quality.f_binary_cross_entropy(&labels, Some(&of_voxels), Reduction::Sum)?;
+        let expected = Tensor::f_from_slice(&self.qualities)?.to_device(device);
+        let quality_loss = quality.f_binary_cross_entropy(&expected, Some(&of_voxels), Reduction::Sum)?;
 
         let hold = self.rotations.as_flattened().as_flattened().as_flattened();
         let hold = Tensor::f_from_slice(hold)?.to_device(device).f_reshape([-1, 2 * TURNS as i64, 4])?;

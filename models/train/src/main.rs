@@ -13,6 +13,7 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use grasp::RESOLUTION;
 use grasp_models::{Architecture, Orientation, gpd};
+use grasp_train::Quality;
 
 /// Trains the networks of graspd in libtorch by executing the very ONNX graph that is served.
 #[derive(Parser)]
@@ -136,6 +137,11 @@ struct Training {
     /// Weigh failures and successes the same, however many there are of each, instead of leaving it to the data.
     #[arg(long)]
     balance: bool,
+    /// What the quality is learnt from: label, whether a grasp held, or share, the share of its tries with small pose
+    /// errors that held, a probability. Where the data have no shares, both are the same. Rotation and width do not depend
+    /// on it.
+    #[arg(long, value_enum, default_value_t = Target::Label)]
+    quality: Target,
     /// What the rotation counts for in the loss, against quality and width.
     #[arg(long, default_value_t = 1.0)]
     rotation_weight: f64,
@@ -179,6 +185,21 @@ impl From<Regressed> for Orientation {
         match regressed {
             Regressed::Quaternion => Self::Quaternion,
             Regressed::Axes => Self::Axes,
+        }
+    }
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Target {
+    Label,
+    Share,
+}
+
+impl From<Target> for Quality {
+    fn from(target: Target) -> Self {
+        match target {
+            Target::Label => Self::Label,
+            Target::Share => Self::Share,
         }
     }
 }

@@ -219,6 +219,7 @@ fn settings(training: &Training, metadata: &Metadata) -> Settings {
             shift: if allows(Change::Shift) { training.max_shift } else { 0 },
         },
         balance: training.balance,
+        quality: training.quality.into(),
         rotation_weight: training.rotation_weight,
         voxel_origin: metadata.voxel_origin,
         bf16: training.bf16,

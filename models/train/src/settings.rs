@@ -1,8 +1,30 @@
 use grasp::VoxelOrigin;
-use grasp_data::Dataset;
+use grasp_data::{Dataset, Trial};
 use serde::Serialize;
 
 use crate::augment::Augmentation;
+
+/// What the quality is learnt from, by binary cross-entropy.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Quality {
+    /// Whether a grasp held: 1 or 0.
+    #[default]
+    Label,
+    /// The share of its tries that held. Where none was tried again, the same as the label.
+    Share,
+}
+
+impl Quality {
+    /// What the quality of a grasp should be.
+    #[must_use]
+    pub fn of(self, trial: &Trial) -> f32 {
+        match self {
+            Self::Label => f32::from(u8::from(trial.success)),
+            Self::Share => trial.share,
+        }
+    }
+}
 
 /// Everything that decides the outcome of a run, besides the network it starts from and the data.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -33,6 +55,8 @@ pub struct Settings {
     /// Whether failures and successes weigh the same, however many there are of each: in the mean as if there were as
     /// many of both. Otherwise the data decide, which VGN balances beforehand.
     pub balance: bool,
+    /// What the quality is learnt from. Rotation and width are learnt from every success the same.
+    pub quality: Quality,
     /// What the rotation's part of the loss counts for.
     pub rotation_weight: f64,
     /// Where in its voxel a grasp stands, `corner` or `center`.

@@ -252,15 +252,15 @@ impl Trainer {
     pub fn epoch(&mut self, stop: &AtomicBool, mut report: impl FnMut(u64, f64)) -> Result<Epoch, TrainError> {
         let start = Instant::now();
         let plan = self.plan();
-        let Settings { batch, accumulate, voxel_origin, .. } = self.settings;
+        let Settings { batch, accumulate, voxel_origin: origin, quality, .. } = self.settings;
         let plan: Vec<&[Example]> = plan.chunks(batch).skip(self.batch as usize).collect();
         let mut volumes = 0;
         let mut learning_rate = 0.0;
         // Out of the way of what the steps change; back in its place before anything is returned.
         let dataset = std::mem::replace(&mut self.dataset, Dataset::none());
         let mut teacher = self.teacher.take();
-        let answers_of = teacher.as_mut();
-        let done: Result<bool, TrainError> = read_ahead(&dataset, &plan, voxel_origin, answers_of, |mut batches| {
+        let answers = teacher.as_mut();
+        let done: Result<bool, TrainError> = read_ahead(&dataset, &plan, origin, quality, answers, |mut batches| {
             let mut left = plan.len();
             while left > 0 {
                 if stop.load(Ordering::Relaxed) {
@@ -329,8 +329,9 @@ impl Trainer {
     /// The loss over the scenes held out, as they are; none if there are none.
     fn validate(&self) -> Result<Option<Validation>, TrainError> {
         let scenes: Vec<_> = self.validation.iter().map(|&scene| Example { scene, ..Example::default() }).collect();
-        let plan: Vec<&[Example]> = scenes.chunks(self.settings.batch).collect();
-        read_ahead(&self.dataset, &plan, self.settings.voxel_origin, None, |batches| {
+        let Settings { batch, voxel_origin, quality, .. } = self.settings;
+        let plan: Vec<&[Example]> = scenes.chunks(batch).collect();
+        read_ahead(&self.dataset, &plan, voxel_origin, quality, None, |batches| {
             let mut sums = Sums::default();
             for batch in batches {
                 if let Some(loss) = no_grad(|| self.loss(&batch?))? {

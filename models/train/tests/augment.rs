@@ -2,7 +2,7 @@
 
 mod support;
 
-use grasp_data::Trial;
+use grasp_data::{MAX_CLEARANCE, Trial};
 use grasp_train::{Augmentation, Transform};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion};
 use rand::{RngExt, SeedableRng};
@@ -17,7 +17,9 @@ fn random_trial(rng: &mut ChaCha8Rng) -> Trial {
         rng.random_range(-1.5..1.5),
         rng.random_range(-3.0..3.0),
     );
-    Trial { position, rotation, width: 5.0, success: true, turns: rng.random::<u8>() & 0b1_1110 }
+    let turns = rng.random::<u8>() & 0b1_1110;
+    let (share, clearance) = (rng.random(), rng.random_range(0.0..MAX_CLEARANCE));
+    Trial { position, rotation, width: 5.0, success: true, turns, share, clearance }
 }
 
 /// Points that fix a grasp up to its symmetry: the finger base and the two fingertips. One of its own, then one for each
@@ -56,7 +58,9 @@ fn a_changed_label_is_the_label_of_the_changed_scene() {
         let trial = random_trial(&mut rng);
         for (transform, expected) in moves {
             let moved: Vec<_> = points(&trial).into_iter().map(|grasp| grasp.map(expected)).collect();
-            let got = points(&transform.trial(&trial, N));
+            let changed = transform.trial(&trial, N);
+            assert_eq!((changed.share, changed.clearance), (trial.share, trial.clearance), "room to spare stays");
+            let got = points(&changed);
             assert!(same(got[0], moved[0]), "{transform:?}: {:?} instead of {:?}", got[0], moved[0]);
             assert_eq!(got.len(), moved.len());
             assert!(moved.iter().all(|moved| got.iter().any(|got| same(*got, *moved))), "{transform:?}: {got:?}");

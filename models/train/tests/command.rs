@@ -82,6 +82,7 @@ fn fine_tuning_follows_the_network_it_starts_from() {
         let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
         let settings: serde_json::Value = serde_json::from_str(&metadata.provenance["settings"]).unwrap();
         assert_eq!((&settings["batch"], &settings["learning_rate"]), (&batch.into(), &learning_rate.into()), "{from}");
+        assert_eq!(settings["quality"], "label", "{from}");
     }
 }
 
@@ -96,6 +97,10 @@ fn a_run_goes_on_where_it_stopped() {
     assert_eq!(weights("whole.onnx"), weights("parts.onnx"));
     let lines = |name: &str| fs::read_to_string(folder.path().join(name)).unwrap().lines().count();
     assert_eq!((lines("whole.jsonl"), lines("parts.jsonl")), (3, 3));
+    let other = train(folder.path(), "--out parts.onnx --epochs 4 --name x --resume --quality share");
+    let said = said(&other);
+    assert!(!other.status.success() && said.contains("give the same options"), "{said}");
+    assert!(said.contains(r#""quality":"label""#) && said.contains(r#""quality":"share""#), "{said}");
 }
 
 #[test]

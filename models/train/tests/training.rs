@@ -9,8 +9,8 @@ use grasp_data::{Dataset, Setup, Trial, packed};
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Architecture, Metadata, Network, Options, Orientation};
 use grasp_train::{
-    Augmentation, Checkpoint, CheckpointError, Epoch, Execution, Executor, Outputs, Record, Settings, Targets, Teacher,
-    TrainError, Trainer, Weights,
+    Augmentation, Checkpoint, CheckpointError, Epoch, Execution, Executor, Outputs, Quality, Record, Settings, Targets,
+    Teacher, TrainError, Trainer, Weights,
 };
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use tch::{Device, Kind, Tensor};
@@ -32,6 +32,7 @@ fn settings() -> Settings {
         validation: 0.0,
         augmentation: Augmentation::default(),
         balance: false,
+        quality: Quality::Label,
         rotation_weight: 1.0,
         voxel_origin: VoxelOrigin::Center,
         bf16: false,
@@ -266,10 +267,13 @@ fn a_checkpoint_of_another_run_is_refused() {
     let refused = |error| matches!(error, Err(TrainError::Checkpoint(CheckpointError::Settings { .. })));
     let mut other = trainer(dataset(), &Settings { seed: 6, ..settings() }, EXECUTION);
     assert!(refused(other.resume(&checkpoint)));
-    let (mut relabelled, mut renamed) = (scenes(), scenes());
+    let mut other = trainer(dataset(), &Settings { quality: Quality::Share, ..settings() }, EXECUTION);
+    assert!(refused(other.resume(&checkpoint)));
+    let (mut relabelled, mut shared, mut renamed) = (scenes(), scenes(), scenes());
     relabelled[3].trials[0].width += 0.5;
+    shared[3].trials[0].share = 0.5;
     "other".clone_into(&mut renamed[3].id);
-    for scenes in [relabelled, renamed] {
+    for scenes in [relabelled, shared, renamed] {
         let mut other = trainer(Dataset::of(scenes).unwrap(), &settings(), EXECUTION);
         assert!(refused(other.resume(&checkpoint)), "as many scenes, but others");
     }
@@ -313,10 +317,12 @@ fn the_loss_is_the_papers() {
         width: 4.0,
         success: true,
         turns: 0,
+        share: 1.0,
+        clearance: 0.0,
     };
     let mut targets = Targets::default();
-    targets.push(1, &label, n, VoxelOrigin::Center);
-    targets.push(0, &Trial { success: false, ..label }, n, VoxelOrigin::Center);
+    targets.push(1, &label, n, VoxelOrigin::Center, Quality::Label);
+    targets.push(0, &Trial { success: false, ..label }, n, VoxelOrigin::Center, Quality::Label);
     assert_eq!(targets.len(), 2);
 
     // The same rotation, turned by 180° about the approach, with either sign, costs nothing.
@@ -335,7 +341,7 @@ fn the_loss_is_the_papers() {
     // A turn that holds, too, is as good.
     let turns = |k: u8| {
         let mut targets = Targets::default();
-        targets.push(0, &Trial { turns: 1 << k, ..label }, n, VoxelOrigin::Center);
+        targets.push(0, &Trial { turns: 1 << k, ..label }, n, VoxelOrigin::Center, Quality::Label);
         targets
     };
     let turned = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), 2.0 * std::f64::consts::PI / 5.0);
@@ -359,6 +365,55 @@ fn the_loss_is_the_papers() {
 }
 
 #[test]
+fn the_quality_is_learnt_from_the_label_or_from_the_share() {
+    let label = Trial {
+        position: Point3::new(0.5, 0.5, 0.5),
+        rotation: UnitQuaternion::identity(),
+        width: 4.0,
+        success: true,
+        turns: 0,
+        share: 0.5,
+        clearance: 0.0,
+    };
+    let sums = |choice: Quality, quality: f32| {
+        let mut targets = Targets::default();
+        for trial in [label, Trial { position: Point3::new(1.5, 0.5, 0.5), ..label }] {
+            targets.push(0, &trial, 2, VoxelOrigin::Center, choice);
+        }
+        let weights = Weights { classes: [1.0, 3.0], rotation: 2.0 };
+        targets.loss(&outputs(quality, [1.0, 0.0, 0.0, 0.0], 6.0), &weights).unwrap().sums
+    };
+    let least = |choice: Quality| {
+        let loss = |percent: &i32| sums(choice, *percent as f32 / 100.0).loss();
+        (1..100).min_by(|a, b| loss(a).total_cmp(&loss(b))).unwrap()
+    };
+    assert_eq!((least(Quality::Share), least(Quality::Label)), (50, 99));
+
+    let (share, whole) = (sums(Quality::Share, 0.8), sums(Quality::Label, 0.8));
+    // Both voxels weigh as successes do.
+    let expected = -3.0 * (0.8_f64.ln() + 0.2_f64.ln());
+    assert!((share.quality - expected).abs() < 1e-5, "{}", share.quality);
+    assert!(share.rotation > 1.0 && share.width > 0.1);
+    assert_eq!((share.rotation, share.width), (whole.rotation, whole.width), "a success counts for one");
+    assert_eq!((share.accuracy(), share.recall()), (1.0, 1.0), "what succeeded is decided by the label");
+}
+
+#[test]
+fn a_run_learns_the_share() {
+    let mut scenes: Vec<_> = (0..8).map(|seed| support::scene(seed, N)).collect();
+    scenes.iter_mut().for_each(|scene| scene.trials[0].share = 0.5);
+    let last_loss = |quality: Quality| {
+        let settings = Settings { quality, batch: 8, learning_rate: 1e-3, warmup: 10, ..settings() };
+        let mut trainer = trainer(Dataset::of(scenes.clone()).unwrap(), &settings, EXECUTION);
+        (0..80).map(|_| epoch(&mut trainer)).last().unwrap().loss_quality
+    };
+    let (label, share) = (last_loss(Quality::Label), last_loss(Quality::Share));
+    // Half of the voxels are successes, of which no better is to be had than ln 2.
+    let least = 0.5 * std::f64::consts::LN_2;
+    assert!(label < 0.05 && (least - 1e-4..least + 0.05).contains(&share), "{label}, {share}");
+}
+
+#[test]
 fn a_grasp_stands_for_the_voxel_of_its_convention() {
     let at = |x: f64, y: f64, z: f64| Trial {
         position: Point3::new(x, y, z),
@@ -366,11 +421,13 @@ fn a_grasp_stands_for_the_voxel_of_its_convention() {
         width: 4.0,
         success: true,
         turns: 0,
+        share: 1.0,
+        clearance: 0.0,
     };
     let cell = |x: i64, y: i64, z: i64| (x * 4 + y) * 4 + z;
     let cells = |label: &Trial, origin| {
         let mut targets = Targets::default();
-        targets.push(2, label, 4, origin);
+        targets.push(2, label, 4, origin, Quality::Label);
         targets.cells().iter().map(|cell| cell - 2 * 64).collect::<Vec<_>>()
     };
     assert_eq!(cells(&at(1.2, 0.7, 3.4), VoxelOrigin::Center), [cell(1, 0, 3)]);

@@ -66,8 +66,9 @@ impl Convert {
                     .iter()
                     .filter(inside)
                     .map(|trial| Trial {
-                        turns: trial.turns,
-                        ..Trial::new(&trial.grasp(1.0), trial.success, voxel_size)
+                        position: trial.position / voxel_size,
+                        width: trial.width / voxel_size,
+                        ..*trial
                     })
                     .collect();
                 dropped += trials.len() - kept.len();

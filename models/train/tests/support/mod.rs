@@ -18,12 +18,14 @@ pub fn scene(seed: u64, n: usize) -> Scene {
     let down = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
     let at = |fraction: f64| Point3::from(std::array::from_fn(|axis| low[axis] as f64 + fraction * size[axis] as f64));
     let width = size[0].min(size[1]) as f64;
+    let (position, rotation) = (at(-0.3), yaw);
+    let failure = Trial { position, rotation, width: 10.0, success: false, turns: 0, share: 0.0, clearance: 0.0 };
     Scene {
         id: format!("{seed:06x}"),
         volumes: vec![(0..n.pow(3)).map(value).collect()],
         trials: vec![
-            Trial { position: at(0.5), rotation: yaw * down, width, success: true, turns: 0 },
-            Trial { position: at(-0.3), rotation: yaw, width: 10.0, success: false, turns: 0 },
+            Trial { position: at(0.5), rotation: yaw * down, width, success: true, share: 1.0, ..failure },
+            failure,
         ],
     }
 }
