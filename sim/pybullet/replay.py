@@ -176,7 +176,7 @@ def scenes(path: Path) -> list[dict[str, Any]]:
         try:
             scene = json.loads(line)
         except json.JSONDecodeError as mistake:
-            raise ValueError(f"{path}, line {number} is not JSON ({mistake}): export it anew") from None
+            raise ValueError(f"{path}, line {number} is not JSON ({mistake}): export it again") from None
         if not {"scene", "objects", "trials"} <= set(scene):
             raise ValueError(f"{path}, line {number} lacks scene, objects or trials: was it written by --export?")
         read.append(scene)

@@ -214,20 +214,20 @@ class CommandTest(unittest.TestCase):
             f"python3 sim/pybullet/clear.py --objects objects --planner grpc:{server.grpc} --rounds 2 --seed 3 "
             "--jobs 2 --attempts attempts.jsonl --pictures pictures --out summary.json"
         )
-        told = self.last(printed)
-        self.assertEqual(told, json.loads((self.folder / "summary.json").read_text()))
+        report = self.last(printed)
+        self.assertEqual(report, json.loads((self.folder / "summary.json").read_text()))
         attempts = [json.loads(line) for line in (self.folder / "attempts.jsonl").read_text().splitlines()]
-        self.assertEqual((told["rounds"], told["attempts"]), (2, len(attempts)))
-        self.assertEqual(told["successes"], sum(attempt["success"] for attempt in attempts))
-        self.assertEqual(told["rose"], sum(attempt["rose"] for attempt in attempts))
-        self.assertTrue(told["rose"] <= told["successes"] <= told["objects"] <= 10)
-        self.assertAlmostEqual(told["gsr"], told["successes"] / max(told["attempts"], 1))
-        self.assertAlmostEqual(told["dr"], told["successes"] / told["objects"])
-        failures = [told[name] for name in ["blocked_at_pregrasp", "closed_on_nothing", "lost_in_lift"]]
-        self.assertEqual(sum(failures) + told["successes"], told["attempts"])
-        endings = [told[name] for name in ["cleared", "nothing_seen", "nothing_proposed", "gave_up"]]
+        self.assertEqual((report["rounds"], report["attempts"]), (2, len(attempts)))
+        self.assertEqual(report["successes"], sum(attempt["success"] for attempt in attempts))
+        self.assertEqual(report["rose"], sum(attempt["rose"] for attempt in attempts))
+        self.assertTrue(report["rose"] <= report["successes"] <= report["objects"] <= 10)
+        self.assertAlmostEqual(report["gsr"], report["successes"] / max(report["attempts"], 1))
+        self.assertAlmostEqual(report["dr"], report["successes"] / report["objects"])
+        failures = [report[name] for name in ["blocked_at_pregrasp", "closed_on_nothing", "lost_in_lift"]]
+        self.assertEqual(sum(failures) + report["successes"], report["attempts"])
+        endings = [report[name] for name in ["cleared", "nothing_seen", "nothing_proposed", "gave_up"]]
         self.assertEqual(sum(endings), 2)
-        self.assertEqual(told["seeds"]["gsr"]["each"], [told["gsr"]])
+        self.assertEqual(report["seeds"]["gsr"]["each"], [report["gsr"]])
         self.assertEqual(len(list((self.folder / "pictures").glob("packed-3-*.png"))), len(attempts))
         self.assertTrue(all(attempt["quality"] >= 0.5 and attempt["round"] < 2 for attempt in attempts))
 
@@ -253,12 +253,12 @@ class CommandTest(unittest.TestCase):
 
     def test_what_the_readme_says_is_true(self):
         printed = [self.run_sh(code) for language, code in self.blocks(SIMULATOR / "README.md") if language == "sh"]
-        told = self.last(printed[-1])
+        report = self.last(printed[-1])
         for label in ["success_kept", "failure_kept"]:
-            self.assertTrue(0 < told[label]["n"] <= 20 and 0 <= told[label]["percent"] <= 100, told)
-            low, high = told[label]["interval"]
-            self.assertTrue(low <= told[label]["percent"] <= high)
-        self.assertEqual(told["scenes"], 2)
+            self.assertTrue(0 < report[label]["n"] <= 20 and 0 <= report[label]["percent"] <= 100, report)
+            low, high = report[label]["interval"]
+            self.assertTrue(low <= report[label]["percent"] <= high)
+        self.assertEqual(report["scenes"], 2)
         # Where contacts are allowed, what was executed counts before the label.
         scenes = [json.loads(line) for line in (self.folder / "labels.jsonl").read_text().splitlines()]
         for scene in scenes:
