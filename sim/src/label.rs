@@ -227,7 +227,7 @@ fn try_point(world: &World, cloud: &[SurfacePoint], rng: &mut impl Rng) -> Point
     let best = middle_of_widest_run(&lifted).and_then(|yaw| widths[yaw].map(|width| (yaw, width)));
     let (yaw, width) = best.unwrap_or((0, MAX_OPENING));
     let quality = if best.is_some() { 1.0 } else { 0.0 };
-    // Nothing is tried again yet.
+    // A grasp is tried once, and its clearance is not measured: 0 says that it is not known.
     let (share, clearance) = (quality as f32, 0.0);
     Point { grasp: Grasp { pose: turned(yaw), width, quality }, yaw, lifted, share, clearance, object }
 }

@@ -138,8 +138,8 @@ struct Training {
     #[arg(long)]
     balance: bool,
     /// What the quality is learnt from: label, whether a grasp held, or share, the share of its tries with small pose
-    /// errors that held, a probability. Where the data have no shares, both are the same. Rotation and width do not depend
-    /// on it.
+    /// errors that held, a probability. Where each grasp was tried once, as `grasp-sim label` does, both are the same.
+    /// Rotation and width do not depend on it.
     #[arg(long, value_enum, default_value_t = Target::Label)]
     quality: Target,
     /// What the rotation counts for in the loss, against quality and width.
