@@ -37,13 +37,14 @@ impl Recipe {
     #[must_use]
     pub fn candidates(&self, index: u64) -> Candidates {
         let mut rng = self.rng(index);
-        let world = self.scene(&mut rng);
+        let mut world = self.scene(&mut rng);
+        world.sleep();
         let cloud = Cloud::new(sights(&observe(&world, &self.views, self.noise, &mut rng)));
         let found = candidates(&cloud, &params(), &mut rng);
         let chosen = index::sample(&mut rng, found.len(), self.points.min(found.len()));
         let mut tried = Candidates::default();
         for candidate in chosen.into_iter().map(|chosen| &found[chosen]) {
-            let success = trial::label(&world, &candidate.pose).is_success();
+            let success = trial::label(&world, &candidate.pose, 0.0).is_success();
             tried.push(index, &Image::of(&cloud, candidate), success);
         }
         tried

@@ -8,6 +8,7 @@ mod label;
 mod look;
 mod merge;
 mod objects;
+mod replay;
 mod stats;
 mod tables;
 
@@ -35,6 +36,8 @@ pub enum Command {
     Merge(merge::Merge),
     /// Count what is in a data set.
     Stats(stats::Stats),
+    /// Try exported grasps again, also those of another simulator.
+    Replay(replay::Replay),
     /// Draw objects, or write them as URDF and OBJ.
     Objects(objects::Objects),
     /// Make scenes, fit the hand to what is seen of them, try it, and write images and labels for GPD's classifier.
@@ -56,6 +59,7 @@ impl Command {
             Self::Convert(command) => command.run(),
             Self::Merge(command) => command.run(),
             Self::Stats(command) => command.run(),
+            Self::Replay(command) => command.run(),
             Self::Objects(command) => command.run(),
             Self::Candidates(command) => command.run(),
             Self::Bench(command) => command.run(),

@@ -5,11 +5,11 @@
 //! were tried `yaws`, what came of each, and `yaw`, which of them `pose` has. Yaw k is k · 36° about the grasp's z. A pose
 //! is `[x, y, z, qx, qy, qz, qw]` in the task frame, metres.
 //!
-//! `share` is the share of the tries of `pose` that held, in [0, 1]: 0 of a failure, 1 of a success that was not tried
-//! again. `clearance` is the smallest distance between the open hand on its way to `pose` and the objects, metres, at most
-//! 0.02; 0 where it is not known. `executed`, where it was tried, is 1 if the grasp of `pose`, executed as in evaluation
-//! (the hand closes where its approach met something), lifted an object, else 0; for `label` an approach that met something
-//! is a failure. Older files have none of the three.
+//! `share` is the share of the tries of `pose` that held, in [0, 1], and `clearance` the smallest distance between the open
+//! hand on its way to `pose` and the objects, metres, at most 0.02. `executed`, where `grasp-sim replay` or another
+//! simulator has written it, is 1 if the grasp of `pose`, executed as in evaluation (the hand closes where its approach met
+//! something), lifted an object, else 0; for `label` an approach that met something is a failure. Older files have none of
+//! the three.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, BufRead, BufReader, Seek, SeekFrom, Write};

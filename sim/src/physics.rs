@@ -4,7 +4,9 @@
 //! a grasp its collision code loses millimetres when it counts in metres.
 
 mod gripper;
+mod hand;
 mod world;
 
-pub use gripper::{Gripper, HandBox, OPEN_HAND};
-pub use world::{Body, BodyId, STEPS_PER_SECOND, World};
+pub use gripper::Gripper;
+pub use hand::{HandPart, OPEN_HAND};
+pub use world::{Body, BodyId, CONTACT_GAP, STEPS_PER_SECOND, World};

@@ -1,10 +1,11 @@
 //! One grasp, tried: pre-grasp, approach, close, lift.
 
 use std::f64::consts::FRAC_PI_3;
+use std::sync::LazyLock;
 
 use nalgebra::{Isometry3, Translation3, Vector3};
 
-use crate::physics::{BodyId, Gripper, OPEN_HAND, STEPS_PER_SECOND, World};
+use crate::physics::{BodyId, CONTACT_GAP, Gripper, HandPart, OPEN_HAND, STEPS_PER_SECOND, World};
 
 /// Distance of the pre-grasp from the grasp along the approach, metres.
 pub const PREGRASP_DISTANCE: f64 = 0.05;
@@ -12,11 +13,8 @@ pub const PREGRASP_DISTANCE: f64 = 0.05;
 /// Height of the lift, metres.
 const LIFT: f64 = 0.1;
 
-/// Speed of the lift, m/s.
-const LIFT_SPEED: f64 = 0.1;
-
-/// Time in which the lift gains its speed, seconds.
-const LIFT_RAMP: f64 = 0.05;
+/// Speed of the lift, m/s: the reference's hand makes 2 mm in 4 steps of 1/240 s.
+const LIFT_SPEED: f64 = 0.12;
 
 /// Opening below which the hand holds nothing: a tenth of its greatest (VGN).
 const EMPTY_WIDTH: f64 = 0.1 * grasp::MAX_OPENING;
@@ -26,6 +24,13 @@ const LOOK: u32 = STEPS_PER_SECOND / 20;
 
 /// Step of the approach, metres.
 const APPROACH_STEP: f64 = 0.002;
+
+/// How far the hand is behind its target on its approach, metres: what Bullet's constraint leaves of steps of 2 mm.
+const LAG: f64 = 0.0014;
+
+/// The way of the open hand from the pre-grasp to the grasp.
+static WAY: LazyLock<Vec<HandPart>> =
+    LazyLock::new(|| OPEN_HAND.iter().map(|part| part.swept(PREGRASP_DISTANCE)).collect());
 
 /// What became of a grasp.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -37,7 +42,7 @@ pub enum Outcome {
         /// Opening, metres.
         width: f64,
     },
-    /// The open hand collided at the pre-grasp.
+    /// The open hand touched something where it appeared, and what it closed on there was not lifted.
     BlockedAtPregrasp,
     /// The open hand collided on its way to the grasp, where that counts as a failure.
     BlockedOnApproach,
@@ -67,36 +72,50 @@ impl Outcome {
     }
 }
 
-/// Tries a grasp as training data is labelled: any contact on the way is a failure. `world` is left as it was.
+/// Tries a grasp as training data is labelled: any contact on the way, of a hand that is swollen by `swell` metres a side,
+/// is a failure. `world` is left as it was.
 #[must_use]
-pub fn label(world: &World, grasp: &Isometry3<f64>) -> Outcome {
+pub fn label(world: &World, grasp: &Isometry3<f64>, swell: f64) -> Outcome {
     // One test of the swept hand stands for the pre-grasp and every step of the approach.
-    if world.collides(&OPEN_HAND.map(|part| part.swept(PREGRASP_DISTANCE)), grasp) {
+    if world.is_near(&WAY, grasp, CONTACT_GAP + swell) {
         return Outcome::BlockedOnApproach;
     }
     close_and_lift(&mut world.clone(), grasp, grasp)
 }
 
+/// How much room the open hand has on its way to a grasp: the distance of the nearest object's mesh, at most `limit`,
+/// metres.
+#[must_use]
+pub fn clearance(world: &World, grasp: &Isometry3<f64>, limit: f64) -> f64 {
+    world.clearance(&WAY, grasp, limit)
+}
+
 /// Executes a grasp as in evaluation: the hand closes where its approach met something, and how far from the grasp that
 /// was is the second answer, metres. A lifted object is still in the hand's place in `world`; the caller decides what
 /// becomes of it.
+///
+/// As in the reference, a hand that touches something where it appears closes there, and if it appears in something it is
+/// pushed out; only a failure is then called [`BlockedAtPregrasp`](Outcome::BlockedAtPregrasp).
 pub fn execute(world: &mut World, grasp: &Isometry3<f64>) -> (Outcome, f64) {
     let at = |distance: f64| grasp * Translation3::new(0.0, 0.0, -distance);
-    if world.collides(&OPEN_HAND, &at(PREGRASP_DISTANCE)) {
-        return (Outcome::BlockedAtPregrasp, PREGRASP_DISTANCE);
-    }
     let steps = (PREGRASP_DISTANCE / APPROACH_STEP).round() as u32;
-    let short_by = (1..=steps)
-        .map(|step| PREGRASP_DISTANCE - f64::from(step) * APPROACH_STEP)
-        .take_while(|&distance| !world.collides(&OPEN_HAND, &at(distance)))
-        .last()
-        .unwrap_or(PREGRASP_DISTANCE);
-    (close_and_lift(world, &at(short_by), grasp), short_by)
+    let touched_in = (1..=steps).find(|&step| world.is_near(&OPEN_HAND, &at(distance_after(step) + LAG), CONTACT_GAP));
+    let short_by = touched_in.map_or(0.0, distance_after);
+    match close_and_lift(world, &at(short_by), grasp) {
+        outcome if touched_in == Some(1) && !outcome.is_success() => (Outcome::BlockedAtPregrasp, short_by),
+        outcome => (outcome, short_by),
+    }
+}
+
+/// From the grasp after so many steps of the approach.
+fn distance_after(step: u32) -> f64 {
+    PREGRASP_DISTANCE - f64::from(step) * APPROACH_STEP
 }
 
 /// Closes the hand at `start` and lifts it to where a lift from `grasp` ends.
 fn close_and_lift(world: &mut World, start: &Isometry3<f64>, grasp: &Isometry3<f64>) -> Outcome {
-    let mut gripper = Gripper::insert(world, start);
+    let behind = start * Translation3::new(0.0, 0.0, -LAG);
+    let mut gripper = Gripper::insert(world, &behind, start);
     let outcome = match close(world, &mut gripper) {
         Some(()) => lift(world, &mut gripper, start, grasp),
         None => Outcome::ClosedOnNothing,
@@ -105,7 +124,7 @@ fn close_and_lift(world: &mut World, start: &Isometry3<f64>, grasp: &Isometry3<f
     outcome
 }
 
-/// Closes until the width is still for 0.1 s, or 0.5 s at the longest. `None` if nothing is held then.
+/// Closes until the width is still for 50 ms, or 0.5 s at the longest. `None` if nothing is held then.
 fn close(world: &mut World, gripper: &mut Gripper) -> Option<()> {
     const STILL: f64 = 1e-5;
     let mut still_since = 0;
@@ -116,7 +135,7 @@ fn close(world: &mut World, gripper: &mut Gripper) -> Option<()> {
         let now = gripper.width(world);
         if (now - width).abs() > STILL {
             still_since = step;
-        } else if step - still_since >= STEPS_PER_SECOND / 10 {
+        } else if step - still_since >= STEPS_PER_SECOND / 20 {
             break;
         }
         width = now;
@@ -127,13 +146,10 @@ fn close(world: &mut World, gripper: &mut Gripper) -> Option<()> {
 fn lift(world: &mut World, gripper: &mut Gripper, start: &Isometry3<f64>, grasp: &Isometry3<f64>) -> Outcome {
     let target = grasp.translation.vector + retreat(grasp) * LIFT;
     let path = target - start.translation.vector;
-    let direction = path.normalize();
-    let duration = path.norm() / LIFT_SPEED + LIFT_RAMP / 2.0;
-    let steps = (duration * f64::from(STEPS_PER_SECOND)).round() as u32;
+    let steps = (path.norm() / LIFT_SPEED * f64::from(STEPS_PER_SECOND)).round() as u32;
+    gripper.set_velocity(world, &(path.normalize() * LIFT_SPEED));
     let mut carried = None;
     for step in 1..=steps {
-        let ramp = (f64::from(step) / f64::from(STEPS_PER_SECOND) / LIFT_RAMP).min(1.0);
-        gripper.set_velocity(world, &(direction * LIFT_SPEED * ramp));
         gripper.close(world);
         world.step();
         if step % LOOK == 0 {
@@ -169,10 +185,10 @@ impl Carried {
         Some(Self { object, pose: gripper.pose(world).inv_mul(&world.pose(object)) })
     }
 
-    /// Whether what creeps now would not have crept a millimetre, or turned three degrees, when the lift ends.
+    /// Whether what creeps now would not have crept 3 mm, or turned nine degrees, when the lift ends.
     fn hangs_still(&self, before: &Self) -> bool {
-        const CREEP: f64 = 4e-5;
-        const TURN: f64 = 2e-3;
+        const CREEP: f64 = 2e-4;
+        const TURN: f64 = 1e-2;
         let moved = before.pose.inv_mul(&self.pose);
         self.object == before.object && moved.translation.vector.norm() < CREEP && moved.rotation.angle() < TURN
     }

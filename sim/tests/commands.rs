@@ -162,7 +162,10 @@ fn an_export_can_be_replayed() {
         for (exported, trial) in line.trials.iter().zip(data.trials(index)) {
             let grasp = trial.grasp(0.3 / 40.0);
             assert_eq!(exported.label == 1, trial.success);
-            assert_eq!(exported.yaws.contains(&1), trial.success);
+            let held = exported.yaws.contains(&1);
+            assert_eq!(exported.yaws[exported.yaw] == 1, held, "the yaw to learn held, if any did");
+            assert_eq!(exported.share > 0.0, held, "its first try is one of those that the share counts");
+            assert_eq!(exported.share > 0.7, trial.success, "at most one of the tries of a success failed");
             assert_eq!((exported.share, exported.clearance), (trial.share, trial.clearance));
             assert!((exported.width - grasp.width).abs() < 1e-6);
             let position = grasp.pose.translation.vector;
@@ -170,6 +173,14 @@ fn an_export_can_be_replayed() {
             assert!(exported.object.is_some_and(|object| object < line.objects.len()));
         }
     }
+    // The very scenes again: what held as it was, holds.
+    let all = lines.iter().map(|line| line.trials.len()).sum::<usize>();
+    let replayed = desk.run("replay scenes.jsonl --objects objects --contact forbid --out replayed.jsonl");
+    let report: Value = serde_json::from_str(replayed.trim()).unwrap();
+    let count = |key: &str| report[key].as_u64().unwrap() as usize;
+    assert_eq!(count("successes") + count("failures"), all);
+    assert!(count("successes") > 0 && count("successes_kept") * 10 >= count("successes") * 8, "{report}");
+    assert_eq!(export::read(&desk.path("replayed.jsonl")).unwrap().len(), lines.len());
 }
 
 #[test]

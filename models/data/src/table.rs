@@ -206,9 +206,6 @@ impl Row {
         if !(0.0..=1.0).contains(&share) {
             return Err(format!("share is {share}, must be from 0 to 1"));
         }
-        if !success && share != 0.0 {
-            return Err(format!("share is {share} although label is 0: a failure's must be 0"));
-        }
         let clearance = clearance.unwrap_or(0.0);
         if !(0.0..=MAX_CLEARANCE).contains(&clearance) {
             return Err(format!("clearance is {clearance}, must be from 0 to {MAX_CLEARANCE} metres"));

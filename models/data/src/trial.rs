@@ -21,8 +21,8 @@ pub struct Trial {
     /// Of a success: which turns about its approach held too, bit k for k/[`TURNS`] of half a turn, from 1 on. None in the
     /// forms of VGN and GIGA, which do not say.
     pub turns: u8,
-    /// The share of the tries that held, in [0, 1], when a success was tried several times with small errors of its pose.
-    /// Of a failure 0; of a success that was not tried again 1.
+    /// The share of the tries that held, in [0, 1]. Where the first held, it was tried again with small errors of its pose,
+    /// and is a success if it nearly always held. Of a grasp that was tried once 1 or 0.
     pub share: f32,
     /// The smallest distance between the open hand on its way to the grasp and the objects, up to [`MAX_CLEARANCE`]; 0
     /// where it is not known, or the hand touches something. In metres in every form, for it is of the hand and the

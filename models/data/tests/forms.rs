@@ -295,7 +295,6 @@ fn what_cannot_be_read_is_named() {
         ("00000001,0,0,0,1,one,2,3,4,1,1,0".to_owned(), "line 4:"),
         ("00000001,0,0,0,1,1,2,3,4,1,1.5,0".to_owned(), "line 4: share is 1.5, must be from 0 to 1"),
         ("00000001,0,0,0,1,1,2,3,4,1,nan,0".to_owned(), "line 4: share is NaN"),
-        ("00000001,0,0,0,1,1,2,3,4,0,0.5,0".to_owned(), "line 4: share is 0.5 although label is 0"),
         ("00000001,0,0,0,1,1,2,3,4,1,1,0.03".to_owned(), "line 4: clearance is 0.03, must be from 0 to 0.02 metres"),
         ("00000001,0,0,0,1,1,2,3,4,1,1,-0.01".to_owned(), "line 4: clearance is -0.01"),
         ("00000001,0,0,0,1,1,2,3,4,1,1,".to_owned(), "line 4:"),

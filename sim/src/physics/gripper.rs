@@ -1,91 +1,58 @@
 use nalgebra::{Isometry3, Point3, Translation3, Vector3};
 use rapier3d::math::{AngVector, Vector};
 use rapier3d::prelude::{
-    ColliderBuilder, ColliderHandle, GenericJoint, GenericJointBuilder, Group, ImpulseJointHandle, InteractionGroups,
-    InteractionTestMode, JointAxesMask, JointAxis, MotorModel, PrismaticJointBuilder, RigidBodyBuilder,
-    RigidBodyHandle, RigidBodyVelocity,
+    CoefficientCombineRule, ColliderBuilder, ColliderHandle, GenericJoint, GenericJointBuilder, Group,
+    ImpulseJointHandle, InteractionGroups, InteractionTestMode, JointAxesMask, JointAxis, MotorModel,
+    PrismaticJointBuilder, RigidBodyBuilder, RigidBodyHandle, RigidBodyVelocity,
 };
 
-use super::world::{SCALE, from_engine, to_engine, vector};
+use super::hand::{FINGER_TRAVEL, FINGERS, HandPart, PALM};
+use super::world::{MARGIN, SCALE, from_engine, to_engine, vector};
 use super::{BodyId, STEPS_PER_SECOND, World};
 
 /// Force with which each finger closes, newtons.
 const FINGER_FORCE: f64 = 20.0;
 
-/// Velocity gain of the fingers' motor, N·s/m: at rest against an object it pushes with [`FINGER_FORCE`].
-const MOTOR_DAMPING: f64 = 130.0;
+/// Velocity gain of the fingers' motor, N·s/m: at rest against an object it pushes with [`FINGER_FORCE`], free it closes
+/// with 0.5 m/s, about as fast as the reference's position control.
+const MOTOR_DAMPING: f64 = 40.0;
 
 /// How fast a finger that lags behind the other catches up, 1/s: the hand's gear keeps both at the same opening.
-const GEAR_GAIN: f64 = 60.0;
+const GEAR_GAIN: f64 = 195.0;
 
 /// Spinning friction of the fingers, metres: the torque about a contact's normal that a normal force of 1 N holds (the
 /// reference's hand: a soft pad does not let an object swing about the line between the fingers).
 const SPINNING_FRICTION: f64 = 0.1;
 
+/// By how much the collision shape of a finger is larger than its mesh, metres: [`MARGIN`], less what the reference's soft
+/// finger (30 kN/m) gives way under [`FINGER_FORCE`].
+const FINGER_MARGIN: f64 = MARGIN - FINGER_FORCE / 30_000.0;
+
+/// Friction of the fingers; an object's own is multiplied with it.
+const FINGER_FRICTION: f32 = 1.0;
+
+/// Friction of the palm (Bullet's for a link that states none).
+const PALM_FRICTION: f32 = 0.5;
+
 const FINGER_MASS: f32 = 0.15;
+const PALM_MASS: f32 = 0.81;
+
+/// The force with which the hand is held where it shall be, newtons: what is in its way for more pushes it off.
+const HOLDING_FORCE: f64 = 300.0;
+
+/// How fast the hand comes to where it shall be, 1/s: Bullet's constraint takes 20 % of the way in a step of 1/240 s.
+const HOLDING_RATE: f32 = 53.6;
+
+/// Engine units. Enough that the hand gives way by [`HOLDING_FORCE`] alone.
+const HOLDING_DAMPING: f32 = 1e4;
+
 /// Engine units. Enough that a brake gives way by its greatest torque alone.
 const BRAKE_DAMPING: f32 = 1e7;
 
-const FINGER_TRAVEL: f64 = grasp::MAX_OPENING / 2.0;
-
-/// A box of the hand in the grasp frame, metres: the frame's z is the approach, ±y the closing axis.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct HandBox {
-    /// Smallest coordinates.
-    pub lower: [f64; 3],
-    /// Largest coordinates.
-    pub upper: [f64; 3],
-}
-
-/// Height of the grasp frame above the Panda hand's own frame, along the approach (VGN's TCP).
-const TCP: f64 = 0.062;
-
-const FINGER: HandBox = HandBox { lower: [-0.0105, 0.0, 0.0584 - TCP], upper: [0.0105, 0.0264, 0.0584 + 0.0538 - TCP] };
-const PALM: HandBox = HandBox { lower: [-0.0316, -0.10, -0.026 - TCP], upper: [0.0316, 0.10, 0.066 - TCP] };
-
-/// The Panda hand, fully open: left finger (+y), right finger, palm.
-pub const OPEN_HAND: [HandBox; 3] = [FINGER.shifted(FINGER_TRAVEL), FINGER.mirrored().shifted(-FINGER_TRAVEL), PALM];
-
-impl HandBox {
-    const fn shifted(self, y: f64) -> Self {
-        Self {
-            lower: [self.lower[0], self.lower[1] + y, self.lower[2]],
-            upper: [self.upper[0], self.upper[1] + y, self.upper[2]],
-        }
-    }
-
-    const fn mirrored(self) -> Self {
-        Self {
-            lower: [self.lower[0], -self.upper[1], self.lower[2]],
-            upper: [self.upper[0], -self.lower[1], self.upper[2]],
-        }
-    }
-
-    /// The space swept when the box comes from `distance` metres back along the approach.
-    #[must_use]
-    pub const fn swept(self, distance: f64) -> Self {
-        Self { lower: [self.lower[0], self.lower[1], self.lower[2] - distance], upper: self.upper }
-    }
-
-    pub(super) fn centre(&self) -> Vector3<f64> {
-        (Vector3::from(self.lower) + Vector3::from(self.upper)) / 2.0
-    }
-
-    pub(super) fn half_extents(&self) -> Vector3<f64> {
-        (Vector3::from(self.upper) - Vector3::from(self.lower)) / 2.0
-    }
-
-    /// Height of the box's lowest corner when its frame stands at `pose`.
-    #[must_use]
-    pub fn lowest_point(&self, pose: &Isometry3<f64>) -> f64 {
-        let half = self.half_extents();
-        let down = pose.rotation.to_rotation_matrix().matrix().row(2).map(f64::abs);
-        (pose * Point3::from(self.centre())).z - (down * half)[0]
-    }
-}
-
-/// A free-floating Panda hand in a world: a palm that moves as it is told, and two fingers that push.
+/// A free-floating Panda hand in a world: a palm that is held at a target, and two fingers that push.
 pub struct Gripper {
+    /// The target, a body without a shape.
+    target: RigidBodyHandle,
     palm: RigidBodyHandle,
     fingers: [Finger; 2],
     /// A brake on the turning, about the closing axis, of each object that was touched.
@@ -101,12 +68,22 @@ struct Finger {
 }
 
 impl Gripper {
-    /// Puts an open hand into `world` with its grasp frame at `pose` (`T_task_grasp`).
+    /// Puts an open hand into `world` with its grasp frame at `pose`, on its way to `target` (both `T_task_grasp`).
     #[must_use]
-    pub fn insert(world: &mut World, pose: &Isometry3<f64>) -> Self {
+    pub fn insert(world: &mut World, pose: &Isometry3<f64>, target: &Isometry3<f64>) -> Self {
         world.grip();
-        let palm = world.bodies.insert(RigidBodyBuilder::kinematic_velocity_based().pose(to_engine(pose)));
-        insert_box(world, palm, &PALM, 0.0);
+        let target = world.bodies.insert(RigidBodyBuilder::kinematic_velocity_based().pose(to_engine(target)));
+        let palm = RigidBodyBuilder::dynamic().pose(to_engine(pose)).gravity_scale(0.0).can_sleep(false);
+        let palm = world.bodies.insert(palm);
+        insert_part(world, palm, &PALM, PALM_MASS, PALM_FRICTION, MARGIN);
+        let mut holder = GenericJointBuilder::new(JointAxesMask::ANG_AXES).contacts_enabled(false);
+        for axis in [JointAxis::LinX, JointAxis::LinY, JointAxis::LinZ] {
+            holder = holder
+                .motor_model(axis, MotorModel::ForceBased)
+                .motor_position(axis, 0.0, HOLDING_DAMPING * HOLDING_RATE, HOLDING_DAMPING)
+                .motor_max_force(axis, (HOLDING_FORCE * SCALE) as f32);
+        }
+        world.joints.insert(target, palm, holder.build(), true);
         let fingers = [1.0, -1.0].map(|side| {
             let offset = Vector3::new(0.0, side * FINGER_TRAVEL, 0.0);
             let body = RigidBodyBuilder::dynamic()
@@ -114,8 +91,8 @@ impl Gripper {
                 .gravity_scale(0.0)
                 .can_sleep(false);
             let body = world.bodies.insert(body);
-            let shape = if side > 0.0 { FINGER } else { FINGER.mirrored() };
-            let collider = insert_box(world, body, &shape, FINGER_MASS);
+            let part = &FINGERS[usize::from(side < 0.0)];
+            let collider = insert_part(world, body, part, FINGER_MASS, FINGER_FRICTION, FINGER_MARGIN);
             // Open at 0, closed at -travel: the joint's axis points outward.
             let joint = PrismaticJointBuilder::new(Vector::new(0.0, side as f32, 0.0))
                 .local_anchor1(vector(&(offset * SCALE)))
@@ -130,7 +107,7 @@ impl Gripper {
             let joint = world.joints.insert(palm, body, GenericJoint::from(joint), true);
             Finger { body, collider, joint, side }
         });
-        Self { palm, fingers, brakes: Vec::new() }
+        Self { target, palm, fingers, brakes: Vec::new() }
     }
 
     /// Lets the fingers push shut during the next step.
@@ -188,10 +165,10 @@ impl Gripper {
         touched
     }
 
-    /// Moves the palm at `velocity` (task frame, m/s) from the next step on.
+    /// Moves the target at `velocity` (task frame, m/s) from the next step on.
     pub fn set_velocity(&self, world: &mut World, velocity: &Vector3<f64>) {
         let velocity = RigidBodyVelocity { linvel: vector(&(velocity * SCALE)), angvel: AngVector::ZERO };
-        world.bodies[self.palm].set_vels(velocity, true);
+        world.bodies[self.target].set_vels(velocity, true);
     }
 
     /// Opening between the fingers, metres.
@@ -229,6 +206,7 @@ impl Gripper {
             world.remove_engine_body(finger.body);
         }
         world.remove_engine_body(self.palm);
+        world.remove_engine_body(self.target);
         world.release();
     }
 
@@ -243,14 +221,21 @@ impl Gripper {
     }
 }
 
-fn insert_box(world: &mut World, body: RigidBodyHandle, part: &HandBox, mass: f32) -> ColliderHandle {
+fn insert_part(
+    world: &mut World,
+    body: RigidBodyHandle,
+    part: &HandPart,
+    mass: f32,
+    friction: f32,
+    margin: f64,
+) -> ColliderHandle {
     // The parts of the hand pass through each other.
     let groups = InteractionGroups::new(Group::GROUP_2, !Group::GROUP_2, InteractionTestMode::And);
-    let half = part.half_extents() * SCALE;
-    let collider = ColliderBuilder::cuboid(half.x as f32, half.y as f32, half.z as f32)
-        .translation(vector(&(part.centre() * SCALE)))
+    let collider = ColliderBuilder::new(part.shape.clone())
         .mass(mass)
-        .friction(0.0)
+        .friction(friction)
+        .friction_combine_rule(CoefficientCombineRule::Multiply)
+        .contact_skin((margin * SCALE) as f32)
         .collision_groups(groups);
     world.colliders.insert_with_parent(collider, body, &mut world.bodies)
 }

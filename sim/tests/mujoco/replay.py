@@ -23,9 +23,9 @@ TCP = 0.062
 TRAVEL = 0.04
 FORCE = 20.0
 DAMPING = 130.0
-# Centre and half extents in the grasp frame; the fingers at their widest.
-FINGER = ([0.0, TRAVEL + 0.0132, 0.0584 + 0.0269 - TCP], [0.0105, 0.0132, 0.0269])
-PALM = ([0.0, 0.0, 0.02 - TCP], [0.0316, 0.10, 0.046])
+# Where the fingers' own frames are in the hand's, see hand.urdf.
+FINGER_ROOT = 0.0584
+HAND = Path(__file__).parents[2] / "hand"
 
 
 def parts_of(folder, name):
@@ -45,6 +45,13 @@ def parts_of(folder, name):
             used |= {int(corner.split("/")[0]) - 1 for corner in rest}
     parts = [np.array([vertices[i] for i in sorted(part)]) for part in [*parts, used] if part]
     return mass, float(friction.get("value")) if friction is not None else 1.0, parts
+
+
+def hand_part(name, side, offset):
+    """The corners of a part of the hand in the grasp frame; the right finger is the left one turned about z."""
+    lines = (HAND / name).read_text().splitlines()
+    corners = np.array([[float(number) for number in line.split()[1:4]] for line in lines if line.startswith("v ")])
+    return corners * [side, side, 1] + offset
 
 
 def numbers(values):
@@ -68,13 +75,16 @@ def scene_xml(folder, scene, hand_pose, axis):
             f"<freejoint/>{''.join(geoms)}</body>"
         )
     x, y, z, qx, qy, qz, qw = hand_pose
+    palm = hand_part("palm.obj", 1, [0, 0, -TCP])
+    assets.append(f'<mesh name="palm" vertex="{numbers(palm)}"/>')
     fingers = ""
     for side, name in [(1, "left"), (-1, "right")]:
-        centre, half = np.array(FINGER[0]) * [1, side, 1], FINGER[1]
+        finger = hand_part("finger.obj", side, [0, side * TRAVEL, FINGER_ROOT - TCP])
+        assets.append(f'<mesh name="{name}" vertex="{numbers(finger)}"/>')
         fingers += (
             f'<body name="{name}" gravcomp="1"><joint name="{name}" type="slide" axis="0 {side} 0" '
             f'range="{-TRAVEL} 0" limited="true" damping="{DAMPING}"/>'
-            f'<geom name="{name}" type="box" pos="{numbers(centre)}" size="{numbers(half)}" mass="0.15" '
+            f'<geom name="{name}" type="mesh" mesh="{name}" mass="0.15" '
             f'friction="1 0.005 0.0001"/></body>'
         )
     return f"""<mujoco>
@@ -83,11 +93,11 @@ def scene_xml(folder, scene, hand_pose, axis):
       <default><geom condim="4" solref="0.005 1" solimp="0.95 0.99 0.001"/></default>
       <asset>{''.join(assets)}</asset>
       <worldbody>
-        <geom name="table" type="plane" size="1 1 1" pos="0 0 {TABLE}" friction="0.5 0.005 0.0001"/>
+        <geom name="table" type="plane" size="1 1 1" pos="0 0 {TABLE}" friction="0.5 0.005 0.0001" priority="1"/>
         {''.join(bodies)}
         <body name="hand" pos="{numbers([x, y, z])}" quat="{numbers([qw, qx, qy, qz])}" gravcomp="1">
           <joint name="slide" type="slide" axis="{numbers(axis)}"/>
-          <geom name="palm" type="box" pos="{numbers(PALM[0])}" size="{numbers(PALM[1])}" mass="0.81"/>
+          <geom name="palm" type="mesh" mesh="palm" mass="0.81"/>
           {fingers}
         </body>
       </worldbody>
