@@ -148,7 +148,7 @@ fn a_hand_that_appears_in_the_table_is_pushed_out() {
     for (rotation, expected) in [(level, Outcome::ClosedOnNothing), (on_edge, Outcome::BlockedAtPregrasp)] {
         let grasp = Isometry3::from_parts(far_from_the_cube, rotation);
         assert_eq!(trial::execute(&mut cube_on_table(0.2, 1.0), &grasp).0, expected);
-        assert_eq!(trial::label(&cube_on_table(0.2, 1.0), &grasp, 0.0).is_success(), false);
+        assert!(!trial::label(&cube_on_table(0.2, 1.0), &grasp, 0.0).is_success());
     }
 }
 
