@@ -94,7 +94,7 @@ pub struct Look {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Point {
     /// The grasp to learn, in the task frame. Where a yaw lifted something: the middle of the widest run of yaws that did,
-    /// and the opening after the lift. Else the first yaw, and the greatest opening. Quality 1 for a success, else 0.
+    /// else the first yaw. Of a success the opening after the lift, and quality 1; else the greatest opening, and 0.
     pub grasp: Grasp,
     /// Which yaw that is.
     pub yaw: usize,
@@ -245,11 +245,15 @@ fn try_point(world: &World, cloud: &[SurfacePoint], rng: &mut impl Rng) -> Point
     let lifted = widths.map(|width| width.is_some());
     let object = world.nearest(&surface.position);
     let best = middle_of_widest_run(&lifted).and_then(|yaw| widths[yaw].map(|width| (yaw, width)));
-    let (yaw, width) = best.unwrap_or((0, MAX_OPENING));
+    let yaw = best.map_or(0, |(yaw, _)| yaw);
     let grasp = turned(yaw);
     let tries = if best.is_some() { Tries::of(world, &grasp, rng) } else { Tries { held: 0, failed: 1 } };
+    let (width, quality) = match best {
+        Some((_, width)) if tries.is_success() => (width, 1.0),
+        _ => (MAX_OPENING, 0.0),
+    };
     Point {
-        grasp: Grasp { pose: grasp, width, quality: if tries.is_success() { 1.0 } else { 0.0 } },
+        grasp: Grasp { pose: grasp, width, quality },
         yaw,
         lifted,
         share: tries.share(),

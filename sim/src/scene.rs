@@ -10,7 +10,7 @@ use rand_distr::{Distribution, StandardNormal};
 
 use crate::TABLE_HEIGHT;
 use crate::objects::{Object, ObjectSet};
-use crate::physics::{STEPS_PER_SECOND, World};
+use crate::physics::{MARGIN, STEPS_PER_SECOND, World};
 
 /// The two ways in which a scene is made.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -131,7 +131,9 @@ fn packed(objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
         let (x, y) = (rng.random_range(0.08..0.22), rng.random_range(0.08..0.22));
         let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), rng.random_range(0.0..TAU));
         let scale = rng.random_range(PACKED_SCALE);
-        let z = TABLE_HEIGHT - scale * lowest_point(&object) + CLEARANCE;
+        // As VGN's code has it, the object's origin goes to half its height: one that would then stand in the table is
+        // rejected, one that hangs above it falls.
+        let z = TABLE_HEIGHT + MARGIN + scale * height(&object) / 2.0 + CLEARANCE;
         let pose = Isometry3::from_parts(Translation3::new(x, y, z), rotation);
         if !world.is_occupied(&object, scale, &pose) {
             world.add(&object, scale, &pose);
@@ -147,7 +149,7 @@ fn random_rotation(rng: &mut impl Rng) -> UnitQuaternion<f64> {
     UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z))
 }
 
-fn lowest_point(object: &Object) -> f64 {
-    let heights = object.parts.iter().flat_map(|part| &part.vertices).map(|p: &Point3<f64>| p.z);
-    heights.fold(f64::INFINITY, f64::min)
+fn height(object: &Object) -> f64 {
+    let heights = || object.parts.iter().flat_map(|part| &part.vertices).map(|p: &Point3<f64>| p.z);
+    heights().fold(f64::NEG_INFINITY, f64::max) - heights().fold(f64::INFINITY, f64::min)
 }

@@ -6,7 +6,7 @@ use rapier3d::parry::query::{self, ClosestPoints};
 use rapier3d::prelude::{
     BoundingVolume, BroadPhaseBvh, CCDSolver, CoefficientCombineRule, ColliderBuilder, ColliderHandle, ColliderSet,
     FrictionModel, ImpulseJointSet, IntegrationParameters, IslandManager, MultibodyJointSet, NarrowPhase,
-    PhysicsPipeline, QueryFilter, QueryPipeline, RigidBodyBuilder, RigidBodyHandle, RigidBodySet, SharedShape,
+    PhysicsPipeline, QueryFilter, QueryPipeline, RigidBodyBuilder, RigidBodyHandle, RigidBodySet, Shape, SharedShape,
     SoftBodySet, SpringCoefficients,
 };
 
@@ -21,7 +21,7 @@ pub const STEPS_PER_SECOND: u32 = 240;
 pub(super) const SCALE: f64 = 100.0;
 
 /// How much larger than its mesh the collision shape of a convex body is, metres: Bullet's margin.
-pub(super) const MARGIN: f64 = 0.001;
+pub const MARGIN: f64 = 0.001;
 
 /// The distance of two convex meshes from which they count as touching, metres. Bullet keeps a contact until its two
 /// shapes, each larger by its margin, are 2 % of the smaller one's size apart: 0.8 mm for a finger.
@@ -251,11 +251,15 @@ impl World {
         linear.hypot(f64::from(body.angvel().length()))
     }
 
-    /// Whether an object scaled by `scale` at `pose` would overlap another object.
+    /// Whether an object scaled by `scale` at `pose` would touch another object, or the table.
     #[must_use]
     pub fn is_occupied(&self, object: &Object, scale: f64, pose: &Isometry3<f64>) -> bool {
-        let (shape, _) = shape(object, scale);
-        self.objects_query().intersect_shape(to_engine(pose), &*shape).next().is_some()
+        let corners = object.parts.iter().flat_map(|part| &part.vertices);
+        let lowest = corners.map(|corner| (pose * Point3::from(corner.coords * scale)).z).fold(f64::INFINITY, f64::min);
+        lowest < TABLE_HEIGHT + CONTACT_GAP - MARGIN || {
+            let (shape, _) = shape(object, scale);
+            distances(&self.objects_query(), &*shape, &to_engine(pose), CONTACT_GAP).next().is_some()
+        }
     }
 
     /// Whether any of the parts, given in the frame at `pose`, comes nearer than `gap` metres to an object's mesh, or as
@@ -264,7 +268,7 @@ impl World {
     pub fn is_near(&self, parts: &[HandPart], pose: &Isometry3<f64>, gap: f64) -> bool {
         parts.iter().any(|part| part.lowest_point(pose) < TABLE_HEIGHT + gap - MARGIN) || {
             let query = self.objects_query();
-            parts.iter().any(|part| distances(&query, part, &to_engine(pose), gap).next().is_some())
+            parts.iter().any(|part| distances(&query, &*part.shape, &to_engine(pose), gap).next().is_some())
         }
     }
 
@@ -272,7 +276,7 @@ impl World {
     #[must_use]
     pub fn clearance(&self, parts: &[HandPart], pose: &Isometry3<f64>, limit: f64) -> f64 {
         let (query, pose) = (self.objects_query(), to_engine(pose));
-        parts.iter().flat_map(|part| distances(&query, part, &pose, limit)).fold(limit, f64::min)
+        parts.iter().flat_map(|part| distances(&query, &*part.shape, &pose, limit)).fold(limit, f64::min)
     }
 
     /// The object nearest to a point: an index into [`objects`](Self::objects).
@@ -368,19 +372,19 @@ impl World {
     }
 }
 
-/// Of each collider that is less than `limit` metres away from a part of the hand, how far it is.
+/// Of each collider that is less than `limit` metres away from a shape, how far it is.
 fn distances<'a>(
     query: &'a QueryPipeline<'_>,
-    part: &'a HandPart,
+    shape: &'a dyn Shape,
     pose: &'a Pose,
     limit: f64,
 ) -> impl Iterator<Item = f64> + 'a {
     // With no reach at all the engine does not find what intersects a shape of several parts.
     const LEAST_REACH: f64 = 1e-5;
     let reach = (limit.max(LEAST_REACH) * SCALE) as f32;
-    let nearby = query.intersect_aabb_conservative(part.shape.compute_aabb(pose).loosened(reach));
+    let nearby = query.intersect_aabb_conservative(shape.compute_aabb(pose).loosened(reach));
     nearby.filter_map(move |(_, collider)| {
-        let found = query::closest_points(pose, &*part.shape, collider.position(), collider.shape(), reach);
+        let found = query::closest_points(pose, shape, collider.position(), collider.shape(), reach);
         match found {
             Ok(ClosestPoints::Intersecting) => Some(0.0),
             Ok(ClosestPoints::WithinMargin(a, b)) => Some(f64::from((b - a).length()) / SCALE),
