@@ -8,13 +8,15 @@ mod label;
 mod look;
 mod merge;
 mod objects;
+mod reliability;
 mod replay;
 mod stats;
 mod tables;
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use clap::{Args, Parser, ValueEnum};
 use grasp_picture::{Picture, object_color};
 use grasp_sim::camera::Views;
@@ -44,6 +46,8 @@ pub enum Command {
     Candidates(candidates::Candidates),
     /// Clear tables with a planner and say how well it did.
     Bench(bench::Bench),
+    /// Compare the quality of executed grasps with what became of them.
+    Reliability(reliability::ReliabilityArgs),
     /// Regenerate the tables of the paper.
     Tables(tables::Tables),
     /// One scene, from the depth camera through a server of its own to the lifted object.
@@ -63,6 +67,7 @@ impl Command {
             Self::Objects(command) => command.run(),
             Self::Candidates(command) => command.run(),
             Self::Bench(command) => command.run(),
+            Self::Reliability(command) => command.run(),
             Self::Tables(command) => command.run(),
             Self::Demo(command) => command.run(),
         }
@@ -81,6 +86,10 @@ struct SceneArgs {
     #[arg(long)]
     objects: Option<String>,
 
+    /// Of the folder's files by name, `validation` is every fifth, and `train` the others.
+    #[arg(long, value_enum, default_value = "all")]
+    part: Part,
+
     /// The cameras: `side[:DEGREES]` (the paper's one view, turned about the vertical), `circle` (six from above), or
     /// `anywhere:MIN-MAX` (so many from any azimuth, 20–75° off the vertical). Of several, separated by commas, one is
     /// drawn for each observation.
@@ -94,6 +103,24 @@ struct SceneArgs {
     /// Seed of everything random.
     #[arg(long, default_value_t = 1)]
     seed: u64,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Part {
+    All,
+    Train,
+    Validation,
+}
+
+impl Part {
+    /// What a report says after the folder.
+    fn suffix(self) -> &'static str {
+        match self {
+            Self::All => "",
+            Self::Train => " (train)",
+            Self::Validation => " (validation)",
+        }
+    }
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -134,7 +161,20 @@ impl SceneArgs {
     }
 
     fn objects(&self, default: &str) -> anyhow::Result<ObjectSet> {
-        self.scene.objects(self.objects.as_deref().unwrap_or(default))
+        let name = self.objects.as_deref().unwrap_or(default);
+        let objects = self.scene.objects(name)?;
+        let is_kept: fn(usize) -> bool = match self.part {
+            Part::All => return Ok(objects),
+            Part::Train => |index| index % 5 != 4,
+            Part::Validation => |index| index % 5 == 4,
+        };
+        ensure!(
+            PathBuf::from(name).is_dir(),
+            "--part takes a part of a folder of URDF files, not of --objects `{name}`"
+        );
+        let part = objects.listed().iter().enumerate().filter(|(index, _)| is_kept(*index));
+        ObjectSet::of(part.map(|(_, object)| Arc::clone(object)).collect())
+            .with_context(|| format!("--objects is {name}: it has too few files for this --part"))
     }
 
     fn views(&self) -> anyhow::Result<Views> {

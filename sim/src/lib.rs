@@ -13,6 +13,7 @@ pub mod objects;
 pub mod ordered;
 pub mod physics;
 pub mod planner;
+pub mod reliability;
 pub mod scene;
 pub mod score;
 pub mod statistics;

@@ -78,6 +78,12 @@ impl ObjectSet {
         Ok(ObjectSet { objects })
     }
 
+    /// These objects; `None` of none.
+    #[must_use]
+    pub fn of(objects: Vec<Arc<Object>>) -> Option<ObjectSet> {
+        (!objects.is_empty()).then_some(ObjectSet { objects })
+    }
+
     /// Any of them, each as likely.
     pub fn draw(&self, rng: &mut impl Rng) -> Arc<Object> {
         if self.objects.is_empty() {

@@ -9,4 +9,4 @@ mod world;
 
 pub use gripper::Gripper;
 pub use hand::{HandPart, OPEN_HAND};
-pub use world::{Body, BodyId, CONTACT_GAP, MARGIN, STEPS_PER_SECOND, World};
+pub use world::{Body, BodyId, CONTACT_GAP, STEPS_PER_SECOND, World};

@@ -10,7 +10,7 @@ use rand_distr::{Distribution, StandardNormal};
 
 use crate::TABLE_HEIGHT;
 use crate::objects::{Object, ObjectSet};
-use crate::physics::{MARGIN, STEPS_PER_SECOND, World};
+use crate::physics::{STEPS_PER_SECOND, World};
 
 /// The two ways in which a scene is made.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -122,6 +122,8 @@ fn pile(objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
 fn packed(objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
     const ATTEMPTS: usize = 12;
     const CLEARANCE: f64 = 0.002;
+    /// By how much the bounding boxes that Bullet tells are larger on each side, metres.
+    const BOX_MARGIN: f64 = 0.003;
     let mut world = World::new();
     for _ in 0..ATTEMPTS {
         if world.objects().len() >= count {
@@ -133,7 +135,7 @@ fn packed(objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
         let scale = rng.random_range(PACKED_SCALE);
         // As VGN's code has it, the object's origin goes to half its height: one that would then stand in the table is
         // rejected, one that hangs above it falls.
-        let z = TABLE_HEIGHT + MARGIN + scale * height(&object) / 2.0 + CLEARANCE;
+        let z = TABLE_HEIGHT + scale * height(&object) / 2.0 + BOX_MARGIN + CLEARANCE;
         let pose = Isometry3::from_parts(Translation3::new(x, y, z), rotation);
         if !world.is_occupied(&object, scale, &pose) {
             world.add(&object, scale, &pose);

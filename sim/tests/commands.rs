@@ -1,5 +1,6 @@
 //! The commands of `grasp-sim` as a user types them. `ORT_DYLIB_PATH` must name ONNX Runtime's library.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -232,13 +233,46 @@ fn a_benchmark_tells_of_every_attempt() {
         assert_eq!((ended, summary["seeds"]["gsr"]["n"].as_u64()), (2, Some(2)));
         assert!(summary["fusion_p50_ms"].as_f64().unwrap() > 0.0);
     }
+    assert!(attempts.iter().any(|attempt| attempt["object"].is_string()), "what was grasped at has a name");
     let pictures: Vec<_> = fs::read_dir(desk.path("pictures")).unwrap().collect();
     assert_eq!(pictures.len(), attempts.len(), "a picture for each attempt");
+
+    let line = desk.run("reliability here=attempts.jsonl --out reliability.png");
+    let reliability: Value = serde_json::from_str(&line).unwrap();
+    let whole = &reliability["reliability"]["whole"];
+    assert_eq!((&reliability["name"], whole["attempts"].as_u64()), (&"here".into(), Some(attempts.len() as u64)));
+    assert!((0.0..=1.0).contains(&reliability["reliability"]["error"].as_f64().unwrap()));
+    assert!(fs::read(desk.path("reliability.png")).unwrap().starts_with(b"\x89PNG"));
 
     let rows = desk.run(&format!("{bench} --format markdown"));
     let of_network = rows.lines().find(|line| line.contains("vgn-packed.onnx |")).unwrap();
     let gsr = format!("{:.1} ±", summaries[1]["seeds"]["gsr"]["mean"].as_f64().unwrap() * 100.0);
     assert!(of_network.contains(&gsr), "{of_network}: {gsr}");
+}
+
+#[test]
+fn a_part_of_a_folder_is_every_fifth_object() {
+    let desk = Desk::new();
+    desk.run("objects --objects test --scene packed --out objects");
+    let mut names: Vec<String> = fs::read_dir(desk.path("objects"))
+        .unwrap()
+        .filter_map(|file| file.unwrap().file_name().to_str()?.strip_suffix(".urdf").map(str::to_owned))
+        .collect();
+    names.sort();
+    let seen = |part: &str| {
+        desk.run(&format!(
+            "label --objects objects --part {part} --points 2 --scenes 12 --out {part} --export {part}.jsonl"
+        ));
+        let scenes = export::read(&desk.path(&format!("{part}.jsonl"))).unwrap();
+        scenes.into_iter().flat_map(|scene| scene.objects).map(|object| object.object).collect::<BTreeSet<_>>()
+    };
+    let (train, validation) = (seen("train"), seen("validation"));
+    assert!(!train.is_empty() && !validation.is_empty());
+    for (index, name) in names.iter().enumerate() {
+        assert!(!(if index % 5 == 4 { &train } else { &validation }).contains(name), "{name}");
+    }
+    let refused = desk.command("bench --planner random --part validation").output().unwrap();
+    assert!(stderr(&refused).contains("--part takes a part of a folder"), "{}", stderr(&refused));
 }
 
 #[test]

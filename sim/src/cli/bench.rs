@@ -58,7 +58,7 @@ pub struct Bench {
     #[arg(long, value_enum, default_value = "json")]
     format: Format,
 
-    /// Also write every attempt to this file, as JSON lines: which grasp, and what became of it.
+    /// Also write every attempt to this file, as JSON lines: which grasp, the object nearest to it, and what became of it.
     #[arg(long)]
     attempts: Option<PathBuf>,
 
@@ -153,9 +153,10 @@ impl Bench {
             seed: self.scene.seed,
         };
         let setup = format!(
-            "{}, objects {}, views {}, noise {}, {} objects a scene, {} rounds, seed {}",
+            "{}, objects {}{}, views {}, noise {}, {} objects a scene, {} rounds, seed {}",
             self.scene.scene.name(),
             self.scene.objects.as_deref().unwrap_or("test"),
+            self.scene.part.suffix(),
             self.scene.views,
             benchmark.noise,
             benchmark.count,
@@ -276,9 +277,11 @@ impl<'a> Watcher<'a> {
         let outcome = attempt.outcome.name();
         if let Some((path, file)) = &self.lines {
             let Grasp { pose, width, quality } = attempt.grasp;
+            let nearest = before.nearest(&pose.translation.vector.into());
+            let object = nearest.map(|index| &before.objects()[index].object.name);
             let line = serde_json::json!({
                 "planner": planner, "seed": seed, "round": round, "attempt": number, "outcome": outcome,
-                "short_by": attempt.short_by, "position": pose.translation.vector.as_slice(),
+                "object": object, "short_by": attempt.short_by, "position": pose.translation.vector.as_slice(),
                 "quaternion_xyzw": pose.rotation.coords.as_slice(), "width": width, "quality": quality,
                 "proposals": proposals.len(), "objects": before.objects().len(),
             });

@@ -21,7 +21,7 @@ pub const STEPS_PER_SECOND: u32 = 240;
 pub(super) const SCALE: f64 = 100.0;
 
 /// How much larger than its mesh the collision shape of a convex body is, metres: Bullet's margin.
-pub const MARGIN: f64 = 0.001;
+pub(super) const MARGIN: f64 = 0.001;
 
 /// The distance of two convex meshes from which they count as touching, metres. Bullet keeps a contact until its two
 /// shapes, each larger by its margin, are 2 % of the smaller one's size apart: 0.8 mm for a finger.
