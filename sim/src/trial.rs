@@ -80,7 +80,7 @@ pub fn label(world: &World, grasp: &Isometry3<f64>, swell: f64) -> Outcome {
     if world.is_near(&WAY, grasp, CONTACT_GAP + swell) {
         return Outcome::BlockedOnApproach;
     }
-    close_and_lift(&mut world.clone(), grasp, grasp)
+    close_and_lift(&mut world.clone(), grasp, grasp, Until::NothingIsHeld)
 }
 
 /// How much room the open hand has on its way to a grasp: the distance of the nearest object's mesh, at most `limit`,
@@ -101,7 +101,7 @@ pub fn execute(world: &mut World, grasp: &Isometry3<f64>) -> (Outcome, f64) {
     let steps = (PREGRASP_DISTANCE / APPROACH_STEP).round() as u32;
     let touched_in = (1..=steps).find(|&step| world.is_near(&OPEN_HAND, &at(distance_after(step) + LAG), CONTACT_GAP));
     let short_by = touched_in.map_or(0.0, distance_after);
-    match close_and_lift(world, &at(short_by), grasp) {
+    match close_and_lift(world, &at(short_by), grasp, Until::TheEnd) {
         outcome if touched_in == Some(1) && !outcome.is_success() => (Outcome::BlockedAtPregrasp, short_by),
         outcome => (outcome, short_by),
     }
@@ -112,20 +112,34 @@ fn distance_after(step: u32) -> f64 {
     PREGRASP_DISTANCE - f64::from(step) * APPROACH_STEP
 }
 
+/// How long a trial goes on.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Until {
+    /// Until it has failed: only the outcome is asked for.
+    NothingIsHeld,
+    /// As in the reference the hand is lifted whatever it holds. It moves what stands around, so that the next attempt
+    /// meets another scene, and now and then it catches something.
+    TheEnd,
+}
+
 /// Closes the hand at `start` and lifts it to where a lift from `grasp` ends.
-fn close_and_lift(world: &mut World, start: &Isometry3<f64>, grasp: &Isometry3<f64>) -> Outcome {
+fn close_and_lift(world: &mut World, start: &Isometry3<f64>, grasp: &Isometry3<f64>, until: Until) -> Outcome {
     let behind = start * Translation3::new(0.0, 0.0, -LAG);
     let mut gripper = Gripper::insert(world, &behind, start);
-    let outcome = match close(world, &mut gripper) {
-        Some(()) => lift(world, &mut gripper, start, grasp),
-        None => Outcome::ClosedOnNothing,
+    let closed_on = close(world, &mut gripper);
+    let outcome = match closed_on {
+        None if until == Until::NothingIsHeld => Outcome::ClosedOnNothing,
+        _ => match lift(world, &mut gripper, start, grasp, until) {
+            Outcome::LostInLift if closed_on.is_none() => Outcome::ClosedOnNothing,
+            outcome => outcome,
+        },
     };
     gripper.remove(world);
     outcome
 }
 
-/// Closes until the width is still for 50 ms, or 0.5 s at the longest. `None` if nothing is held then.
-fn close(world: &mut World, gripper: &mut Gripper) -> Option<()> {
+/// Closes until the width is still for 50 ms, or 0.5 s at the longest. What is held then.
+fn close(world: &mut World, gripper: &mut Gripper) -> Option<BodyId> {
     const STILL: f64 = 1e-5;
     let mut still_since = 0;
     let mut width = gripper.width(world);
@@ -140,10 +154,16 @@ fn close(world: &mut World, gripper: &mut Gripper) -> Option<()> {
         }
         width = now;
     }
-    holds(world, gripper).map(|_| ())
+    holds(world, gripper)
 }
 
-fn lift(world: &mut World, gripper: &mut Gripper, start: &Isometry3<f64>, grasp: &Isometry3<f64>) -> Outcome {
+fn lift(
+    world: &mut World,
+    gripper: &mut Gripper,
+    start: &Isometry3<f64>,
+    grasp: &Isometry3<f64>,
+    until: Until,
+) -> Outcome {
     let target = grasp.translation.vector + retreat(grasp) * LIFT;
     let path = target - start.translation.vector;
     let steps = (path.norm() / LIFT_SPEED * f64::from(STEPS_PER_SECOND)).round() as u32;
@@ -154,7 +174,7 @@ fn lift(world: &mut World, gripper: &mut Gripper, start: &Isometry3<f64>, grasp:
         world.step();
         if step % LOOK == 0 {
             // The reference looks once, at the end; shut fingers will not hold anything any more.
-            if gripper.width(world) <= EMPTY_WIDTH {
+            if until == Until::NothingIsHeld && gripper.width(world) <= EMPTY_WIDTH {
                 return Outcome::LostInLift;
             }
             // Nor will anything change for what hangs still in the hand with nothing before it.

@@ -27,10 +27,10 @@ pub(super) const MARGIN: f64 = 0.001;
 /// shapes, each larger by its margin, are 2 % of the smaller one's size apart: 0.8 mm for a finger.
 pub const CONTACT_GAP: f64 = 2.0 * MARGIN + 0.0008;
 
-/// Angular damping of objects at rest, 1/s: without it round bodies roll for ever.
+/// Angular damping of objects while a scene is made, 1/s: without it round bodies roll for ever.
 const REST_DAMPING: f32 = 10.0;
 
-/// Angular damping while a hand is in the world, 1/s, as in the reference.
+/// Angular damping from the first hand on, 1/s, as in the reference.
 const TRIAL_DAMPING: f32 = 0.04;
 
 /// Friction of the table and the walls; an object's own is multiplied with it, as Bullet does.
@@ -161,9 +161,8 @@ impl World {
         };
     }
 
-    /// Goes back to the settings that keep a pile at rest.
+    /// Goes back to the solver's settings that keep a pile at rest. The damping stays low: what was dropped tumbles.
     pub(super) fn release(&mut self) {
-        self.set_angular_damping(REST_DAMPING);
         self.parameters = Self::parameters();
     }
 
