@@ -138,7 +138,7 @@ struct Training {
     #[arg(long)]
     balance: bool,
     /// What the quality is learnt from: label, whether a grasp held, or share, the share of its tries with small pose
-    /// errors that held, a probability. Where each grasp was tried once, as `grasp-sim label` does, both are the same.
+    /// errors that held, a probability. In data of one try a grasp both are the same.
     /// Rotation and width do not depend on it.
     #[arg(long, value_enum, default_value_t = Target::Label)]
     quality: Target,
