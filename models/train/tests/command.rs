@@ -152,7 +152,7 @@ fn ctrl_c_leaves_a_checkpoint() {
     assert!(Command::new("kill").args(["-INT", &run.id().to_string()]).status().unwrap().success());
     assert_eq!(run.wait().unwrap().code(), Some(0));
     let checkpoint = Checkpoint::read(&folder.path().join("out.state")).unwrap();
-    assert!((1..100_000).contains(&checkpoint.epoch));
+    assert!(checkpoint.steps > 0 && checkpoint.epoch < 100_000);
     let path = folder.path().join("out.onnx");
     let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
     assert_eq!(metadata.provenance["steps"], checkpoint.steps.to_string(), "both are of the same step");
