@@ -269,7 +269,8 @@ struct Tries {
 }
 
 impl Tries {
-    /// Tries a grasp that is known to hold as it is, until more tries would not change what it is called.
+    /// Tries a grasp that is known to hold as it is: until it is a failure, held [`ENOUGH`] times more without one, or was
+    /// tried [`REPEATS`] times more.
     fn of(world: &World, grasp: &Isometry3<f64>, rng: &mut impl Rng) -> Self {
         let mut tries = Self { held: 1, failed: 0 };
         while tries.held + tries.failed <= REPEATS && tries.is_success() && !(tries.failed == 0 && tries.held > ENOUGH)
