@@ -91,8 +91,13 @@ soak: ## a minute of four times what the server can do, then 20 minutes of 80 % 
 	$(CARGO) build --release $(WORKSPACE) --example soak
 	$(with_onnxruntime) $(RELEASE)/examples/soak $(MINUTES)
 
-tables: ## play the paper's tables into docs/tables.md; VGN=DIR adds VGN's released weights
-	$(with_onnxruntime) $(CARGO) run --release --package grasp-sim --locked -- tables $(if $(VGN),--released $(VGN))
+tables: ## play the paper's tables into docs/tables.md; VGN=DIR adds VGN's released weights, OBJECTS=DIR other objects
+	$(CARGO) build --release --package graspd --package grasp-sim --locked
+	$(with_onnxruntime) $(with_python) \
+		"$$GRASPD_PYTHON" -m pip install --quiet --no-index --no-deps --no-build-isolation --upgrade \
+			--target $(CARGO_TARGET_DIR)/pybullet ./client/python && \
+		PYTHONPATH=$(CARGO_TARGET_DIR)/pybullet $(RELEASE)/grasp-sim tables --pybullet "$$GRASPD_PYTHON" \
+			--graspd $(RELEASE)/graspd $(if $(VGN),--released $(VGN)) $(if $(OBJECTS),--objects $(OBJECTS))
 
 clean: ## remove what was built; what was downloaded stays
 	$(CARGO) clean

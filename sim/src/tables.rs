@@ -28,6 +28,30 @@ pub const EPSILONS: [u8; 3] = [80, EPSILON, 95];
 /// ε of all other tables, in hundredths.
 pub const EPSILON: u8 = 90;
 
+/// The objects of a game that are ours; others have the name of their folder.
+pub const TEST_OBJECTS: &str = "test";
+
+/// A physics engine in which tables are cleared.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Simulator {
+    /// The one of this crate.
+    Rapier,
+    /// `sim/pybullet`.
+    PyBullet,
+}
+
+impl Simulator {
+    /// As it is written in the tables.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Rapier => "rapier",
+            Self::PyBullet => "PyBullet",
+        }
+    }
+}
+
 /// What a cell of a table is about.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Game {
@@ -37,6 +61,10 @@ pub struct Game {
     pub learnt: Option<String>,
     /// The scenario that it is tried on.
     pub scenario: String,
+    /// What the scenes are made of: [`TEST_OBJECTS`], or the name of a folder.
+    pub objects: String,
+    /// Where tables are cleared.
+    pub simulator: Simulator,
     /// Where the cameras stand.
     pub views: String,
     /// ε in hundredths.
@@ -51,9 +79,14 @@ impl Game {
         self.learnt.as_ref().is_none_or(|learnt| *learnt == self.scenario)
     }
 
-    /// Whether the paper has it: its view, its ε, and `force`.
+    /// Whether the paper has it: its view, its ε, and `force`, with objects that are made from seeds.
     fn is_as_published(&self) -> bool {
-        self.views == VIEWS[0].0 && self.epsilon == EPSILON && self.forced
+        self.objects == TEST_OBJECTS && self.views == VIEWS[0].0 && self.epsilon == EPSILON && self.forced
+    }
+
+    /// The same, in the simulator of this crate.
+    fn is_as_published_here(&self) -> bool {
+        self.is_as_published() && self.simulator == Simulator::Rapier
     }
 }
 
@@ -111,14 +144,15 @@ impl Results {
         let mut text = String::new();
         self.data(&mut text);
         text.push_str("\n## Table 2: clearing tables\n\n");
-        self.success(&mut text, &PUBLISHED, Game::learnt_here);
+        self.success(&mut text, &PUBLISHED, &self.simulators(), Game::learnt_here);
+        self.elsewhere(&mut text);
         text.push_str("\n## Table 3: milliseconds to plan\n\n");
         self.times(&mut text);
         text.push_str("\n## Table 4: learnt from the other scenario\n\n");
         text.push_str(
             "A network that began with the weights of one for the other scenario has seen it: its card says so.\n\n",
         );
-        self.success(&mut text, &PUBLISHED_CROSSED, |game| !game.learnt_here());
+        self.success(&mut text, &PUBLISHED_CROSSED, &[Simulator::Rapier], |game| !game.learnt_here());
         text.push_str("\n## How sure a grasp must be\n\n");
         self.epsilons(&mut text);
         text.push_str("\n## Where the camera stands\n\n");
@@ -140,26 +174,77 @@ impl Results {
         }
     }
 
-    fn success(&self, text: &mut String, published: &[(&str, [&str; 4])], wanted: impl Fn(&Game) -> bool) {
-        text.push_str("| | packed GSR % | published | packed DR % | published | ");
-        text.push_str("pile GSR % | published | pile DR % | published |\n|---|---|---|---|---|---|---|---|---|\n");
+    /// Those in which tables were cleared.
+    fn simulators(&self) -> Vec<Simulator> {
+        self.games.keys().map(|game| game.simulator).collect::<BTreeSet<_>>().into_iter().collect()
+    }
+
+    fn success(
+        &self,
+        text: &mut String,
+        published: &[(&str, [&str; 4])],
+        simulators: &[Simulator],
+        wanted: impl Fn(&Game) -> bool,
+    ) {
+        let columns = SCENARIOS.into_iter().flat_map(|scenario| [(scenario, "GSR"), (scenario, "DR")]);
+        text.push('|');
+        for (scenario, figure) in columns {
+            for simulator in simulators {
+                let _ = write!(text, " | {scenario} {figure} %, {}", simulator.name());
+            }
+            text.push_str(" | published");
+        }
+        let _ = writeln!(text, " |\n|{}", "---|".repeat(1 + 4 * (simulators.len() + 1)));
         let games = || self.games.iter().filter(|(game, _)| game.is_as_published() && wanted(game));
         for method in in_order(games().map(|(game, _)| game.method.as_str())) {
             let name = method.strip_suffix(LEARNT_BOTH).unwrap_or(method);
             let of_method = published.iter().find(|(other, _)| *other == name).map(|(_, figures)| figures);
-            let mut row = format!("| {method} ");
+            let _ = write!(text, "| {method} ");
             for (column, scenario) in SCENARIOS.into_iter().enumerate() {
-                let played =
-                    games().find(|(game, _)| game.method == method && game.scenario == scenario).map(|(_, s)| s);
+                let played = |simulator| {
+                    let is_it = |game: &Game| {
+                        (game.method.as_str(), game.scenario.as_str(), game.simulator) == (method, scenario, simulator)
+                    };
+                    games().find(|(game, _)| is_it(game)).map(|(_, played)| played)
+                };
                 let figures: [fn(&Summary) -> f64; 2] = [|summary| summary.gsr, |summary| summary.dr];
                 for (index, figure) in figures.into_iter().enumerate() {
-                    let here = played.map_or_else(|| "–".to_owned(), |played| spread(played, figure));
-                    let there = of_method.map_or("–", |figures| figures[2 * column + index]);
-                    let _ = write!(row, "| {here} | {there} ");
+                    for &simulator in simulators {
+                        let here = played(simulator).map_or_else(|| "–".to_owned(), |played| spread(played, figure));
+                        let _ = write!(text, "| {here} ");
+                    }
+                    let _ = write!(text, "| {} ", of_method.map_or("–", |figures| figures[2 * column + index]));
                 }
             }
-            text.push_str(&row);
             text.push_str("|\n");
+        }
+    }
+
+    /// A table for each other set of objects.
+    fn elsewhere(&self, text: &mut String) {
+        let others = || self.games.iter().filter(|(game, _)| game.objects != TEST_OBJECTS);
+        for objects in others().map(|(game, _)| game.objects.as_str()).collect::<BTreeSet<_>>() {
+            let _ = write!(text, "\n### The same with the objects of `{objects}`\n\nGSR / DR in %, pooled.\n\n|");
+            let columns: Vec<_> = SCENARIOS
+                .into_iter()
+                .flat_map(|scenario| self.simulators().into_iter().map(move |simulator| (scenario, simulator)))
+                .collect();
+            columns.iter().for_each(|(scenario, simulator)| {
+                let _ = write!(text, " | {scenario}, {}", simulator.name());
+            });
+            let _ = writeln!(text, " |\n|{}", "---|".repeat(1 + columns.len()));
+            let games = || others().filter(|(game, _)| game.objects == objects);
+            for method in in_order(games().map(|(game, _)| game.method.as_str())) {
+                let _ = write!(text, "| {method} |");
+                for &(scenario, simulator) in &columns {
+                    let is_it = |game: &Game| {
+                        (game.method.as_str(), game.scenario.as_str(), game.simulator) == (method, scenario, simulator)
+                    };
+                    let played = games().find(|(game, _)| is_it(game));
+                    let _ = write!(text, " {} |", played.map_or_else(|| "–".to_owned(), |(_, played)| pooled(played)));
+                }
+                text.push('\n');
+            }
         }
     }
 
@@ -192,7 +277,7 @@ impl Results {
 
     fn epsilons(&self, text: &mut String) {
         text.push_str(
-            "GSR / DR in %, pooled, from the paper's view, by ε, where nothing below it is taken: with `force`, the\n",
+            "GSR / DR in rapier in %, pooled, from the paper's view, by ε, where nothing below it is taken: with `force`, the\n",
         );
         text.push_str("best grasp is the same whatever ε is.\n\n| |");
         EPSILONS.iter().for_each(|epsilon| text.push_str(&format!(" 0.{epsilon} |")));
@@ -203,7 +288,7 @@ impl Results {
     }
 
     fn views(&self, text: &mut String) {
-        text.push_str("GSR / DR in %, pooled.\n\n| |");
+        text.push_str("GSR / DR in rapier in %, pooled.\n\n| |");
         VIEWS.iter().for_each(|(_, name)| text.push_str(&format!(" {name} |")));
         text.push_str(&format!("\n|---|{}\n", "---|".repeat(VIEWS.len())));
         let others = self.games.keys().filter(|game| game.views != VIEWS[0].0);
@@ -234,11 +319,11 @@ impl Results {
     }
 
     fn endings(&self, text: &mut String) {
-        text.push_str("Of the attempts from the paper's view, in %; and of the rounds.\n\n");
+        text.push_str("Of the attempts from the paper's view in rapier, in %; and of the rounds.\n\n");
         text.push_str("| | attempts | lifted | blocked at the pre-grasp | closed on nothing | lost in the lift | ");
         text.push_str("rounds | cleared | nothing seen | no proposal | two failures |\n");
         text.push_str("|---|---|---|---|---|---|---|---|---|---|---|\n");
-        let games = || self.games.iter().filter(|(game, _)| game.is_as_published());
+        let games = || self.games.iter().filter(|(game, _)| game.is_as_published_here());
         let methods = in_order(games().map(|(game, _)| game.method.as_str()));
         for (game, played) in methods.iter().flat_map(|method| games().filter(|(game, _)| game.method == *method)) {
             let sum = |figure: fn(&Summary) -> usize| played.iter().map(figure).sum::<usize>();

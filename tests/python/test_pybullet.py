@@ -240,6 +240,22 @@ class CommandTest(unittest.TestCase):
         ours, theirs = (set(json.loads(file.read_text().splitlines()[0])) for file in files)
         self.assertLessEqual(ours, theirs)
 
+    def test_tables_have_a_column_for_it(self):
+        (self.folder / "zoo").mkdir()
+        (self.folder / "zoo/vgn-packed.onnx").symlink_to(Path(os.environ["GRASPD_MODELS"], "vgn-packed.onnx").resolve())
+        python, graspd = self.folder / "bin/python3", os.path.abspath(os.environ["GRASPD"])
+        self.run_sh(
+            f"grasp-sim tables --models zoo --rounds 1 --seeds 1 --timed 1 --out tables.md --objects objects "
+            f"--pybullet {python} --graspd {shlex.quote(graspd)}"
+        )
+        played = [json.loads(line) for line in (self.folder / "tables.jsonl").read_text().splitlines()]
+        there = {(one["method"], one["scenario"], one["objects"]) for one in played if one["simulator"] == "pybullet"}
+        planners = [("random", "packed"), ("random", "pile"), ("shaf", "packed"), ("shaf", "pile"), ("vgn", "packed")]
+        self.assertEqual(there, {(*planner, objects) for planner in planners for objects in ["test", "objects"]})
+        text = (self.folder / "tables.md").read_text()
+        self.assertIn("| packed GSR %, rapier | packed GSR %, PyBullet | published |", text)
+        self.assertIn("| packed, rapier | packed, PyBullet | pile, rapier | pile, PyBullet |", text)
+
     def test_mistakes_are_told(self):
         for arguments, wanted in [
             ("--objects bin", "--objects is bin: there is no .urdf file"),

@@ -1,28 +1,29 @@
-use std::collections::BTreeMap;
-use std::fs::{self, File, OpenOptions};
-use std::io::{BufRead, BufReader, Write};
+mod fingerprint;
+mod log;
+mod pybullet;
+
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Context;
 use clap::Args;
-use grasp::{DecodeParams, Maps, RESOLUTION, Volume, WORKSPACE_SIZE, decode};
+use grasp::DecodeParams;
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Metadata, Options};
 use grasp_sim::benchmark::{Benchmark, Event};
-use grasp_sim::label::Recipe;
-use grasp_sim::objects::{ObjectSet, Split};
+use grasp_sim::objects::ObjectSet;
 use grasp_sim::planner::PlannerSpec;
 use grasp_sim::score::{Spread, Summary};
-use grasp_sim::tables::{EPSILON, EPSILONS, Game, LEARNT_BOTH, RELEASED, Results, SCENARIOS, VIEWS};
+use grasp_sim::tables::{
+    EPSILON, EPSILONS, Game, LEARNT_BOTH, RELEASED, Results, SCENARIOS, Simulator, TEST_OBJECTS, VIEWS,
+};
 use indicatif::{ProgressBar, ProgressStyle};
-use nalgebra::Isometry3;
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 
 use super::{Scene, parse_views};
+use fingerprint::{decoding, digest, hash, hash_folder, simulator};
+use log::{Log, Played};
+use pybullet::{FOLDER, PyBullet, model};
 
 /// Plays what the paper's tables need, and writes them beside the published figures. What was played is kept beside the
 /// tables as JSON lines and not played again, unless the network, the simulator or the settings have changed.
@@ -37,6 +38,18 @@ pub struct Tables {
     #[arg(long)]
     released: Option<PathBuf>,
 
+    /// Clear tables of other objects, too: those of this folder of URDF files. Its name is their name in the tables.
+    #[arg(long = "objects", value_name = "DIR")]
+    others: Vec<PathBuf>,
+
+    /// Clear tables in PyBullet, too, with this interpreter, which has what sim/pybullet/requirements.txt asks for.
+    #[arg(long, value_name = "PYTHON", requires = "graspd")]
+    pybullet: Option<PathBuf>,
+
+    /// The server that answers there.
+    #[arg(long, value_name = "PROGRAM")]
+    graspd: Option<PathBuf>,
+
     /// The tables.
     #[arg(long, default_value = "docs/tables.md")]
     out: PathBuf,
@@ -45,7 +58,8 @@ pub struct Tables {
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
     rounds: u64,
 
-    /// How many seeds; the cameras and ε that the paper does not have are played with the first two.
+    /// How many seeds; the cameras, ε and objects that the paper does not have, and all games in PyBullet, are played with
+    /// the first alone.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..))]
     seeds: u64,
 
@@ -58,8 +72,8 @@ pub struct Tables {
     timed: u64,
 }
 
-/// Seeds of the cameras and ε that the paper does not have.
-const SEEDS_ELSEWHERE: u64 = 2;
+/// Where nothing reaches ε, the best grasp down to this quality is taken.
+const FORCE: f32 = 0.5;
 
 /// A planner and what it is called.
 #[derive(Clone)]
@@ -69,20 +83,6 @@ struct Entry {
     planner: String,
     /// Of the planner's network.
     sha256: Option<String>,
-}
-
-/// A line of what was played.
-#[derive(Clone, Serialize, Deserialize)]
-struct Played {
-    /// A hash of everything that it depends on.
-    key: String,
-    #[serde(flatten)]
-    game: Game,
-    seed: u64,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    summary: Option<Summary>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    milliseconds: Option<Spread>,
 }
 
 /// Something to play.
@@ -98,19 +98,24 @@ impl Tables {
     pub fn run(self) -> anyhow::Result<()> {
         let entries = self.entries()?;
         let fingerprint = digest(&format!("{} {}", simulator(), decoding()));
-        let tasks = self.tasks(&entries, &fingerprint);
+        let tasks = self.tasks(&entries, &fingerprint)?;
         let mut log = Log::open(&self.out.with_extension("jsonl"))?;
         let missing: Vec<&Task> = tasks.iter().filter(|task| !log.played.contains_key(&task.key)).collect();
         eprintln!("{} of {} games are to be played", missing.len(), tasks.len());
         let progress = ProgressBar::new(missing.iter().map(|task| self.effort(task)).sum())
             .with_style(ProgressStyle::with_template("{wide_bar} {pos}/{len} scenes, {eta} left {msg}")?);
+        let mut pybullet = self.pybullet.as_deref().zip(self.graspd.as_deref()).map(|(p, g)| PyBullet::new(p, g));
         for task in missing {
-            progress.set_message(format!("{} on {}", task.game.method, task.game.scenario));
-            let played = self.play(task, &progress).with_context(|| format!("planner `{}`", task.planner))?;
-            log.append(played)?;
+            let Game { method, scenario, objects, simulator, .. } = &task.game;
+            progress.set_message(format!("{method} on {scenario}, {objects}, {}", simulator.name()));
+            let played = match (simulator, &mut pybullet) {
+                (Simulator::PyBullet, Some(pybullet)) => self.play_there(task, pybullet, &progress),
+                _ => self.play(task, &progress),
+            };
+            log.append(played.with_context(|| format!("planner `{}`", task.planner))?)?;
         }
         progress.finish_and_clear();
-        log.keep(&tasks)?;
+        log.keep(tasks.iter().map(|task| task.key.as_str()))?;
 
         let results = self.results(&entries, &tasks, &log)?;
         let text = self.head(&fingerprint) + &results.markdown();
@@ -122,7 +127,7 @@ impl Tables {
     /// Every planner there is, with each network in it.
     fn entries(&self) -> anyhow::Result<Vec<Entry>> {
         let entry = |method: &str, learnt, planner: &str, file: Option<&Path>| {
-            let sha256 = file.map(|path| hash(path).with_context(|| path.display().to_string())).transpose()?;
+            let sha256 = file.map(hash).transpose()?;
             anyhow::Ok(Entry { method: method.to_owned(), learnt, planner: planner.to_owned(), sha256 })
         };
         let mut entries = vec![entry("random", None, "random", None)?, entry("shaf", None, "shaf", None)?];
@@ -157,8 +162,14 @@ impl Tables {
         Ok(entries)
     }
 
-    fn tasks(&self, entries: &[Entry], fingerprint: &str) -> Vec<Task> {
+    fn tasks(&self, entries: &[Entry], fingerprint: &str) -> anyhow::Result<Vec<Task>> {
         let mut tasks = Vec::new();
+        let others = self.others.iter().map(|folder| Ok((name_of(folder), hash_folder(folder)?)));
+        let others: Vec<(String, String)> = others.collect::<anyhow::Result<_>>()?;
+        let there = match &self.pybullet {
+            Some(_) => Some(hash_folder(Path::new(FOLDER))? + &hash_folder(Path::new("sim/hand"))?),
+            None => None,
+        };
         for entry in entries {
             for scenario in SCENARIOS {
                 let crossed = entry.learnt.is_some_and(|learnt| learnt != scenario);
@@ -167,51 +178,75 @@ impl Tables {
                 if crossed && of_proposals {
                     continue;
                 }
-                let mut add = |views: &str, epsilon, forced, seed, timed| {
-                    let game = Game {
-                        method: entry.method.clone(),
-                        learnt: entry.learnt.map(str::to_owned),
-                        scenario: scenario.to_owned(),
-                        views: views.to_owned(),
-                        epsilon,
-                        forced,
-                    };
-                    let file = &entry.sha256;
-                    let kind = entry.planner.split(':').next().filter(|_| !is_network || of_proposals);
-                    let on =
-                        (scenario, views, epsilon, forced, seed, if timed { self.timed } else { self.rounds }, timed);
-                    let key = digest(&format!("{kind:?} {file:?} {on:?} {fingerprint}"));
+                let as_published = Game {
+                    method: entry.method.clone(),
+                    learnt: entry.learnt.map(str::to_owned),
+                    scenario: scenario.to_owned(),
+                    objects: TEST_OBJECTS.to_owned(),
+                    simulator: Simulator::Rapier,
+                    views: VIEWS[0].0.to_owned(),
+                    epsilon: EPSILON,
+                    forced: true,
+                };
+                let kind = entry.planner.split(':').next().filter(|_| !is_network || of_proposals);
+                let mut add = |game: Game, of_objects: &str, seed, timed| {
+                    let Game { views, epsilon, forced, .. } = &game;
+                    let scenes = if timed { self.timed } else { self.rounds };
+                    let on = (scenario, views, epsilon, forced, seed, scenes, timed);
+                    let simulator = there.as_ref().filter(|_| game.simulator == Simulator::PyBullet);
+                    let key =
+                        digest(&format!("{kind:?} {:?} {on:?} {fingerprint} {of_objects} {simulator:?}", entry.sha256));
                     tasks.push(Task { key, game, planner: entry.planner.clone(), seed, timed });
                 };
-                for (index, (views, _)) in VIEWS.into_iter().enumerate() {
-                    let seeds = if index == 0 { self.seeds } else { self.seeds.min(SEEDS_ELSEWHERE) };
-                    if index == 0 || is_network && !of_proposals && !crossed {
-                        (self.seed..self.seed + seeds).for_each(|seed| add(views, EPSILON, true, seed, false));
-                    }
+                (self.seed..self.seed + self.seeds).for_each(|seed| add(as_published.clone(), "", seed, false));
+                if crossed {
+                    continue;
                 }
-                if is_network && !of_proposals && !crossed {
-                    let seeds = self.seed..self.seed + self.seeds.min(SEEDS_ELSEWHERE);
-                    for epsilon in EPSILONS {
-                        seeds.clone().for_each(|seed| add(VIEWS[0].0, epsilon, false, seed, false));
-                    }
+                let mut more = Vec::new();
+                if is_network && !of_proposals {
+                    let elsewhere = VIEWS.into_iter().skip(1);
+                    more.extend(elsewhere.map(|(views, _)| Game { views: views.to_owned(), ..as_published.clone() }));
+                    more.extend(EPSILONS.map(|epsilon| Game { epsilon, forced: false, ..as_published.clone() }));
                 }
-                if !crossed {
-                    add(VIEWS[0].0, EPSILON, true, self.seed, true);
+                more.into_iter().for_each(|game| add(game, "", self.seed, false));
+                add(as_published.clone(), "", self.seed, true);
+
+                let planner = PlannerSpec::from(entry.planner.as_str());
+                let is_there = there.is_some()
+                    && (matches!(planner, PlannerSpec::Random) || model(&planner, &self.models).is_some());
+                let ours = (TEST_OBJECTS.to_owned(), String::new());
+                for (objects, hash) in std::iter::once(&ours).chain(&others) {
+                    for simulator in [Simulator::Rapier, Simulator::PyBullet] {
+                        let game = Game { objects: objects.clone(), simulator, ..as_published.clone() };
+                        let is_new = game != as_published;
+                        if is_new && (is_there || simulator == Simulator::Rapier) {
+                            add(game, hash, self.seed, false);
+                        }
+                    }
                 }
             }
         }
-        tasks
+        Ok(tasks)
     }
 
     fn effort(&self, task: &Task) -> u64 {
         if task.timed { self.timed } else { self.rounds }
     }
 
+    /// The folder of a game's objects; `None` of ours.
+    fn folder(&self, game: &Game) -> Option<&Path> {
+        self.others.iter().map(PathBuf::as_path).find(|folder| name_of(folder) == game.objects)
+    }
+
     fn benchmark(&self, game: &Game, seed: u64) -> anyhow::Result<Benchmark> {
-        let scene = if game.scenario == "pile" { Scene::Pile } else { Scene::Packed };
+        let scene = scene_of(&game.scenario);
+        let objects = match self.folder(game) {
+            Some(folder) => ObjectSet::load(folder)?,
+            None => scene.objects("test")?,
+        };
         Ok(Benchmark {
             kind: scene.kind(),
-            objects: scene.objects("test")?,
+            objects,
             count: 5,
             views: parse_views(&game.views).context("views of a table")?,
             noise: 1.0,
@@ -220,9 +255,19 @@ impl Tables {
         })
     }
 
+    fn play_there(&self, task: &Task, pybullet: &mut PyBullet, progress: &ProgressBar) -> anyhow::Result<Played> {
+        let planner = PlannerSpec::from(task.planner.as_str());
+        let model = model(&planner, &self.models);
+        let summary = pybullet.play(&task.game, model.as_ref(), self.folder(&task.game), self.rounds, task.seed)?;
+        progress.inc(self.rounds);
+        let (key, game) = (task.key.clone(), task.game.clone());
+        Ok(Played { key, game, seed: task.seed, summary: Some(summary), milliseconds: None })
+    }
+
     fn play(&self, task: &Task, progress: &ProgressBar) -> anyhow::Result<Played> {
         let benchmark = self.benchmark(&task.game, task.seed)?;
-        let (params, planner) = (params(&task.game), PlannerSpec::from(task.planner.as_str()));
+        let params = params(task.game.epsilon, task.game.forced);
+        let planner = PlannerSpec::from(task.planner.as_str());
         let (mut summary, mut milliseconds) = (None, None);
         if task.timed {
             let mut planner = planner.build(&params, &Options::default())?;
@@ -274,18 +319,25 @@ impl Tables {
     }
 
     fn head(&self, fingerprint: &str) -> String {
+        let pybullet = match &self.pybullet {
+            Some(_) => format!(
+                " In PyBullet ({FOLDER}) networks answer\nthrough graspd, which keeps grasps at the border of the volume; in rapier they \
+                 are dropped, as in GIGA's evaluation."
+            ),
+            None => String::new(),
+        };
         format!(
             "# The paper's tables, here and there\n\n\
              *6-DoF Robotic Grasping with Transformer*, Tables 1–4, beside what `make tables` measured: {} scenes of five unseen\n\
-             procedural objects for each of {} seeds from {} (other cameras and ε than the paper's: {} seeds), noisy depth from\n\
-             one side view, ε = 0.9, `force` down to 0.5, the best grasp first, out_th 0.1. GSR is the share of the grasps that\n\
-             lifted an object, DR that of the objects cleared away; mean ± standard deviation over the seeds. VGN-R are VGN's\n\
-             released weights; the paper states its times for an RTX 3090, here it is {} with {} cores,\n\
-             ONNX Runtime's CPU provider, one observation after another. Simulator and decoding {}.\n\n",
+             procedural objects for each of {} seeds from {} (only the first in PyBullet, and for cameras, ε and objects that the\n\
+             paper does not have), noisy depth from one side view, ε = 0.9, `force` down to 0.5, the best grasp first, out_th 0.1.\n\
+             GSR is the share of the grasps that lifted an object, DR that of the objects cleared away; mean ± standard deviation\n\
+             over the seeds. VGN-R are VGN's released weights; the paper states its times for an RTX 3090, here it is\n\
+             {} with {} cores, ONNX Runtime's CPU provider, one observation after another.\n\
+             Simulator and decoding {}.{pybullet}\n\n",
             self.rounds,
             self.seeds,
             self.seed,
-            self.seeds.min(SEEDS_ELSEWHERE),
             processor(),
             std::thread::available_parallelism().map_or(1, |n| n.get()),
             &fingerprint[..12],
@@ -293,113 +345,18 @@ impl Tables {
     }
 }
 
-/// Between a network's output and the grasps, in a game.
-fn params(game: &Game) -> DecodeParams {
-    let benchmark = DecodeParams::benchmark();
-    let force = benchmark.force.filter(|_| game.forced);
-    DecodeParams { threshold: f32::from(game.epsilon) / 100.0, force, ..benchmark }
+/// Between a network's output and the grasps: ε in hundredths, and whether the best grasp is taken below it.
+fn params(epsilon: u8, forced: bool) -> DecodeParams {
+    let force = Some(FORCE).filter(|_| forced);
+    DecodeParams { threshold: f32::from(epsilon) / 100.0, force, ..DecodeParams::benchmark() }
 }
 
-/// What was played, in a file.
-struct Log {
-    path: PathBuf,
-    file: File,
-    played: BTreeMap<String, Played>,
+fn scene_of(scenario: &str) -> Scene {
+    if scenario == "pile" { Scene::Pile } else { Scene::Packed }
 }
 
-impl Log {
-    fn open(path: &Path) -> anyhow::Result<Self> {
-        let context = || path.display().to_string();
-        if let Some(folder) = path.parent() {
-            fs::create_dir_all(folder).with_context(context)?;
-        }
-        let mut played = BTreeMap::new();
-        if path.exists() {
-            for line in BufReader::new(File::open(path).with_context(context)?).lines() {
-                // What a killed run left half written is played again.
-                if let Ok(line) = serde_json::from_str::<Played>(&line.with_context(context)?) {
-                    played.insert(line.key.clone(), line);
-                }
-            }
-        }
-        let file = OpenOptions::new().append(true).create(true).open(path).with_context(context)?;
-        Ok(Self { path: path.to_owned(), file, played })
-    }
-
-    fn append(&mut self, played: Played) -> anyhow::Result<()> {
-        // After a half-written line a new one begins.
-        let line = format!("\n{}\n", serde_json::to_string(&played)?);
-        self.file.write_all(line.as_bytes()).with_context(|| self.path.display().to_string())?;
-        self.played.insert(played.key.clone(), played);
-        Ok(())
-    }
-
-    /// Drops what no table needs any more, and puts the rest in the order of the tables.
-    fn keep(&mut self, tasks: &[Task]) -> anyhow::Result<()> {
-        let context = || self.path.display().to_string();
-        let lines = tasks.iter().filter_map(|task| self.played.get(&task.key));
-        let text = lines.map(|line| Ok(serde_json::to_string(line)? + "\n")).collect::<anyhow::Result<String>>()?;
-        let partial = self.path.with_extension("jsonl.partial");
-        fs::write(&partial, text).with_context(context)?;
-        fs::rename(&partial, &self.path).with_context(context)
-    }
-}
-
-/// Changes when the simulator does: a hash of two labelled scenes.
-fn simulator() -> String {
-    let scenes = [Scene::Pile, Scene::Packed].map(|scene| {
-        let recipe = Recipe {
-            kind: scene.kind(),
-            objects: ObjectSet::procedural(Split::PileTest),
-            points: 10,
-            views: parse_views(VIEWS[0].0).expect("the paper's view is one"),
-            looks: 1,
-            noise: 1.0,
-            seed: 1,
-        };
-        recipe.label(1)
-    });
-    digest(&format!("{scenes:?}"))
-}
-
-/// Changes when decoding does: a hash of what is found in a volume and maps by chance.
-fn decoding() -> String {
-    /// The edge of a block in which quality is the same: smoothing must leave something to be found.
-    const BLOCK: usize = 8;
-    let blocks = RESOLUTION / BLOCK;
-    let mut rng = ChaCha8Rng::seed_from_u64(1);
-    let mut draw = |count: usize| (0..count).map(|_| rng.random()).collect::<Vec<f32>>();
-    let (coarse, values) = (draw(blocks.pow(3)), draw(RESOLUTION.pow(3)));
-    let width: Vec<f32> = draw(RESOLUTION.pow(3)).iter().map(|width| 10.0 * width).collect();
-    let block =
-        |i: usize| [i / (RESOLUTION * RESOLUTION), i / RESOLUTION % RESOLUTION, i % RESOLUTION].map(|c| c / BLOCK);
-    let quality: Vec<f32> =
-        (0..RESOLUTION.pow(3)).map(block).map(|[x, y, z]| coarse[(x * blocks + y) * blocks + z]).collect();
-    let rotation = [[0.5; RESOLUTION.pow(3)]; 4].concat();
-    let maps = Maps { quality: &quality, rotation: &rotation, width: &width };
-    let voxel_size = WORKSPACE_SIZE / RESOLUTION as f64;
-    let volume = Volume::new(RESOLUTION, voxel_size, Isometry3::identity(), values).expect("values in [0, 1]");
-    let game = |forced| Game {
-        method: String::new(),
-        learnt: None,
-        scenario: String::new(),
-        views: String::new(),
-        epsilon: EPSILON,
-        forced,
-    };
-    let found = [true, false].map(|forced| {
-        let decoded = decode(&volume, &maps, &params(&game(forced))).expect("maps of the volume's size");
-        decoded.grasps
-    });
-    digest(&format!("{found:?}"))
-}
-
-fn digest(text: &str) -> String {
-    Sha256::digest(text).iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-fn hash(path: &Path) -> std::io::Result<String> {
-    Ok(Sha256::digest(fs::read(path)?).iter().map(|byte| format!("{byte:02x}")).collect())
+fn name_of(folder: &Path) -> String {
+    folder.file_name().unwrap_or(folder.as_os_str()).to_string_lossy().into_owned()
 }
 
 fn thousands(number: &str) -> String {

@@ -1,7 +1,7 @@
 //! Household-like objects without end, each made from a seed.
 //!
 //! A kind — a bottle, a mug, a pair of pliers — draws its proportions at random; then the size is
-//! brought within a gripper's world and a material gives the mass.
+//! drawn from that of real things, and a material gives the mass.
 
 mod dice;
 mod food;
@@ -20,12 +20,13 @@ use shape::Shape;
 
 /// Friction of everything, that of the public grasping sets.
 const FRICTION: f64 = 1.0;
-/// What a gripper that opens 80 mm can just take, metres.
-const GRASPABLE: f64 = 0.072;
-/// The longest object, metres.
-const LONGEST: f64 = 0.22;
+/// Ranges of the greatest length of the shortest, the middle and the longest side, metres. Real things are large
+/// for a gripper that opens 80 mm: of 88 household things, half are wider than that in two directions.
+const SIDES: [(f64, f64); 3] = [(0.055, 0.077), (0.05, 0.17), (0.12, 0.28)];
 /// The least length of the longest side, metres.
 const SMALLEST: f64 = 0.045;
+/// What an arm with such a gripper lifts, kg.
+const HEAVIEST: f64 = 1.5;
 
 /// Seeds of the objects that are in no split.
 pub(super) const ENDLESS: Range<u64> = 1 << 32..1 << 63;
@@ -112,7 +113,7 @@ pub fn object(seed: u64) -> Object {
     // Now and then one is full, or cast.
     let filling = if dice.chance(0.25) { dice.between(1.5, 5.0) } else { 1.0 };
     let density = dice.between(kind.density.0, kind.density.1) * filling;
-    let mass = density * parts.iter().map(Mesh::volume).sum::<f64>();
+    let mass = (density * parts.iter().map(Mesh::volume).sum::<f64>()).min(HEAVIEST);
     let name = format!("{}_{seed}", kind.name);
     // What the camera sees is exactly what the fingers touch.
     Object { name, visual: Mesh::union(&parts), parts, mass, friction: FRICTION }
@@ -131,25 +132,20 @@ fn kind_of(seed: u64) -> &'static Kind {
     &KINDS[(seed % KINDS.len() as u64) as usize]
 }
 
-/// Whether an object suits a packed test: of a kind that stands upright, and 5–16 cm high.
+/// Whether an object suits a packed test: of a kind that stands upright, and 5–21 cm high.
 fn is_upright(seed: u64) -> bool {
-    kind_of(seed).upright && (0.05..0.16).contains(&object(seed).visual.extents().z)
+    kind_of(seed).upright && (0.05..0.21).contains(&object(seed).visual.extents().z)
 }
 
-/// A shape centred on its bounding box and scaled to sizes that suit the gripper: of most, two
-/// sides fit between its fingers; some are too big for any grasp but one on a rim or handle.
+/// A shape centred on its bounding box, and as large as the greatest lengths drawn for its sides allow.
 fn fitted(shape: Shape, dice: &mut Dice) -> Shape {
     let (low, high) = shape.bounds();
     let centre = nalgebra::center(&low, &high);
     let mut sides: [f64; 3] = (high - low).into();
     sides.sort_by(f64::total_cmp);
-    let [_, middle, longest] = sides;
 
-    let mut scale = 1.0;
-    if middle > GRASPABLE && dice.chance(0.85) || middle < 0.6 * GRASPABLE && dice.chance(0.5) {
-        scale = dice.between(0.75, 1.0) * GRASPABLE / middle;
-    }
-    scale = scale.min(LONGEST / longest).max(SMALLEST / longest);
+    let fits = SIDES.iter().zip(sides).map(|(&(least, most), side)| dice.between(least, most) / side);
+    let scale = fits.fold(f64::INFINITY, f64::min).max(SMALLEST / sides[2]);
     shape.shifted(-centre.x, -centre.y, -centre.z).stretched(scale, scale, scale)
 }
 
@@ -209,8 +205,8 @@ mod tests {
             let (low, high) = object.visual.bounds();
             assert!((low + high.coords).coords.norm() < 1e-6, "{}: off centre", object.name);
             let size = high - low;
-            assert!(size.min() > 0.003 && (0.044..0.23).contains(&size.max()), "{}: {size:?}", object.name);
-            assert!((0.002..5.0).contains(&object.mass), "{}: {} kg", object.name, object.mass);
+            assert!(size.min() > 0.003 && (0.044..0.29).contains(&size.max()), "{}: {size:?}", object.name);
+            assert!((0.002..=HEAVIEST).contains(&object.mass), "{}: {} kg", object.name, object.mass);
         }
         let graspable = |object: &&Object| object.visual.extents().min() < 0.075;
         let all = all();

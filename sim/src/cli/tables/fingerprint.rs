@@ -1,0 +1,79 @@
+//! What the results depend on, as hashes: where one changes, its tables are played again.
+
+use std::path::{Path, PathBuf};
+use std::{fs, io};
+
+use anyhow::Context;
+use grasp::{Maps, RESOLUTION, Volume, WORKSPACE_SIZE, decode};
+use grasp_sim::label::Recipe;
+use grasp_sim::objects::{ObjectSet, Split};
+use grasp_sim::tables::{EPSILON, VIEWS};
+use nalgebra::Isometry3;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use sha2::{Digest, Sha256};
+
+use super::params;
+use crate::cli::{Scene, parse_views};
+
+/// Changes when the simulator does: a hash of two labelled scenes.
+pub(super) fn simulator() -> String {
+    let scenes = [Scene::Pile, Scene::Packed].map(|scene| {
+        let recipe = Recipe {
+            kind: scene.kind(),
+            objects: ObjectSet::procedural(Split::PileTest),
+            points: 10,
+            views: parse_views(VIEWS[0].0).expect("the paper's view is one"),
+            looks: 1,
+            noise: 1.0,
+            seed: 1,
+        };
+        recipe.label(1)
+    });
+    digest(&format!("{scenes:?}"))
+}
+
+/// Changes when decoding does: a hash of what is found in a volume and maps by chance.
+pub(super) fn decoding() -> String {
+    /// The edge of a block in which quality is the same: smoothing must leave something to be found.
+    const BLOCK: usize = 8;
+    let blocks = RESOLUTION / BLOCK;
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let mut draw = |count: usize| (0..count).map(|_| rng.random()).collect::<Vec<f32>>();
+    let (coarse, values) = (draw(blocks.pow(3)), draw(RESOLUTION.pow(3)));
+    let width: Vec<f32> = draw(RESOLUTION.pow(3)).iter().map(|width| 10.0 * width).collect();
+    let block =
+        |i: usize| [i / (RESOLUTION * RESOLUTION), i / RESOLUTION % RESOLUTION, i % RESOLUTION].map(|c| c / BLOCK);
+    let quality: Vec<f32> =
+        (0..RESOLUTION.pow(3)).map(block).map(|[x, y, z]| coarse[(x * blocks + y) * blocks + z]).collect();
+    let rotation = [[0.5; RESOLUTION.pow(3)]; 4].concat();
+    let maps = Maps { quality: &quality, rotation: &rotation, width: &width };
+    let voxel_size = WORKSPACE_SIZE / RESOLUTION as f64;
+    let volume = Volume::new(RESOLUTION, voxel_size, Isometry3::identity(), values).expect("values in [0, 1]");
+    let found = [true, false].map(|forced| {
+        let decoded = decode(&volume, &maps, &params(EPSILON, forced)).expect("maps of the volume's size");
+        decoded.grasps
+    });
+    digest(&format!("{found:?}"))
+}
+
+pub(super) fn digest(text: &str) -> String {
+    Sha256::digest(text).iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// Of a file.
+pub(super) fn hash(path: &Path) -> anyhow::Result<String> {
+    let bytes = fs::read(path).with_context(|| path.display().to_string())?;
+    Ok(Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect())
+}
+
+/// Of a folder's files, by their names.
+pub(super) fn hash_folder(folder: &Path) -> anyhow::Result<String> {
+    let files: io::Result<Vec<PathBuf>> =
+        fs::read_dir(folder).and_then(|files| files.map(|file| Ok(file?.path())).collect());
+    let mut files = files.with_context(|| folder.display().to_string())?;
+    files.retain(|path| path.is_file());
+    files.sort();
+    let hashes = files.iter().map(|path| Ok(format!("{:?} {}", path.file_name(), hash(path)?)));
+    Ok(digest(&hashes.collect::<anyhow::Result<Vec<_>>>()?.join("\n")))
+}

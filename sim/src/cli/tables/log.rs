@@ -1,0 +1,70 @@
+//! What was played, a JSON line each, so that an interrupted run goes on where it stopped.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File, OpenOptions};
+use std::io::{BufRead, BufReader, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use grasp_sim::score::{Spread, Summary};
+use grasp_sim::tables::Game;
+use serde::{Deserialize, Serialize};
+
+/// A line of what was played.
+#[derive(Clone, Serialize, Deserialize)]
+pub(super) struct Played {
+    /// A hash of everything that it depends on.
+    pub(super) key: String,
+    #[serde(flatten)]
+    pub(super) game: Game,
+    pub(super) seed: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) summary: Option<Summary>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) milliseconds: Option<Spread>,
+}
+
+/// What was played, in a file.
+pub(super) struct Log {
+    path: PathBuf,
+    file: File,
+    pub(super) played: BTreeMap<String, Played>,
+}
+
+impl Log {
+    pub(super) fn open(path: &Path) -> anyhow::Result<Self> {
+        let context = || path.display().to_string();
+        if let Some(folder) = path.parent() {
+            fs::create_dir_all(folder).with_context(context)?;
+        }
+        let mut played = BTreeMap::new();
+        if path.exists() {
+            for line in BufReader::new(File::open(path).with_context(context)?).lines() {
+                // What a killed run left half written is played again.
+                if let Ok(line) = serde_json::from_str::<Played>(&line.with_context(context)?) {
+                    played.insert(line.key.clone(), line);
+                }
+            }
+        }
+        let file = OpenOptions::new().append(true).create(true).open(path).with_context(context)?;
+        Ok(Self { path: path.to_owned(), file, played })
+    }
+
+    pub(super) fn append(&mut self, played: Played) -> anyhow::Result<()> {
+        // After a half-written line a new one begins.
+        let line = format!("\n{}\n", serde_json::to_string(&played)?);
+        self.file.write_all(line.as_bytes()).with_context(|| self.path.display().to_string())?;
+        self.played.insert(played.key.clone(), played);
+        Ok(())
+    }
+
+    /// Drops all but these, and puts them in this order.
+    pub(super) fn keep<'a>(&mut self, keys: impl Iterator<Item = &'a str>) -> anyhow::Result<()> {
+        let context = || self.path.display().to_string();
+        let lines = keys.filter_map(|key| self.played.get(key));
+        let text = lines.map(|line| Ok(serde_json::to_string(line)? + "\n")).collect::<anyhow::Result<String>>()?;
+        let partial = self.path.with_extension("jsonl.partial");
+        fs::write(&partial, text).with_context(context)?;
+        fs::rename(&partial, &self.path).with_context(context)
+    }
+}
