@@ -16,11 +16,11 @@ use crate::engine::{Answer, Engine, Found, Reply, Tensors};
 use crate::health::State;
 use crate::intake;
 use crate::metrics::Metrics;
-use crate::planner::Scene;
 use crate::recent::{Answered, Outcome, Recent};
 use crate::refusal::Refusal;
 use crate::telemetry::{self, REQUEST};
 use crate::timings::Timings;
+use grasp_planner::Scene;
 
 /// Longest request id and frame id, bytes: they are echoed, and the first is logged.
 const MAX_ID: usize = 256;

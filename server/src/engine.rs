@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use grasp::{DecodeError, DecodeParams, Decoded, Dropped, Grasp, Obstacles, Volume, decode};
-use grasp_models::{Backend, Network, Options, Output, RuntimeError, batch_sizes};
+use grasp_models::{Backend, Options, Output, RuntimeError, batch_sizes};
+use grasp_planner::{Loaded, NetworkPlanner, PlanError, PlanParams, Planner, Scene, Source};
 use grasp_proto::{Asked, Collision};
 use nalgebra::Isometry3;
 use prometheus::{Histogram, IntGauge};
@@ -17,7 +18,6 @@ use tracing::{Span, error, info, warn};
 
 use crate::deadline::Deadline;
 use crate::metrics::Metrics;
-use crate::planner::{Classical, Planner, Scene, Source};
 use crate::queue::{Batching, Full, Place, Queue};
 
 /// One planner: its queue, and what is said of it. The sessions that take from the queue end when the engine is dropped.
@@ -108,6 +108,17 @@ pub(crate) enum EngineError {
     Expired,
 }
 
+impl From<PlanError> for EngineError {
+    fn from(error: PlanError) -> Self {
+        match error {
+            PlanError::Run(error) => error.into(),
+            PlanError::Decode(error) => error.into(),
+            // A session asks for as long as the deadline has not passed and the caller waits.
+            PlanError::Cancelled => Self::Expired,
+        }
+    }
+}
+
 /// What a session's answer comes by. Who drops it has gone, and the volume is not looked at any more.
 pub(crate) struct Reply<T> {
     answer: Receiver<T>,
@@ -177,7 +188,7 @@ impl Engine {
         let (mut planners, backend) = source.load(&options, workers)?;
         let mut pace = Duration::ZERO;
         for planner in &mut planners {
-            if let Planner::Network(network) = planner {
+            if let Loaded::Network(network) = planner {
                 pace = warm_up(network, batching.max).with_context(|| format!("the model {label} cannot answer"))?;
             }
         }
@@ -214,7 +225,7 @@ impl Engine {
     /// Queues a volume to have a network's own output, or refuses at once.
     pub fn maps(&self, volume: Volume, deadline: Option<Deadline>, span: Span) -> Result<Reply<Tensors>, Overloaded> {
         let (reply, answer) = oneshot::channel();
-        let place = self.push(Scene { volume, sights: None }, Task::Maps(reply), deadline, span)?;
+        let place = self.push(Scene { volume, points: None }, Task::Maps(reply), deadline, span)?;
         Ok(Reply { answer, _place: place })
     }
 
@@ -280,7 +291,7 @@ impl Sessions {
 
 /// A thread's own planner and its end of the queue.
 struct Session {
-    planner: Planner,
+    planner: Loaded,
     /// How its grasps are chosen, unless a request says otherwise.
     own: DecodeParams,
     queue: Arc<Queue<Job>>,
@@ -299,7 +310,7 @@ struct Taken {
 impl Session {
     fn run(mut self) {
         let alone = Batching { max: 1, delay: Duration::ZERO };
-        let batching = if matches!(self.planner, Planner::Classical(_)) { alone } else { self.batching };
+        let batching = if matches!(self.planner, Loaded::Single(_)) { alone } else { self.batching };
         while let Some(mut jobs) = self.queue.take(batching) {
             let now = Instant::now();
             let expired = |job: &mut Job| job.deadline.is_some_and(|Deadline(deadline)| deadline <= now);
@@ -321,11 +332,11 @@ impl Session {
                 Taken { at: now, inference }
             };
             match planner {
-                Planner::Network(network) => infer(network, *own, jobs, done),
+                Loaded::Network(network) => infer(network, *own, jobs, done),
                 // One at a time: there is nothing to share.
-                Planner::Classical(classical) => {
+                Loaded::Single(planner) => {
                     if let Some(job) = jobs.pop() {
-                        plan(classical, *own, job, done);
+                        plan(planner.as_mut(), *own, job, done);
                     }
                 }
             }
@@ -336,7 +347,7 @@ impl Session {
 }
 
 /// Runs the network over the batch, then makes of each output what is asked for.
-fn infer(network: &mut Network, own: DecodeParams, jobs: Vec<Job>, done: impl FnOnce(Duration) -> Taken) {
+fn infer(network: &mut NetworkPlanner, own: DecodeParams, jobs: Vec<Job>, done: impl FnOnce(Duration) -> Taken) {
     let started = Instant::now();
     let volumes: Vec<&Volume> = jobs.iter().map(|job| &job.scene.volume).collect();
     let output = caught(|| Ok(network.infer(&volumes)?));
@@ -367,14 +378,17 @@ fn infer(network: &mut Network, own: DecodeParams, jobs: Vec<Job>, done: impl Fn
 }
 
 /// Has a planner without a network look at a scene.
-fn plan(classical: &mut Classical, own: DecodeParams, job: Job, done: impl FnOnce(Duration) -> Taken) {
+fn plan(planner: &mut dyn Planner, own: DecodeParams, job: Job, done: impl FnOnce(Duration) -> Taken) {
     let Job { scene, task, deadline, span, submitted } = job;
     let _entered = span.enter();
     match task {
         Task::Grasps(asked, reply) => {
             let started = Instant::now();
             let wanted = || !reply.is_closed() && !deadline.is_some_and(Deadline::has_passed);
-            let decoded = caught(|| classical.plan(&scene, &asked, &asked.decode_params(own), wanted));
+            let decoded = caught(|| {
+                let params = PlanParams { decode: asked.decode_params(own), table: asked.table };
+                Ok(planner.plan(&scene, &params, &wanted)?)
+            });
             let taken = done(started.elapsed());
             answer(reply, submitted, taken, || Ok(found(decoded?, scene.volume, &asked)));
         }
@@ -422,8 +436,8 @@ fn tensors(output: &Output, index: usize) -> Tensors {
 
 /// Has a network answer a batch of each size, and says how long a single volume takes: the first inference of a size
 /// allocates and tunes, no caller should wait for that.
-fn warm_up(network: &mut Network, max_batch: usize) -> Result<Duration, EngineError> {
-    let metadata = network.metadata();
+fn warm_up(network: &mut NetworkPlanner, max_batch: usize) -> Result<Duration, EngineError> {
+    let metadata = network.network().metadata();
     let values = vec![0.5; metadata.resolution.pow(3)];
     let volume = Volume::new(metadata.resolution, metadata.voxel_size, Isometry3::identity(), values);
     let resolution = metadata.resolution;

@@ -13,7 +13,7 @@ use crate::engine::{Engine, Serving, Sessions};
 use crate::health::State;
 use crate::metrics::Metrics;
 use crate::models::Models;
-use crate::planner::Source;
+use grasp_planner::Source;
 
 /// In the folder of models.
 const CLASSIFIERS: &str = "classifiers";

@@ -16,7 +16,6 @@ mod models;
 mod oip;
 mod outbox;
 mod perceive;
-mod planner;
 mod queue;
 mod recent;
 mod refusal;

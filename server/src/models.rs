@@ -4,8 +4,8 @@ use grasp::Volume;
 use grasp_proto::{FieldError, on_a_line, pb};
 
 use crate::engine::Engine;
-use crate::planner::Classical;
 use crate::refusal::Refusal;
+use grasp_planner::Source;
 
 /// The models that are served now.
 #[derive(Default)]
@@ -36,12 +36,12 @@ impl Models {
         let served = self.now();
         let fits = |engine: &Arc<Engine>| match (engine.source.network(), resolution) {
             (Some(network), Some(resolution)) => network.metadata.resolution == resolution,
-            (None, Some(resolution)) => resolution <= Classical::MAX_RESOLUTION,
+            (None, Some(resolution)) => resolution <= Source::MAX_RESOLUTION,
             (_, None) => true,
         };
         let taken = |engine: &Engine| match engine.source.network() {
             Some(network) => format!("{} ({})", network.metadata.resolution, engine.label),
-            None => format!("at most {} ({})", Classical::MAX_RESOLUTION, engine.label),
+            None => format!("at most {} ({})", Source::MAX_RESOLUTION, engine.label),
         };
         let wrong = |taken: &str| {
             let needed = format_args!("the models that could answer take {taken}");

@@ -7,7 +7,7 @@ use grasp_models::Metadata;
 use grasp_proto::{FieldError, Points, Workspace};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 
-use crate::planner::{Scene, Source};
+use grasp_planner::{Scene, Source};
 
 /// The cube that depth is fused into, and how it stands.
 #[derive(Clone, Debug, PartialEq)]
@@ -114,7 +114,7 @@ impl Grid {
             }
             error => FieldError::refused("workspace", error),
         })?;
-        Ok(Scene { volume, sights: sights.filter(|_| self.sights) })
+        Ok(Scene { volume, points: sights.filter(|_| self.sights) })
     }
 }
 

@@ -20,9 +20,9 @@ use crate::engine::{Engine, EngineError};
 use crate::health::draining;
 use crate::models::{Models, check_voxel_size};
 use crate::perceive::{Grid, eyes, rendered, size};
-use crate::planner::Scene;
 use crate::refusal::Refusal;
 use crate::track::{Kept, Track};
+use grasp_planner::Scene;
 
 /// Requests of one stream that wait behind the one being answered: enough that no session waits for the next volume,
 /// and few enough that a stream alone never fills a queue.
@@ -101,7 +101,7 @@ impl Grasps {
             blocking(held, move || Ok(Volume::try_from(&volume)?)).await?
         };
         check_voxel_size(&checked, &engine)?;
-        call.submit(&engine, Scene { volume: checked, sights: None }, asked, origin, None)
+        call.submit(&engine, Scene { volume: checked, points: None }, asked, origin, None)
     }
 
     async fn submit_depth(&self, request: pb::DetectGraspsFromDepthRequest, call: &mut Call) -> Result<Work, Refusal> {

@@ -10,8 +10,8 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use crate::call::Origin;
 use crate::engine::Engine;
 use crate::perceive::{Grid, eyes};
-use crate::planner::Scene;
 use crate::refusal::Refusal;
+use grasp_planner::Scene;
 
 /// How many volumes are kept for calls of TrackGrasps, and for how long without a view.
 pub(crate) struct Kept {

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use crate::camera::{Views, observe};
 use crate::objects::ObjectSet;
 use crate::physics::World;
-use crate::planner::{Observation, Planner, PlannerSpec};
+use crate::planner::{BenchPlanner, Observation, PlannerSpec};
 use crate::scene::{SceneKind, generate, settle};
 use crate::trial::{Outcome, execute};
 
@@ -116,7 +116,7 @@ impl Benchmark {
             .map(|number| {
                 let waiting = idle().pop();
                 let mut player = waiting.map_or_else(|| planner.build(params, options), Ok)?;
-                let round = self.play(number, player.as_mut(), &watch);
+                let round = self.play(number, &mut player, &watch);
                 idle().push(player);
                 watch(Event::Round);
                 round
@@ -139,7 +139,7 @@ impl Benchmark {
         Observation::new(observe(world, &self.views, self.noise, rng))
     }
 
-    fn play(&self, number: u64, planner: &mut dyn Planner, watch: impl Fn(Event<'_>)) -> anyhow::Result<Round> {
+    fn play(&self, number: u64, planner: &mut BenchPlanner, watch: impl Fn(Event<'_>)) -> anyhow::Result<Round> {
         let (mut world, mut rng) = self.scene(number);
         let mut round = Round {
             objects: world.objects().len(),

@@ -3,7 +3,7 @@
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_3, TAU};
 use std::ops::RangeInclusive;
 
-use grasp::{DepthImage, Fusion, Intrinsics};
+use grasp::{DepthImage, Fusion, Intrinsics, SurfacePoint};
 pub use grasp_data::raw::View;
 use nalgebra::{Isometry3, Point3, Vector3};
 use rand::seq::IndexedRandom;
@@ -140,4 +140,14 @@ pub fn fuse(views: &[View], resolution: usize) -> Fusion {
         fusion.integrate(&image, &view.camera_from_task);
     }
     fusion
+}
+
+/// What views see, every pixel with a depth a point, in the task frame.
+#[must_use]
+pub fn points(views: &[View]) -> Vec<SurfacePoint> {
+    let points = views.iter().flat_map(|view| {
+        let image = DepthImage::new(Intrinsics::BENCHMARK, &view.depth).expect("views are of the benchmark's camera");
+        image.points(&view.camera_from_task).collect::<Vec<_>>()
+    });
+    points.collect()
 }

@@ -1,21 +1,20 @@
-//! Grasp planners behind one interface: each looks at the same observation and proposes grasps, best first.
+//! The planners of the benchmark: those that graspd serves, a running graspd, and random grasps.
 
-mod gpd;
-mod network;
 mod random;
 mod server;
-mod shaf;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use grasp::{DecodeParams, Grasp, RESOLUTION, Volume};
 use grasp_models::Options;
+use grasp_planner::{Gpd, HighestProposal, NetworkPlanner, PlanParams, Planner, Scene, Shaf};
 use nalgebra::Isometry3;
 use rand_chacha::ChaCha8Rng;
 
-pub use self::server::depth_view;
-use crate::camera::{View, fuse};
+pub use self::server::{Server, depth_view};
+use crate::TABLE_HEIGHT;
+use crate::camera::{View, fuse, points};
 use crate::label::is_graspable;
 
 /// What a planner is given: depth images, and the volume fused from them.
@@ -43,13 +42,41 @@ impl Observation {
     }
 }
 
-/// Proposes grasps, best first, in the task frame.
-pub trait Planner {
-    /// Plans for one observation. `rng` is the round's own, so that a planner that draws stays reproducible.
+/// A planner of the benchmark.
+pub enum BenchPlanner {
+    /// [`PlannerSpec::Random`].
+    Random,
+    /// [`PlannerSpec::Server`].
+    Server(Server),
+    /// One of those that graspd serves, in this process.
+    Local {
+        /// It.
+        planner: Box<dyn Planner + Send>,
+        /// How it chooses grasps.
+        decode: DecodeParams,
+        /// Whether it reads the point cloud.
+        reads_points: bool,
+    },
+}
+
+impl BenchPlanner {
+    /// Proposes grasps for one observation, best first, in the task frame. `rng` is the round's own, so that random grasps
+    /// stay reproducible.
     ///
     /// # Errors
     /// When the network or the server behind the planner fails.
-    fn plan(&mut self, observation: &Observation, rng: &mut ChaCha8Rng) -> anyhow::Result<Vec<Grasp>>;
+    pub fn plan(&mut self, observation: &Observation, rng: &mut ChaCha8Rng) -> anyhow::Result<Vec<Grasp>> {
+        match self {
+            Self::Random => Ok(random::plan(observation, rng)),
+            Self::Server(server) => server.plan(observation),
+            Self::Local { planner, decode, reads_points } => {
+                let points = reads_points.then(|| points(&observation.views));
+                let scene = Scene { volume: observation.volume.clone(), points };
+                let params = PlanParams { decode: *decode, table: Some(TABLE_HEIGHT) };
+                Ok(planner.plan(&scene, &params, &|| true)?.grasps)
+            }
+        }
+    }
 }
 
 /// Which planner, as written on the command line.
@@ -83,18 +110,36 @@ impl From<&str> for PlannerSpec {
 }
 
 impl PlannerSpec {
-    /// Makes the planner, whose network, if it has one, is run with `options`. A server decodes with its model's own parameters but for the threshold and `force`.
+    /// Makes the planner; its network, if it has one, is run with `options` and its output decoded with `params`. GPD and
+    /// the heuristic choose as they do by default. A server decodes with its model's own parameters but for the threshold
+    /// and `force`.
     ///
     /// # Errors
     /// When the file is not the network or classifier it should be, or the server cannot be reached.
-    pub fn build(&self, params: &DecodeParams, options: &Options) -> anyhow::Result<Box<dyn Planner + Send>> {
+    pub fn build(&self, params: &DecodeParams, options: &Options) -> anyhow::Result<BenchPlanner> {
+        let load = |path: &Path| {
+            let network = NetworkPlanner::load(path, options)?;
+            let decode = DecodeParams { origin: network.network().metadata().voxel_origin, ..*params };
+            anyhow::Ok((network, decode))
+        };
+        let local = |planner: Box<dyn Planner + Send>, decode, reads_points| BenchPlanner::Local {
+            planner,
+            decode,
+            reads_points,
+        };
         Ok(match self {
-            Self::Random => Box::new(random::Random),
-            Self::Network(path) => Box::new(network::Onnx::load(path, params, options)?),
-            Self::Server(address) => Box::new(server::Server::connect(address, params)?),
-            Self::Highest => Box::new(shaf::Geometric),
-            Self::HighestProposed(path) => Box::new(shaf::Proposed::load(path, params, options)?),
-            Self::Gpd(path) => Box::new(gpd::Gpd::load(path)?),
+            Self::Random => BenchPlanner::Random,
+            Self::Server(address) => BenchPlanner::Server(Server::connect(address, params)?),
+            Self::Highest => local(Box::new(Shaf), Shaf::decode_params(), true),
+            Self::Gpd(path) => local(Box::new(Gpd::load(path)?), Gpd::decode_params(), true),
+            Self::Network(path) => {
+                let (network, decode) = load(path)?;
+                local(Box::new(network), decode, false)
+            }
+            Self::HighestProposed(path) => {
+                let (network, decode) = load(path)?;
+                local(Box::new(HighestProposal(network)), decode, false)
+            }
         })
     }
 }

@@ -2,12 +2,13 @@
 
 use std::fs;
 
-use grasp::DecodeParams;
+use grasp::{DecodeParams, Hand, WORKSPACE_SIZE};
 use grasp_data::Candidates;
 use grasp_models::Options;
+use grasp_planner::object_points;
+use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
-use grasp_sim::camera::Views;
-use grasp_sim::candidates::{params, sights};
+use grasp_sim::camera::{Views, points};
 use grasp_sim::label::Recipe;
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::planner::{Observation, PlannerSpec};
@@ -70,8 +71,9 @@ fn shaf_grasps_what_is_highest_and_lifts_it() {
     let observation = benchmark().observe(&world, &mut rng).unwrap();
     let grasps = plan("shaf", &observation);
     assert!(grasps.len() > 10);
-    assert!(grasps.iter().all(|grasp| params().hand.lowest_point(&grasp.pose) >= grasp_sim::TABLE_HEIGHT));
-    let top = sights(&observation.views).iter().map(|point| point.position.z).fold(0.0, f64::max);
+    assert!(grasps.iter().all(|grasp| Hand::GPD.lowest_point(&grasp.pose) >= TABLE_HEIGHT));
+    let seen = object_points(&points(&observation.views), WORKSPACE_SIZE, TABLE_HEIGHT);
+    let top = seen.iter().map(|point| point.position.z).fold(0.0, f64::max);
     let tips = |grasp: &grasp::Grasp| (grasp.pose * nalgebra::Point3::new(0.0, 0.0, grasp::FINGER_DEPTH)).z;
     assert!(tips(&grasps[0]) > top - grasp::FINGER_DEPTH - 0.01, "the fingers close near the top");
     let down = |grasp: &grasp::Grasp| -(grasp.pose.rotation * Vector3::z()).z;

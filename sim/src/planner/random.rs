@@ -3,19 +3,16 @@ use nalgebra::{UnitQuaternion, Vector3};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
-use super::{Observation, Planner};
+use super::Observation;
 use crate::label::{graspable, sample_pose};
 
-pub(super) struct Random;
-
-impl Planner for Random {
-    fn plan(&mut self, observation: &Observation, rng: &mut ChaCha8Rng) -> anyhow::Result<Vec<Grasp>> {
-        let surface = graspable(&observation.views);
-        if surface.is_empty() {
-            return Ok(Vec::new());
-        }
-        let yaw = rng.random_range(0.0..std::f64::consts::PI);
-        let pose = sample_pose(&surface, rng) * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw);
-        Ok(vec![Grasp { pose, width: MAX_OPENING, quality: 0.5 }])
+/// One grasp, or none where no surface can be reached.
+pub(super) fn plan(observation: &Observation, rng: &mut ChaCha8Rng) -> Vec<Grasp> {
+    let surface = graspable(&observation.views);
+    if surface.is_empty() {
+        return Vec::new();
     }
+    let yaw = rng.random_range(0.0..std::f64::consts::PI);
+    let pose = sample_pose(&surface, rng) * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw);
+    vec![Grasp { pose, width: MAX_OPENING, quality: 0.5 }]
 }

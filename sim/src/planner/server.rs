@@ -1,29 +1,31 @@
 use anyhow::Context;
 use grasp::{DecodeParams, Grasp, Intrinsics};
 use grasp_client::{Asked, Client, Depth, DepthView, Extrinsics, Options, Workspace};
-use rand_chacha::ChaCha8Rng;
 use tokio::runtime::Runtime;
 
-use super::{Observation, Planner};
+use super::Observation;
 use crate::camera::View;
 
-pub(super) struct Server {
+/// A running graspd, which is sent the depth images.
+pub struct Server {
     runtime: Runtime,
     client: Client,
     params: DecodeParams,
 }
 
 impl Server {
+    /// Connects to the server at this address.
+    ///
+    /// # Errors
+    /// Where none answers.
     pub fn connect(address: &str, params: &DecodeParams) -> anyhow::Result<Self> {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let client =
             runtime.block_on(Client::connect(address)).with_context(|| format!("no graspd answers at {address}"))?;
         Ok(Self { runtime, client, params: *params })
     }
-}
 
-impl Planner for Server {
-    fn plan(&mut self, observation: &Observation, _: &mut ChaCha8Rng) -> anyhow::Result<Vec<Grasp>> {
+    pub(super) fn plan(&self, observation: &Observation) -> anyhow::Result<Vec<Grasp>> {
         let DecodeParams { threshold, force, .. } = self.params;
         let asked = Asked { threshold: Some(threshold), force, ..Asked::default() };
         let options = Options { asked, ..Options::default() };

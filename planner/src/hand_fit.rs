@@ -1,0 +1,78 @@
+//! Places where the hand fits into a point cloud, which GPD and SHAF choose from.
+
+use std::borrow::Cow;
+
+use grasp::gpd::{Candidate, Cloud, Params, by_sample, is_on_an_object};
+use grasp::{DecodeParams, Decoded, Fusion, Grasp, Hand, SurfacePoint, select};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+
+use crate::{PlanError, PlanParams, Scene};
+
+/// No part of the hand comes closer to the table than this, metres: the noise of a depth camera.
+const TABLE_CLEARANCE: f64 = 0.002;
+
+/// An object is worth grasping if it is wider than this, and narrower than the hand's opening by this, metres.
+const APERTURE_MARGIN: f64 = 0.01;
+
+/// The places in one scene.
+#[derive(Debug)]
+pub struct HandFit {
+    /// The points of the objects.
+    pub cloud: Cloud,
+    /// Where the hand fits.
+    pub candidates: Vec<Candidate>,
+    /// Points that are not of an object.
+    other_points: usize,
+    /// Rotations at which the hand does not fit.
+    misfits: usize,
+}
+
+/// The points of objects on a table, without the table and the border of a cube with an edge of `size` metres.
+#[must_use]
+pub fn object_points(points: &[SurfacePoint], size: f64, table: f64) -> Vec<SurfacePoint> {
+    points.iter().filter(|point| is_on_an_object(&point.position, size, table)).copied().collect()
+}
+
+impl HandFit {
+    /// GPD's parameters for a hand over a table at this height.
+    #[must_use]
+    pub fn params(hand: Hand, table: f64) -> Params {
+        let aperture = APERTURE_MARGIN..=(2.0 * hand.half_opening() - APERTURE_MARGIN);
+        Params { hand, aperture, ..Params::above(table + TABLE_CLEARANCE) }
+    }
+
+    /// Fits the hand.
+    pub(crate) fn of(scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Self, PlanError> {
+        let volume = &scene.volume;
+        let size = volume.resolution() as f64 * volume.voxel_size();
+        let table = params.table.unwrap_or(0.0);
+        let points = match &scene.points {
+            Some(points) => Cow::Borrowed(points),
+            None => Cow::Owned(Fusion::of(volume).surface()),
+        };
+        let of_objects = object_points(&points, size, table);
+        let other_points = points.len() - of_objects.len();
+        let cloud = Cloud::new(of_objects);
+        let fit = Self::params(params.decode.hand.unwrap_or(Hand::GPD), table);
+        let (mut candidates, mut misfits) = (Vec::new(), 0);
+        for of_sample in by_sample(&cloud, &fit, &mut ChaCha8Rng::seed_from_u64(0)) {
+            if !is_wanted() {
+                return Err(PlanError::Cancelled);
+            }
+            misfits += fit.rotations - of_sample.len();
+            candidates.extend(of_sample);
+        }
+        Ok(Self { cloud, candidates, other_points, misfits })
+    }
+
+    /// Those of the grasps, best first, that the parameters let pass.
+    pub(crate) fn select(&self, grasps: Vec<Grasp>, scene: &Scene, params: &DecodeParams) -> Decoded {
+        let pose = scene.volume.pose();
+        let in_frame: Vec<Grasp> = grasps.into_iter().map(|grasp| Grasp { pose: pose * grasp.pose, ..grasp }).collect();
+        let mut decoded = select(&in_frame, &scene.volume, params);
+        decoded.dropped.mask += self.other_points;
+        decoded.dropped.collision += self.misfits;
+        decoded
+    }
+}

@@ -1,0 +1,58 @@
+//! The simple high-point heuristic that GIGA's paper compares with, in its two forms.
+
+use grasp::gpd::ranked;
+use grasp::{DecodeParams, Decoded, Grasp};
+
+use crate::hand_fit::HandFit;
+use crate::{NetworkPlanner, PlanError, PlanParams, Planner, Scene};
+
+/// The highest of the places where the hand fits.
+pub struct Shaf;
+
+impl Shaf {
+    /// Its quality is a rank and no probability, so that nothing is dropped by it.
+    #[must_use]
+    pub fn decode_params() -> DecodeParams {
+        DecodeParams { threshold: 1e-6, ..DecodeParams::default() }
+    }
+}
+
+impl Planner for Shaf {
+    fn plan(&mut self, scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Decoded, PlanError> {
+        let mut fit = HandFit::of(scene, params, is_wanted)?;
+        let grasps = ranked(std::mem::take(&mut fit.candidates));
+        Ok(fit.select(grasps, scene, &params.decode))
+    }
+}
+
+/// The highest of a network's proposals with a quality above 0.5.
+pub struct HighestProposal(pub NetworkPlanner);
+
+impl Planner for HighestProposal {
+    fn plan(&mut self, scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Decoded, PlanError> {
+        let decode = DecodeParams { threshold: 0.5, force: None, ..params.decode };
+        let mut decoded = self.0.plan(scene, &PlanParams { decode, ..*params }, is_wanted)?;
+        highest_first(&mut decoded.grasps);
+        Ok(decoded)
+    }
+}
+
+/// By the height of the grasp's position; the sort is stable, so the better of two equals stays ahead.
+fn highest_first(grasps: &mut [Grasp]) {
+    grasps.sort_by(|a, b| b.pose.translation.z.total_cmp(&a.pose.translation.z));
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Isometry3;
+
+    use super::*;
+
+    #[test]
+    fn the_highest_proposal_comes_first_whatever_its_quality() {
+        let at = |z, quality| Grasp { pose: Isometry3::translation(0.1, 0.1, z), width: 0.05, quality };
+        let mut grasps = [at(0.1, 0.99), at(0.2, 0.6), at(0.15, 0.9), at(0.2, 0.55)];
+        highest_first(&mut grasps);
+        assert_eq!(grasps.map(|grasp| grasp.quality), [0.6, 0.55, 0.9, 0.99]);
+    }
+}

@@ -1,0 +1,141 @@
+//! Each planner on two boxes that stand on a table. `ORT_DYLIB_PATH` must name ONNX Runtime's library.
+
+use std::cell::Cell;
+use std::path::PathBuf;
+
+use grasp::{DecodeParams, Decoded, DepthImage, Fusion, RESOLUTION, SurfacePoint, WORKSPACE_SIZE, seen_from};
+use grasp_models::Options;
+use grasp_planner::{Gpd, HighestProposal, NetworkPlanner, PlanError, PlanParams, Planner, Scene, Shaf};
+use nalgebra::{Isometry3, Point3, Vector3};
+
+const TABLE: f64 = 0.05;
+/// Middle of the base and sides of a high and a low box, metres.
+const BOXES: [([f64; 2], [f64; 3]); 2] = [([0.1, 0.15], [0.04, 0.05, 0.12]), ([0.2, 0.16], [0.045, 0.04, 0.05])];
+/// 2 mm.
+const STEP: f64 = 0.002;
+
+/// The top and the four sides of a box.
+fn surface(([x, y], [a, b, height]): ([f64; 2], [f64; 3])) -> Vec<SurfacePoint> {
+    let steps = |length: f64| (0..=(length / STEP) as usize).map(|i| i as f64 * STEP);
+    let at = |dx: f64, dy: f64, dz: f64, normal| SurfacePoint {
+        position: Point3::new(x - a / 2.0 + dx, y - b / 2.0 + dy, TABLE + dz),
+        normal,
+    };
+    let mut points = Vec::new();
+    for dx in steps(a) {
+        points.extend(steps(b).map(|dy| at(dx, dy, height, Vector3::z())));
+        points.extend(steps(height).flat_map(|dz| [at(dx, 0.0, dz, -Vector3::y()), at(dx, b, dz, Vector3::y())]));
+    }
+    for dy in steps(b) {
+        points.extend(steps(height).flat_map(|dz| [at(0.0, dy, dz, -Vector3::x()), at(a, dy, dz, Vector3::x())]));
+    }
+    points
+}
+
+/// The boxes as a camera in front of them sees them, in a frame.
+fn scene(frame: Isometry3<f64>) -> Scene {
+    let mut points: Vec<SurfacePoint> = BOXES.into_iter().flat_map(surface).collect();
+    let table = (0..150).flat_map(|i| (0..150).map(move |j| (f64::from(i) * STEP, f64::from(j) * STEP)));
+    points.extend(table.map(|(x, y)| SurfacePoint { position: Point3::new(x, y, TABLE), normal: Vector3::z() }));
+    let positions: Vec<Point3<f64>> = points.iter().map(|point| point.position).collect();
+    let view = seen_from(&positions, &Point3::new(0.15, -0.35, 0.45), WORKSPACE_SIZE).unwrap();
+    let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
+    let image = DepthImage::new(view.intrinsics, &view.depth).unwrap();
+    assert!(fusion.integrate(&image, &view.camera_from_task) > 0);
+    Scene { volume: fusion.volume(frame).unwrap(), points: Some(points) }
+}
+
+fn zoo(file: &str) -> PathBuf {
+    [env!("CARGO_MANIFEST_DIR"), "..", "models", "zoo", file].iter().collect()
+}
+
+fn plan(planner: &mut dyn Planner, scene: &Scene, decode: DecodeParams) -> Decoded {
+    planner.plan(scene, &PlanParams { decode, table: Some(TABLE) }, &|| true).unwrap()
+}
+
+fn network() -> NetworkPlanner {
+    NetworkPlanner::load(&zoo("vgn-packed.onnx"), &Options::default()).unwrap()
+}
+
+/// Every planner with its default parameters.
+fn planners() -> Vec<(&'static str, Box<dyn Planner>, DecodeParams)> {
+    let network = network();
+    let decode = network.network().metadata().decode_params();
+    let proposals = NetworkPlanner::load(&zoo("vgn-packed.onnx"), &Options::default()).unwrap();
+    vec![
+        ("network", Box::new(network), decode),
+        ("highest proposal", Box::new(HighestProposal(proposals)), decode),
+        ("gpd", Box::new(Gpd::load(&zoo("classifiers/gpd.onnx")).unwrap()), Gpd::decode_params()),
+        ("shaf", Box::new(Shaf), Shaf::decode_params()),
+    ]
+}
+
+#[test]
+fn every_planner_grasps_the_boxes_and_says_the_same_again() {
+    let scene = scene(Isometry3::identity());
+    for (name, mut planner, decode) in planners() {
+        let decoded = plan(planner.as_mut(), &scene, decode);
+        assert!(!decoded.grasps.is_empty(), "{name}");
+        for grasp in &decoded.grasps {
+            let tip = grasp.pose * Point3::new(0.0, 0.0, grasp::FINGER_DEPTH);
+            let near = |&([x, y], [a, b, height]): &([f64; 2], [f64; 3])| {
+                (tip.x - x).abs() < a && (tip.y - y).abs() < b && tip.z < TABLE + height + 0.02
+            };
+            assert!(BOXES.iter().any(|one| near(one)), "{name}: {tip}");
+            assert!((0.0..=0.08).contains(&grasp.width), "{name}: {}", grasp.width);
+        }
+        assert_eq!(plan(planner.as_mut(), &scene, decode), decoded, "{name}");
+    }
+}
+
+#[test]
+fn grasps_are_in_the_frame_of_the_volume() {
+    let frame = Isometry3::new(Vector3::new(1.0, -2.0, 0.5), Vector3::z() * 0.7);
+    for (name, mut planner, decode) in planners() {
+        let here = plan(planner.as_mut(), &scene(Isometry3::identity()), decode).grasps;
+        let there = plan(planner.as_mut(), &scene(frame), decode).grasps;
+        assert_eq!(here.len(), there.len(), "{name}");
+        for (here, there) in here.iter().zip(&there) {
+            let off = (frame * here.pose).inverse() * there.pose;
+            assert!(off.translation.vector.norm() < 1e-9 && off.rotation.angle() < 1e-6, "{name}");
+        }
+    }
+}
+
+#[test]
+fn grasps_come_best_first_by_the_measure_of_the_planner() {
+    let scene = scene(Isometry3::identity());
+    for (name, mut planner, decode) in planners() {
+        let grasps = plan(planner.as_mut(), &scene, decode).grasps;
+        let falls = |measure: fn(&grasp::Grasp) -> f64| grasps.windows(2).all(|w| measure(&w[0]) >= measure(&w[1]));
+        match name {
+            "highest proposal" => assert!(falls(|grasp| grasp.pose.translation.z)),
+            _ => assert!(falls(|grasp| f64::from(grasp.quality)), "{name}"),
+        }
+    }
+    let highest = plan(&mut Shaf, &scene, Shaf::decode_params()).grasps[0];
+    assert!((highest.pose.translation.x - 0.1).abs() < 0.04, "the high box: {}", highest.pose.translation);
+}
+
+#[test]
+fn without_points_the_surface_of_the_volume_is_taken() {
+    let scene = Scene { points: None, ..scene(Isometry3::identity()) };
+    assert!(!plan(&mut Shaf, &scene, Shaf::decode_params()).grasps.is_empty());
+}
+
+#[test]
+fn planning_stops_once_the_answer_is_not_wanted() {
+    let scene = scene(Isometry3::identity());
+    let params = PlanParams { decode: Shaf::decode_params(), table: Some(TABLE) };
+    let mut gpd = Gpd::load(&zoo("classifiers/gpd.onnx")).unwrap();
+    let planners: [&mut dyn Planner; 2] = [&mut Shaf, &mut gpd];
+    for planner in planners {
+        let calls = Cell::new(0);
+        let is_wanted = || {
+            calls.set(calls.get() + 1);
+            calls.get() < 10
+        };
+        assert!(matches!(planner.plan(&scene, &params, &is_wanted), Err(PlanError::Cancelled)));
+        assert_eq!(calls.get(), 10);
+    }
+}
