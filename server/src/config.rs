@@ -13,10 +13,10 @@ use grasp_models::{Choice, Precision, Provider, Store};
 use tonic::transport::{Certificate, Identity, ServerTlsConfig};
 use tracing_subscriber::EnvFilter;
 
-use crate::auth::Tokens;
-use crate::folder::{Stamps, stamps};
-use crate::intake::Limits;
-use crate::queue::Batching;
+use crate::serving::queue::Batching;
+use crate::serving::reload::{Stamps, stamps};
+use crate::transport::request_body::Limits;
+use crate::transport::tokens::Tokens;
 
 /// Everything that can be set, checked.
 pub(crate) struct Config {

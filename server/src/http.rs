@@ -15,22 +15,22 @@ use tokio::sync::watch;
 use tokio_stream::wrappers::WatchStream;
 use tokio_stream::{Stream, StreamExt};
 
-use crate::health::State;
-use crate::metrics::Metrics;
-use crate::models::Models;
-use crate::recent::Recent;
+use crate::readiness::State;
+use crate::serving::registry::ModelRegistry;
+use crate::telemetry::metrics::Metrics;
+use crate::telemetry::recent::RecentRequests;
 
 /// What the HTTP listener shows.
 #[derive(Clone)]
-pub(crate) struct Pages {
+pub(crate) struct HttpState {
     pub metrics: Arc<Metrics>,
-    pub models: Arc<Models>,
-    pub recent: Arc<Recent>,
+    pub models: Arc<ModelRegistry>,
+    pub recent: Arc<RecentRequests>,
 }
 
 /// What a machine asks over HTTP: Prometheus its metrics, an orchestrator whether to restart or to send requests. And a page
 /// for people, with what it reads.
-pub(crate) async fn serve(listener: TcpListener, pages: Pages, state: watch::Receiver<State>) -> io::Result<()> {
+pub(crate) async fn serve(listener: TcpListener, pages: HttpState, state: watch::Receiver<State>) -> io::Result<()> {
     let (metrics, now) = (Arc::clone(&pages.metrics), state.clone());
     let mut app = Router::new()
         .route("/metrics", get(async move || ([(CONTENT_TYPE, Metrics::CONTENT_TYPE)], metrics.render(*now.borrow()))))
@@ -38,7 +38,7 @@ pub(crate) async fn serve(listener: TcpListener, pages: Pages, state: watch::Rec
         .route("/readyz", get(async move || readiness(*state.borrow())));
     if pages.recent.is_kept() {
         let page = Router::new()
-            .route("/", get(Html(include_str!("page.html"))))
+            .route("/", get(Html(include_str!("http/page.html"))))
             .route("/api/requests", get(requests))
             .route("/api/requests/{number}", get(request))
             .route("/api/models", get(models))
@@ -57,20 +57,20 @@ fn readiness(state: State) -> impl IntoResponse {
 }
 
 /// The latest requests in short, the last one first.
-async fn requests(Shared(pages): Shared<Pages>) -> Json<Value> {
+async fn requests(Shared(pages): Shared<HttpState>) -> Json<Value> {
     Json(pages.recent.list())
 }
 
 /// One of them, with the observed surface and the grasps.
-async fn request(Path(number): Path<u64>, Shared(pages): Shared<Pages>) -> Result<Json<Value>, StatusCode> {
+async fn request(Path(number): Path<u64>, Shared(pages): Shared<HttpState>) -> Result<Json<Value>, StatusCode> {
     // A mesh takes some milliseconds, which the threads that move messages do not have.
     let found = tokio::task::spawn_blocking(move || pages.recent.get(number)).await;
     found.ok().flatten().map(Json).ok_or(StatusCode::NOT_FOUND)
 }
 
 /// What is served, and what runs it.
-async fn models(Shared(pages): Shared<Pages>) -> Json<Value> {
-    let model = |engine: &Arc<crate::engine::Engine>| {
+async fn models(Shared(pages): Shared<HttpState>) -> Json<Value> {
+    let model = |engine: &Arc<crate::serving::engine::Engine>| {
         json!({
             "name": engine.source.name(),
             "version": engine.source.version(),
@@ -82,7 +82,7 @@ async fn models(Shared(pages): Shared<Pages>) -> Json<Value> {
 }
 
 /// The number of the last request, whenever there is another.
-async fn events(Shared(pages): Shared<Pages>) -> Sse<impl Stream<Item = Result<Event, Infallible>>> {
+async fn events(Shared(pages): Shared<HttpState>) -> Sse<impl Stream<Item = Result<Event, Infallible>>> {
     let numbers = WatchStream::new(pages.recent.last());
     Sse::new(numbers.map(|number| Ok(Event::default().data(number.to_string())))).keep_alive(KeepAlive::default())
 }

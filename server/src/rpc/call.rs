@@ -11,15 +11,15 @@ use tonic::{Code, Request, Status};
 use tracing::field::Empty;
 use tracing::{Span, debug, info, info_span};
 
-use crate::deadline::{self, Deadline};
-use crate::engine::{Answer, Engine, Found, Reply, Tensors};
-use crate::health::State;
-use crate::intake;
-use crate::metrics::Metrics;
-use crate::recent::{Answered, Outcome, Recent};
-use crate::refusal::Refusal;
-use crate::telemetry::{self, REQUEST};
-use crate::timings::Timings;
+use crate::readiness::State;
+use crate::rpc::refusal::Refusal;
+use crate::serving::engine::{Detection, Engine, Reply, SessionOutput, Tensors};
+use crate::telemetry::metrics::Metrics;
+use crate::telemetry::recent::{Answered, Outcome, RecentRequests};
+use crate::telemetry::subscriber::{self, REQUEST};
+use crate::telemetry::timings::StageTimings;
+use crate::transport::deadline::{self, Deadline};
+use crate::transport::request_body::unreadable_message;
 use grasp_planner::Scene;
 
 /// Longest request id and frame id, bytes: they are echoed, and the first is logged.
@@ -32,7 +32,7 @@ const WARM_UP: Duration = Duration::from_secs(1);
 #[derive(Clone)]
 pub(crate) struct Calls {
     metrics: Arc<Metrics>,
-    recent: Arc<Recent>,
+    recent: Arc<RecentRequests>,
     state: watch::Receiver<State>,
     ids: Arc<RequestIds>,
 }
@@ -44,7 +44,7 @@ pub(crate) struct Call {
     started: Instant,
     span: Span,
     metrics: Arc<Metrics>,
-    recent: Arc<Recent>,
+    recent: Arc<RecentRequests>,
     name: String,
     version: String,
     /// The planner's, empty as long as none is chosen.
@@ -54,36 +54,36 @@ pub(crate) struct Call {
 
 /// Who calls: until when they wait, and what the call is a part of.
 #[derive(Clone, Default)]
-pub(crate) struct Caller {
+pub(crate) struct CallContext {
     deadline: Option<Deadline>,
     parent: Option<Context>,
 }
 
-impl Caller {
+impl CallContext {
     pub fn of<T>(request: &Request<T>) -> Self {
-        Self { deadline: deadline::of(request.extensions()), parent: telemetry::parent(request.metadata()) }
+        Self { deadline: deadline::of(request.extensions()), parent: subscriber::parent(request.metadata()) }
     }
 }
 
 /// What a request that was taken needs for its reply.
-pub(crate) struct Work {
-    reply: Reply<Found>,
+pub(crate) struct PendingReply {
+    reply: Reply<Detection>,
     asked: Asked,
     /// What to look at was made in this time, checking and fusing.
     preprocessing: Duration,
     fusion: Option<Duration>,
-    origin: Origin,
+    origin: FrameStamp,
 }
 
 /// Where and when a request's views were taken: echoed.
 #[derive(Clone, Default)]
-pub(crate) struct Origin {
+pub(crate) struct FrameStamp {
     pub frame_id: String,
     pub stamp: Option<prost_types::Timestamp>,
 }
 
 impl Calls {
-    pub fn new(metrics: Arc<Metrics>, recent: Arc<Recent>, state: watch::Receiver<State>) -> Self {
+    pub fn new(metrics: Arc<Metrics>, recent: Arc<RecentRequests>, state: watch::Receiver<State>) -> Self {
         Self { metrics, recent, state, ids: Arc::new(RequestIds::new()) }
     }
 
@@ -94,11 +94,11 @@ impl Calls {
 
     /// What ends a stream whose messages cannot be read any more.
     pub fn unreadable(&self, status: Status) -> Status {
-        intake::unreadable_message(status, &self.metrics)
+        unreadable_message(status, &self.metrics)
     }
 
     /// Opens a call. What is wrong with its id or its moment is the second of the two.
-    pub fn open(&self, mut id: String, caller: Caller) -> (Call, Result<(), Refusal>) {
+    pub fn open(&self, mut id: String, caller: CallContext) -> (Call, Result<(), Refusal>) {
         let started = Instant::now();
         let mut checked = check_id("request_id", &id).map_err(Refusal::from);
         if id.is_empty() || checked.is_err() {
@@ -108,7 +108,7 @@ impl Calls {
         if checked.is_ok() && *self.state.borrow() == State::Starting {
             checked = Err(Refusal::Starting(WARM_UP));
         }
-        let Caller { deadline, parent } = caller;
+        let CallContext { deadline, parent } = caller;
         let span = info_span!(
             REQUEST,
             otel.kind = "server",
@@ -122,7 +122,7 @@ impl Calls {
             postprocessing = Empty,
             total = Empty,
         );
-        telemetry::adopt(&span, parent);
+        subscriber::adopt(&span, parent);
         let call = Call {
             id,
             deadline,
@@ -139,7 +139,7 @@ impl Calls {
     }
 }
 
-impl Origin {
+impl FrameStamp {
     pub fn checked(
         field: &'static str,
         frame_id: String,
@@ -172,16 +172,16 @@ impl Call {
         engine: &Engine,
         scene: Scene,
         asked: Asked,
-        origin: Origin,
+        origin: FrameStamp,
         fusion: Option<Duration>,
-    ) -> Result<Work, Refusal> {
+    ) -> Result<PendingReply, Refusal> {
         let preprocessing = self.started.elapsed().saturating_sub(fusion.unwrap_or_default());
         let reply = engine.detect(scene, asked.clone(), self.deadline, self.span.clone())?;
-        Ok(Work { reply, asked, preprocessing, fusion, origin })
+        Ok(PendingReply { reply, asked, preprocessing, fusion, origin })
     }
 
     /// Waits for the session, and says in the log and the metrics how it went.
-    pub async fn finish(mut self, work: Result<Work, Refusal>) -> Result<pb::DetectGraspsResponse, Refusal> {
+    pub async fn finish(mut self, work: Result<PendingReply, Refusal>) -> Result<pb::DetectGraspsResponse, Refusal> {
         let outcome = match work {
             Ok(work) => self.reply(work).await,
             Err(refusal) => Err(refusal),
@@ -196,18 +196,18 @@ impl Call {
     }
 
     /// Waits for the maps of each volume, and says how it went. The times are those of the volume that took longest.
-    pub async fn maps(mut self, replies: Vec<Reply<Tensors>>) -> Result<(Vec<Tensors>, Timings), Refusal> {
+    pub async fn maps(mut self, replies: Vec<Reply<Tensors>>) -> Result<(Vec<Tensors>, StageTimings), Refusal> {
         let preprocessing = self.started.elapsed();
         let mut maps = Vec::with_capacity(replies.len());
-        let mut timings = Timings { preprocessing, ..Timings::default() };
+        let mut timings = StageTimings { preprocessing, ..StageTimings::default() };
         for reply in replies {
-            let Answer { made, queue, inference, postprocessing } = match reply.wait(self.deadline).await {
+            let SessionOutput { made, queue, inference, postprocessing } = match reply.wait(self.deadline).await {
                 Ok(answer) => answer,
                 Err(error) => return Err(self.end(error.into())),
             };
             maps.push(made);
             if queue + inference >= timings.queue + timings.inference {
-                timings = Timings { queue, inference, postprocessing, ..timings };
+                timings = StageTimings { queue, inference, postprocessing, ..timings };
             }
         }
         timings.total = self.started.elapsed();
@@ -229,10 +229,10 @@ impl Call {
         self.span.clone()
     }
 
-    async fn reply(&mut self, work: Work) -> Result<pb::DetectGraspsResponse, Refusal> {
-        let Work { reply, asked, preprocessing, fusion, origin } = work;
-        let Answer { made, queue, inference, postprocessing } = reply.wait(self.deadline).await?;
-        let Found { grasps: found, collides, dropped, over_limit, volume } = made;
+    async fn reply(&mut self, work: PendingReply) -> Result<pb::DetectGraspsResponse, Refusal> {
+        let PendingReply { reply, asked, preprocessing, fusion, origin } = work;
+        let SessionOutput { made, queue, inference, postprocessing } = reply.wait(self.deadline).await?;
+        let Detection { grasps: found, collides, dropped, over_limit, volume } = made;
 
         let grasps: Vec<_> = found
             .iter()
@@ -249,7 +249,7 @@ impl Call {
 
         let finger_depth = asked.hand.map_or(grasp::FINGER_DEPTH, |hand| hand.depth);
         let total = self.started.elapsed();
-        let timings = Timings { queue, preprocessing, fusion, inference, postprocessing, total };
+        let timings = StageTimings { queue, preprocessing, fusion, inference, postprocessing, total };
         self.answered(&timings, grasps.len());
         let (pose, size) = (*volume.pose(), volume.voxel_size() * volume.resolution() as f64);
         let volume = Some(volume).filter(|volume| volume.resolution() <= Answered::MAX_RESOLUTION);
@@ -268,9 +268,9 @@ impl Call {
         })
     }
 
-    fn answered(&self, timings: &Timings, grasps: usize) {
+    fn answered(&self, timings: &StageTimings, grasps: usize) {
         timings.record(&self.span);
-        telemetry::stages(&self.span, timings);
+        subscriber::stages(&self.span, timings);
         self.metrics.answered(&self.label, timings, grasps);
         self.span.in_scope(|| debug!(grasps, "answered"));
     }

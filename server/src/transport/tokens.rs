@@ -12,7 +12,7 @@ use tonic::metadata::MetadataMap;
 use tonic::{Code, Request, Status};
 use tracing::{error, info};
 
-use crate::metrics::Metrics;
+use crate::telemetry::metrics::Metrics;
 
 /// Before the token in the header `authorization` (RFC 6750, section 2.1; the scheme's case does not matter).
 const SCHEME: &str = "bearer ";

@@ -6,7 +6,7 @@ use tonic::metadata::{MetadataMap, MetadataValue};
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
-use crate::engine::{EngineError, Overloaded};
+use crate::serving::engine::{EngineError, Overloaded};
 
 /// Why a request gets no grasps.
 #[derive(Debug, Error)]

@@ -13,13 +13,13 @@ use prost::bytes::Bytes;
 use tokio::task::spawn_blocking;
 use tonic::{Request, Response, Status};
 
-use crate::call::{Call, Caller, Calls};
-use crate::engine::{Engine, EngineError, Reply, Tensors};
-use crate::health::State;
-use crate::models::Models;
-use crate::outbox::{Held, Outbox};
-use crate::refusal::Refusal;
-use crate::timings::Timings;
+use crate::readiness::State;
+use crate::rpc::call::{Call, CallContext, Calls};
+use crate::rpc::refusal::Refusal;
+use crate::serving::engine::{Engine, EngineError, Reply, Tensors};
+use crate::serving::registry::ModelRegistry;
+use crate::telemetry::timings::StageTimings;
+use crate::transport::response_buffer::{ResponseBuffer, ResponsePermit};
 
 const FP32: &str = "FP32";
 
@@ -31,16 +31,16 @@ const MAPS_PER_VOXEL: usize = 24;
 
 /// The Open Inference Protocol: a network's own input and output, for tools that know nothing of grasps.
 #[derive(Clone)]
-pub(crate) struct Inference {
-    models: Arc<Models>,
+pub(crate) struct InferenceRpc {
+    models: Arc<ModelRegistry>,
     calls: Calls,
     /// Maps are a hundred times as large as the grasps in them.
-    outbox: Outbox,
+    outbox: ResponseBuffer,
 }
 
-impl Inference {
-    pub fn new(models: Arc<Models>, calls: Calls) -> Self {
-        Self { models, calls, outbox: Outbox::new() }
+impl InferenceRpc {
+    pub fn new(models: Arc<ModelRegistry>, calls: Calls) -> Self {
+        Self { models, calls, outbox: ResponseBuffer::new() }
     }
 
     fn is_ready(&self) -> bool {
@@ -77,7 +77,7 @@ impl Inference {
         }
         let batch = batches(request, n, max_batch(&engine))?;
         let held = self.outbox.hold(batch.len() * MAPS_PER_VOXEL).ok_or_else(|| {
-            let most = Outbox::CAPACITY >> 20;
+            let most = ResponseBuffer::CAPACITY >> 20;
             engine.overloaded(format!("of {most} MiB of maps too few were read yet by those who asked for them"))
         })?;
         let volume = |values: &[f32]| {
@@ -98,7 +98,7 @@ impl Inference {
 struct Queued {
     engine: Arc<Engine>,
     replies: Vec<Reply<Tensors>>,
-    held: Held,
+    held: ResponsePermit,
 }
 
 /// The values of the input, checked: `[batch, 1, n, n, n]`.
@@ -164,7 +164,7 @@ fn response(
     request: oip::ModelInferRequest,
     engine: &Engine,
     maps: &[Tensors],
-    timings: &Timings,
+    timings: &StageTimings,
 ) -> oip::ModelInferResponse {
     let n = edge(engine);
     let mut outputs = Vec::new();
@@ -198,7 +198,7 @@ fn response(
 }
 
 #[tonic::async_trait]
-impl GrpcInferenceService for Inference {
+impl GrpcInferenceService for InferenceRpc {
     async fn server_live(
         &self,
         _: Request<oip::ServerLiveRequest>,
@@ -259,7 +259,7 @@ impl GrpcInferenceService for Inference {
         &self,
         request: Request<oip::ModelInferRequest>,
     ) -> Result<Response<oip::ModelInferResponse>, Status> {
-        let caller = Caller::of(&request);
+        let caller = CallContext::of(&request);
         let request = request.into_inner();
         let (mut call, checked) = self.calls.open(request.id.clone(), caller);
         let id = call.id.clone();
@@ -318,5 +318,5 @@ fn edge(engine: &Engine) -> i64 {
 /// A request whose volumes do not all fit into the queue, or whose maps into the outbox, could never be answered.
 fn max_batch(engine: &Engine) -> usize {
     let maps = (edge(engine) as usize).pow(3) * MAPS_PER_VOXEL;
-    MAX_BATCH.min(engine.capacity()).min(Outbox::CAPACITY / maps.max(1))
+    MAX_BATCH.min(engine.capacity()).min(ResponseBuffer::CAPACITY / maps.max(1))
 }

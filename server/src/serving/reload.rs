@@ -9,10 +9,10 @@ use tokio::sync::watch;
 use tracing::{error, info, warn};
 
 use crate::config::Config;
-use crate::engine::{Engine, Serving, Sessions};
-use crate::health::State;
-use crate::metrics::Metrics;
-use crate::models::Models;
+use crate::readiness::State;
+use crate::serving::engine::{Engine, Serving, SessionThreads};
+use crate::serving::registry::ModelRegistry;
+use crate::telemetry::metrics::Metrics;
 use grasp_planner::Source;
 
 /// In the folder of models.
@@ -22,19 +22,24 @@ const CLASSIFIERS: &str = "classifiers";
 const DEFAULT: &str = "default";
 
 /// Brings the models of a folder into service, and keeps them as the folder has them.
-pub(crate) struct Folder {
+pub(crate) struct ModelFolder {
     directory: PathBuf,
     /// From before it was read first.
     stamps: Stamps,
     default_model: Option<String>,
     serving: Serving,
-    models: Arc<Models>,
-    sessions: Arc<Sessions>,
+    models: Arc<ModelRegistry>,
+    sessions: Arc<SessionThreads>,
     metrics: Arc<Metrics>,
 }
 
-impl Folder {
-    pub fn new(config: &Config, models: Arc<Models>, sessions: Arc<Sessions>, metrics: Arc<Metrics>) -> Self {
+impl ModelFolder {
+    pub fn new(
+        config: &Config,
+        models: Arc<ModelRegistry>,
+        sessions: Arc<SessionThreads>,
+        metrics: Arc<Metrics>,
+    ) -> Self {
         let Config { workers, threads, provider, precision, queue, batching, .. } = *config;
         let options = Options { threads, provider, precision, max_batch: batching.max };
         let serving = Serving { workers, options, capacity: queue, batching };

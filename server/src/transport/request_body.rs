@@ -12,8 +12,8 @@ use tonic::body::Body;
 use tonic::codegen::Bytes;
 use tonic::{Code, Status};
 
-use crate::deadline::Deadline;
-use crate::metrics::Metrics;
+use crate::telemetry::metrics::Metrics;
+use crate::transport::deadline::Deadline;
 
 /// A gRPC message's prefix: whether it is compressed, then its length, four bytes from the highest on.
 const PREFIX: usize = 5;
@@ -34,7 +34,7 @@ pub(crate) struct Limits {
 }
 
 /// The body of a request, held to the limits.
-pub(crate) struct Intake {
+pub(crate) struct RequestBody {
     body: Body,
     /// When the caller gives up. tonic watches over it, too, and calls what it ends cancelled.
     deadline: Option<Deadline>,
@@ -71,7 +71,7 @@ struct Message {
     missing: usize,
 }
 
-impl Intake {
+impl RequestBody {
     /// The body of a request for a method at `path`.
     pub fn new(path: &str, body: Body, deadline: Option<Deadline>, limits: Limits, metrics: Arc<Metrics>) -> Self {
         let rests = STREAMS.iter().any(|stream| path.ends_with(stream));
@@ -207,7 +207,7 @@ impl Message {
     }
 }
 
-impl http_body::Body for Intake {
+impl http_body::Body for RequestBody {
     type Data = Bytes;
     type Error = Status;
 

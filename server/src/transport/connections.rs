@@ -12,7 +12,7 @@ use tonic::transport::server::{Connected, TcpConnectInfo, TcpIncoming};
 use tracing::warn;
 
 /// How many connections may be open, and what is counted of them.
-pub(crate) struct Doors {
+pub(crate) struct ConnectionLimit {
     pub most: usize,
     /// How long one may be open without a word.
     pub patience: Duration,
@@ -22,8 +22,8 @@ pub(crate) struct Doors {
 
 /// The connections of a listener, of which no more than `most` are open at a time: a further one is closed at once, which
 /// clients see as the server being unavailable.
-pub(crate) fn accept(listener: TcpListener, doors: Doors) -> impl Stream<Item = io::Result<Connection>> {
-    let Doors { most, patience, open, refused } = doors;
+pub(crate) fn accept(listener: TcpListener, doors: ConnectionLimit) -> impl Stream<Item = io::Result<Connection>> {
+    let ConnectionLimit { most, patience, open, refused } = doors;
     // `Server::tcp_nodelay` does nothing for a listener that was bound before; without TCP_NODELAY a reply of several
     // packets waits 40 ms for the client to acknowledge the first.
     let accepted = TcpIncoming::from(listener).with_nodelay(Some(true)).then(async |accepted| {
@@ -144,7 +144,12 @@ mod tests {
         let address = listener.local_addr().unwrap();
         let open = IntGauge::new("open", "How many are open.").unwrap();
         let refused = IntCounter::new("refused", "How many were closed at once.").unwrap();
-        let doors = Doors { most: 1, patience: Duration::from_secs(10), open: open.clone(), refused: refused.clone() };
+        let doors = ConnectionLimit {
+            most: 1,
+            patience: Duration::from_secs(10),
+            open: open.clone(),
+            refused: refused.clone(),
+        };
         let mut incoming = pin!(accept(listener, doors));
 
         let _first = TcpStream::connect(address).await.unwrap();

@@ -5,7 +5,7 @@ use tracing::Span;
 
 /// Where a request's time went: the one source of the reply's latency, the span's fields and the histograms.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Timings {
+pub(crate) struct StageTimings {
     pub queue: Duration,
     pub preprocessing: Duration,
     /// Of depth images and points.
@@ -15,7 +15,7 @@ pub(crate) struct Timings {
     pub total: Duration,
 }
 
-impl Timings {
+impl StageTimings {
     /// Each stage that there was with its name, seconds.
     pub fn stages(&self) -> impl Iterator<Item = (&'static str, f64)> {
         let stages = [
@@ -37,8 +37,8 @@ impl Timings {
     }
 }
 
-impl From<&Timings> for pb::Latency {
-    fn from(timings: &Timings) -> Self {
+impl From<&StageTimings> for pb::Latency {
+    fn from(timings: &StageTimings) -> Self {
         Self {
             queue: timings.queue.as_secs_f64(),
             preprocessing: timings.preprocessing.as_secs_f64(),

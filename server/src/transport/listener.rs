@@ -13,14 +13,14 @@ use tonic::transport::{Server, ServerTlsConfig};
 use tonic_health::pb::health_server::HealthServer;
 use tower::util::{MapRequestLayer, MapResponseLayer};
 
-use crate::auth::Tokens;
-use crate::health::{Health, State, draining};
-use crate::intake::{Intake, Limits};
-use crate::metrics::Metrics;
-use crate::oip::Inference;
-use crate::outbox::outgoing;
-use crate::service::Grasps;
-use crate::{auth, connections, deadline, intake};
+use crate::readiness::{Health, State, draining};
+use crate::rpc::grasp_service::GraspRpc;
+use crate::rpc::inference_service::InferenceRpc;
+use crate::telemetry::metrics::Metrics;
+use crate::transport::request_body::{Limits, RequestBody};
+use crate::transport::response_buffer::outgoing;
+use crate::transport::tokens::Tokens;
+use crate::transport::{connections, deadline, request_body, tokens};
 
 /// HTTP/2's default of 64 KiB holds a quarter of a 40³ volume: the client would wait for us four times per request.
 const STREAM_WINDOW: u32 = 4 << 20;
@@ -35,7 +35,7 @@ const KEEPALIVE: Duration = Duration::from_secs(30);
 const MAX_STREAMS: u32 = 256;
 
 /// Who may connect and what is taken.
-pub(crate) struct Entrance {
+pub(crate) struct GrpcConfig {
     /// TLS, where it is spoken.
     pub tls: Option<ServerTlsConfig>,
     /// The tokens that are taken, where one is needed.
@@ -48,13 +48,13 @@ pub(crate) struct Entrance {
 /// Serves until the state is draining and every request that was taken is answered.
 pub(crate) async fn serve(
     listener: TcpListener,
-    entrance: Entrance,
-    service: Grasps,
-    inference: Inference,
+    entrance: GrpcConfig,
+    service: GraspRpc,
+    inference: InferenceRpc,
     metrics: Arc<Metrics>,
     state: watch::Receiver<State>,
 ) -> anyhow::Result<()> {
-    let Entrance { tls, tokens, connections, limits } = entrance;
+    let GrpcConfig { tls, tokens, connections, limits } = entrance;
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
@@ -63,17 +63,17 @@ pub(crate) async fn serve(
     // The limit is kept by the intake, which counts what it refuses.
     let grasps = GraspServiceServer::new(service).max_decoding_message_size(usize::MAX);
     let inference = GrpcInferenceServiceServer::new(inference).max_decoding_message_size(usize::MAX);
-    let guard = auth::guard(tokens, Arc::clone(&metrics));
+    let guard = tokens::guard(tokens, Arc::clone(&metrics));
     let incoming = connections::accept(listener, metrics.connections(connections, limits.stall));
     let counted = Arc::clone(&metrics);
-    let outgoing = MapResponseLayer::new(move |response| outgoing(intake::unreadable(response, &counted)));
+    let outgoing = MapResponseLayer::new(move |response| outgoing(request_body::unreadable(response, &counted)));
     let intake = MapRequestLayer::new(move |request: http::Request<Body>| {
         let (mut parts, body) = request.into_parts();
         let deadline = deadline::read(&parts.headers);
         if let Some(deadline) = deadline {
             parts.extensions.insert(deadline);
         }
-        let body = Intake::new(parts.uri.path(), body, deadline, limits, Arc::clone(&metrics));
+        let body = RequestBody::new(parts.uri.path(), body, deadline, limits, Arc::clone(&metrics));
         http::Request::from_parts(parts, Body::new(body))
     });
     let mut server = Server::builder();

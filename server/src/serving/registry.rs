@@ -3,18 +3,18 @@ use std::sync::{Arc, PoisonError, RwLock};
 use grasp::Volume;
 use grasp_proto::{FieldError, on_a_line, pb};
 
-use crate::engine::Engine;
-use crate::refusal::Refusal;
+use crate::rpc::refusal::Refusal;
+use crate::serving::engine::Engine;
 use grasp_planner::Source;
 
 /// The models that are served now.
 #[derive(Default)]
-pub(crate) struct Models(RwLock<Engines>);
+pub(crate) struct ModelRegistry(RwLock<Engines>);
 
 /// The default first, then by name, the newest version of a name before the older ones.
 pub(crate) type Engines = Arc<[Arc<Engine>]>;
 
-impl Models {
+impl ModelRegistry {
     /// What is served at this moment. Whoever holds it can still ask it, even if others are served meanwhile.
     pub fn now(&self) -> Engines {
         Arc::clone(&self.0.read().unwrap_or_else(PoisonError::into_inner))
@@ -84,8 +84,8 @@ pub(crate) fn check_voxel_size(volume: &Volume, engine: &Engine) -> Result<(), F
     Err(FieldError::new("volume.voxel_size", got, needed))
 }
 
-impl From<&Models> for pb::ListModelsResponse {
-    fn from(models: &Models) -> Self {
+impl From<&ModelRegistry> for pb::ListModelsResponse {
+    fn from(models: &ModelRegistry) -> Self {
         Self { models: models.now().iter().map(|engine| (&**engine).into()).collect() }
     }
 }

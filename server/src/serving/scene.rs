@@ -11,7 +11,7 @@ use grasp_planner::{Scene, Source};
 
 /// The cube that depth is fused into, and how it stands.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Grid {
+pub(crate) struct FusionGrid {
     resolution: usize,
     size: f64,
     /// `T_frame_task`.
@@ -25,7 +25,7 @@ pub(crate) struct Grid {
     sights: bool,
 }
 
-impl Grid {
+impl FusionGrid {
     /// The one that a planner reads, of a workspace that cameras look at from these points of the task frame.
     pub fn of(source: &Source, workspace: &Workspace, eyes: &[Point3<f64>]) -> Result<Self, FieldError> {
         let Workspace { frame_from_task, size, .. } = *workspace;
@@ -87,7 +87,7 @@ impl Grid {
 
     /// Adds views, each of which must see something of the cube. Returns what planners on point clouds want.
     pub fn integrate(&self, fusion: &mut Fusion, views: &[View]) -> Result<Vec<SurfacePoint>, FieldError> {
-        let mut sights = Sights::default();
+        let mut sights = PointSampler::default();
         for (index, view) in views.iter().enumerate() {
             let image = DepthImage::new(view.intrinsics, &view.depth);
             let image = image.map_err(|error| FieldError::refused(format!("views[{index}]"), error))?;
@@ -120,14 +120,14 @@ impl Grid {
 
 /// Points that were seen, thinned out evenly once there are [`MOST`](Self::MOST): images may have millions of pixels, and a
 /// queue of requests that hold them would fill the memory.
-struct Sights {
+struct PointSampler {
     points: Vec<SurfacePoint>,
     /// One of so many is kept.
     every: usize,
     passed: usize,
 }
 
-impl Sights {
+impl PointSampler {
     /// Far more than the planners, which thin them again, look at: 10 MB.
     const MOST: usize = 200_000;
 
@@ -147,7 +147,7 @@ impl Sights {
     }
 }
 
-impl Default for Sights {
+impl Default for PointSampler {
     fn default() -> Self {
         Self { points: Vec::new(), every: 1, passed: 0 }
     }
@@ -205,10 +205,10 @@ mod tests {
 
     #[test]
     fn points_are_thinned_out_evenly() {
-        let mut sights = Sights::default();
+        let mut sights = PointSampler::default();
         let point = |x: usize| SurfacePoint { position: Point3::new(x as f64, 0.0, 0.0), normal: Vector3::z() };
-        (0..5 * Sights::MOST).for_each(|x| sights.add(point(x)));
-        assert!((Sights::MOST / 2..Sights::MOST).contains(&sights.points.len()));
+        (0..5 * PointSampler::MOST).for_each(|x| sights.add(point(x)));
+        assert!((PointSampler::MOST / 2..PointSampler::MOST).contains(&sights.points.len()));
         assert!(sights.points.windows(2).all(|pair| pair[1].position.x - pair[0].position.x == 8.0));
     }
 

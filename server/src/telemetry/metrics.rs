@@ -12,10 +12,10 @@ use prometheus::{
 use tonic::Code;
 use tracing_appender::non_blocking::ErrorCounter;
 
-use crate::connections::Doors;
-use crate::engine::{Engine, Gauges};
-use crate::health::State;
-use crate::timings::Timings;
+use crate::readiness::State;
+use crate::serving::engine::{Engine, Gauges};
+use crate::telemetry::timings::StageTimings;
+use crate::transport::connections::ConnectionLimit;
 
 /// Seconds. Dense from a cached wake-up to a large network on a slow CPU, whose queue is full.
 const BUCKETS: [f64; 33] = [
@@ -139,7 +139,7 @@ impl Metrics {
     }
 
     /// A request was answered.
-    pub fn answered(&self, model: &str, timings: &Timings, grasps: usize) {
+    pub fn answered(&self, model: &str, timings: &StageTimings, grasps: usize) {
         for (stage, seconds) in timings.stages() {
             self.stages.with_label_values(&[model, stage]).observe(seconds);
         }
@@ -179,7 +179,7 @@ impl Metrics {
 
     /// What is measured of a model's queue.
     pub fn gauges(&self, model: &str) -> Gauges {
-        for (stage, _) in Timings::default().stages() {
+        for (stage, _) in StageTimings::default().stages() {
             self.stages.with_label_values(&[model, stage]);
         }
         for code in [Code::Ok, Code::Internal, Code::ResourceExhausted, Code::DeadlineExceeded, Code::Cancelled] {
@@ -189,9 +189,9 @@ impl Metrics {
     }
 
     /// Of connections, of which so many may be open.
-    pub fn connections(&self, most: usize, patience: Duration) -> Doors {
+    pub fn connections(&self, most: usize, patience: Duration) -> ConnectionLimit {
         self.connections_limit.set(i64::try_from(most).unwrap_or(i64::MAX));
-        Doors { most, patience, open: self.connections.clone(), refused: self.connections_refused.clone() }
+        ConnectionLimit { most, patience, open: self.connections.clone(), refused: self.connections_refused.clone() }
     }
 
     /// How many volumes are kept from one view to the next.

@@ -18,15 +18,15 @@ const PIECE: usize = 64 << 10;
 
 /// How much may wait for clients to read it.
 #[derive(Clone)]
-pub(crate) struct Outbox(Arc<Semaphore>);
+pub(crate) struct ResponseBuffer(Arc<Semaphore>);
 
 /// The place of one reply in the outbox, an extension of its response.
 #[derive(Clone)]
-pub(crate) struct Held {
+pub(crate) struct ResponsePermit {
     _permit: Arc<OwnedSemaphorePermit>,
 }
 
-impl Outbox {
+impl ResponseBuffer {
     /// Bytes.
     pub const CAPACITY: usize = 256 << 20;
 
@@ -35,16 +35,16 @@ impl Outbox {
     }
 
     /// A place for a reply of so many bytes, if there is one.
-    pub fn hold(&self, bytes: usize) -> Option<Held> {
+    pub fn hold(&self, bytes: usize) -> Option<ResponsePermit> {
         let units = u32::try_from(bytes.min(Self::CAPACITY).div_ceil(UNIT)).ok()?;
         let permit = Arc::clone(&self.0).try_acquire_many_owned(units).ok()?;
-        Some(Held { _permit: Arc::new(permit) })
+        Some(ResponsePermit { _permit: Arc::new(permit) })
     }
 }
 
 /// Has a reply keep its place until it has been read.
 pub(crate) fn outgoing(mut response: http::Response<Body>) -> http::Response<Body> {
-    match response.extensions_mut().remove::<Held>() {
+    match response.extensions_mut().remove::<ResponsePermit>() {
         Some(held) => response.map(|body| Body::new(Outgoing { body, rest: Bytes::new(), _held: held })),
         None => response,
     }
@@ -54,7 +54,7 @@ pub(crate) fn outgoing(mut response: http::Response<Body>) -> http::Response<Bod
 struct Outgoing {
     body: Body,
     rest: Bytes,
-    _held: Held,
+    _held: ResponsePermit,
 }
 
 impl http_body::Body for Outgoing {
@@ -107,10 +107,10 @@ mod tests {
 
     #[tokio::test]
     async fn a_reply_keeps_its_place_until_it_was_read() {
-        let outbox = Outbox::new();
+        let outbox = ResponseBuffer::new();
         let all = vec![7; 3 * PIECE + 1];
         let mut response = http::Response::new(Body::new(Whole(Some(Bytes::from(all.clone())))));
-        response.extensions_mut().insert(outbox.hold(Outbox::CAPACITY).unwrap());
+        response.extensions_mut().insert(outbox.hold(ResponseBuffer::CAPACITY).unwrap());
         assert!(outbox.hold(1).is_none());
         let mut body = outgoing(response).into_body();
         let mut read = Vec::new();
@@ -121,6 +121,6 @@ mod tests {
         }
         assert_eq!(read, all);
         drop(body);
-        assert!(outbox.hold(Outbox::CAPACITY).is_some());
+        assert!(outbox.hold(ResponseBuffer::CAPACITY).is_some());
     }
 }

@@ -8,19 +8,19 @@ use serde_json::{Value, json};
 use tokio::sync::watch;
 use tonic::Code;
 
-use crate::metrics::code_name;
-use crate::timings::Timings;
+use crate::telemetry::metrics::code_name;
+use crate::telemetry::timings::StageTimings;
 
 /// The latest requests, for whoever looks at the page.
-pub(crate) struct Recent {
+pub(crate) struct RecentRequests {
     most: usize,
-    ended: Mutex<VecDeque<Arc<Ended>>>,
+    ended: Mutex<VecDeque<Arc<RecentRequest>>>,
     /// The number of the last one.
     last: watch::Sender<u64>,
 }
 
 /// A request that came to its end.
-pub(crate) struct Ended {
+pub(crate) struct RecentRequest {
     number: u64,
     at: SystemTime,
     request_id: String,
@@ -33,7 +33,7 @@ pub(crate) struct Ended {
 pub(crate) enum Outcome {
     Answered(Box<Answered>),
     /// By a network's maps, which the caller decodes.
-    Inferred(Timings),
+    Inferred(StageTimings),
     Refused {
         code: Code,
         message: String,
@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 
 /// What was seen, and the grasps in it.
 pub(crate) struct Answered {
-    pub timings: Timings,
+    pub timings: StageTimings,
     /// `T_frame_volume`.
     pub pose: Isometry3<f64>,
     /// Edge of the volume, metres.
@@ -61,7 +61,7 @@ impl Answered {
     pub const MAX_RESOLUTION: usize = 64;
 }
 
-impl Recent {
+impl RecentRequests {
     /// Keeps so many; none at all with 0.
     pub fn new(most: usize) -> Self {
         Self { most, ended: Mutex::default(), last: watch::Sender::new(0) }
@@ -82,7 +82,7 @@ impl Recent {
         if ended.len() == self.most {
             ended.pop_front();
         }
-        ended.push_back(Arc::new(Ended { number, at: SystemTime::now(), request_id, model, outcome }));
+        ended.push_back(Arc::new(RecentRequest { number, at: SystemTime::now(), request_id, model, outcome }));
         drop(ended);
         self.last.send_replace(number);
     }
@@ -104,12 +104,12 @@ impl Recent {
         Some(ended.whole())
     }
 
-    fn lock(&self) -> MutexGuard<'_, VecDeque<Arc<Ended>>> {
+    fn lock(&self) -> MutexGuard<'_, VecDeque<Arc<RecentRequest>>> {
         self.ended.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl Ended {
+impl RecentRequest {
     fn short(&self) -> Value {
         let at = self.at.duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64();
         let mut value = json!({ "number": self.number, "at": at, "request_id": self.request_id, "model": self.model });

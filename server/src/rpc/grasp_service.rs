@@ -14,14 +14,14 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::codegen::BoxStream;
 use tonic::{Request, Response, Status, Streaming};
 
-use crate::call::{Call, Caller, Calls, Origin, Work};
-use crate::deadline::Deadline;
-use crate::engine::{Engine, EngineError};
-use crate::health::draining;
-use crate::models::{Models, check_voxel_size};
-use crate::perceive::{Grid, eyes, rendered, size};
-use crate::refusal::Refusal;
-use crate::track::{Kept, Track};
+use crate::readiness::draining;
+use crate::rpc::call::{Call, CallContext, Calls, FrameStamp, PendingReply};
+use crate::rpc::refusal::Refusal;
+use crate::serving::engine::{Engine, EngineError};
+use crate::serving::registry::{ModelRegistry, check_voxel_size};
+use crate::serving::scene::{FusionGrid, eyes, rendered, size};
+use crate::serving::tracking::{Track, TrackedVolumes};
+use crate::transport::deadline::Deadline;
 use grasp_planner::Scene;
 
 /// Requests of one stream that wait behind the one being answered: enough that no session waits for the next volume,
@@ -34,10 +34,10 @@ const AT_ONCE: usize = 1 << 20;
 
 /// grasp.v1.GraspService.
 #[derive(Clone)]
-pub(crate) struct Grasps {
-    models: Arc<Models>,
+pub(crate) struct GraspRpc {
+    models: Arc<ModelRegistry>,
     calls: Calls,
-    kept: Arc<Kept>,
+    kept: Arc<TrackedVolumes>,
     /// As many requests as there are processors convert and fuse at a time...
     fusing: Arc<Semaphore>,
     /// ... and as many more as a model's queue takes wait for that: a crowd of them would fill the memory.
@@ -45,12 +45,12 @@ pub(crate) struct Grasps {
 }
 
 /// A request that was taken, or refused without anyone having been told yet.
-struct Begun {
+struct PendingCall {
     call: Call,
-    work: Result<Work, Refusal>,
+    work: Result<PendingReply, Refusal>,
 }
 
-impl Begun {
+impl PendingCall {
     async fn finish(self) -> Result<pb::DetectGraspsResponse, Refusal> {
         self.call.finish(self.work).await
     }
@@ -61,34 +61,34 @@ impl Begun {
     }
 }
 
-impl Grasps {
+impl GraspRpc {
     /// `queue` requests may wait to be converted and fused.
-    pub fn new(models: Arc<Models>, calls: Calls, kept: Kept, queue: usize) -> Self {
+    pub fn new(models: Arc<ModelRegistry>, calls: Calls, kept: TrackedVolumes, queue: usize) -> Self {
         let processors = thread::available_parallelism().map_or(1, NonZero::get);
         let semaphore = |places: usize| Arc::new(Semaphore::new(places.min(Semaphore::MAX_PERMITS)));
         let (fusing, turns) = (semaphore(processors), semaphore(processors.saturating_add(queue)));
         Self { models, calls, kept: Arc::new(kept), fusing, turns }
     }
 
-    /// Opens a call and submits what it asks for. What is wrong with it comes out of [`Begun::finish`], like the answer.
+    /// Opens a call and submits what it asks for. What is wrong with it comes out of [`PendingCall::finish`], like the answer.
     async fn begin(
         &self,
         request_id: String,
-        caller: Caller,
-        submit: impl AsyncFnOnce(&mut Call) -> Result<Work, Refusal>,
-    ) -> Begun {
+        caller: CallContext,
+        submit: impl AsyncFnOnce(&mut Call) -> Result<PendingReply, Refusal>,
+    ) -> PendingCall {
         let (mut call, checked) = self.calls.open(request_id, caller);
         let work = match checked {
             Ok(()) => submit(&mut call).await,
             Err(refusal) => Err(refusal),
         };
-        Begun { call, work }
+        PendingCall { call, work }
     }
 
-    async fn submit(&self, request: pb::DetectGraspsRequest, call: &mut Call) -> Result<Work, Refusal> {
+    async fn submit(&self, request: pb::DetectGraspsRequest, call: &mut Call) -> Result<PendingReply, Refusal> {
         let pb::DetectGraspsRequest { volume, options, .. } = request;
         let mut volume = volume.ok_or_else(|| FieldError::new("volume", "absent", "must be given"))?;
-        let origin = Origin::checked("volume.frame_id", std::mem::take(&mut volume.frame_id), volume.stamp)?;
+        let origin = FrameStamp::checked("volume.frame_id", std::mem::take(&mut volume.frame_id), volume.stamp)?;
         let asked = Asked::try_from(&options.unwrap_or_default())?;
         // The model before the data: nothing is converted that no model takes.
         let engine = self.models.select(&asked.model, &asked.version, Some(resolution(&volume)?))?;
@@ -104,7 +104,11 @@ impl Grasps {
         call.submit(&engine, Scene { volume: checked, points: None }, asked, origin, None)
     }
 
-    async fn submit_depth(&self, request: pb::DetectGraspsFromDepthRequest, call: &mut Call) -> Result<Work, Refusal> {
+    async fn submit_depth(
+        &self,
+        request: pb::DetectGraspsFromDepthRequest,
+        call: &mut Call,
+    ) -> Result<PendingReply, Refusal> {
         let pb::DetectGraspsFromDepthRequest { views, workspace, options, .. } = request;
         let count = views.len();
         let seen = move |workspace: &Workspace, _: f64| -> Result<Vec<View>, FieldError> {
@@ -114,7 +118,11 @@ impl Grasps {
         self.submit_views(count, workspace, options, call, seen).await
     }
 
-    async fn submit_cloud(&self, request: pb::DetectGraspsFromCloudRequest, call: &mut Call) -> Result<Work, Refusal> {
+    async fn submit_cloud(
+        &self,
+        request: pb::DetectGraspsFromCloudRequest,
+        call: &mut Call,
+    ) -> Result<PendingReply, Refusal> {
         let pb::DetectGraspsFromCloudRequest { views, workspace, options, .. } = request;
         let count = views.len();
         let seen = move |workspace: &Workspace, size: f64| -> Result<Vec<View>, FieldError> {
@@ -133,11 +141,12 @@ impl Grasps {
         options: Option<pb::Options>,
         call: &mut Call,
         seen: impl FnOnce(&Workspace, f64) -> Result<Vec<View>, FieldError> + Send + 'static,
-    ) -> Result<Work, Refusal> {
+    ) -> Result<PendingReply, Refusal> {
         check_count(count)?;
         let asked = Asked::try_from(&options.unwrap_or_default())?;
         let mut workspace = Workspace::try_from(workspace.unwrap_or_default())?;
-        let origin = Origin::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
+        let origin =
+            FrameStamp::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
         let engine = self.models.select(&asked.model, &asked.version, None)?;
         call.by(&engine);
         let held = (self.turn(&engine)?, self.fusing_place(call).await?);
@@ -152,7 +161,7 @@ impl Grasps {
     }
 
     /// Ends a stream, and counts and tells that.
-    fn refuse(&self, refusal: Refusal, caller: Caller) -> Status {
+    fn refuse(&self, refusal: Refusal, caller: CallContext) -> Status {
         let (call, _) = self.calls.open(String::new(), caller);
         let id = call.id.clone();
         call.end(refusal).status(&id)
@@ -182,7 +191,7 @@ impl Grasps {
         request: pb::TrackGraspsRequest,
         track: &mut Option<Track>,
         call: &mut Call,
-    ) -> Result<Work, Refusal> {
+    ) -> Result<PendingReply, Refusal> {
         let pb::TrackGraspsRequest { views, workspace, options, .. } = request;
         let before = track.as_ref().map(|track| track.asked.clone());
         let asked = match (options, before) {
@@ -210,7 +219,7 @@ fn fuse(
     views: &[View],
 ) -> Result<(Scene, Asked, std::time::Duration), Refusal> {
     let started = Instant::now();
-    let grid = Grid::of(&engine.source, workspace, &eyes(views))?;
+    let grid = FusionGrid::of(&engine.source, workspace, &eyes(views))?;
     let mut fusion = grid.fusion();
     let sights = grid.integrate(&mut fusion, views)?;
     asked.constraints = grid.within(asked.constraints);
@@ -232,12 +241,12 @@ async fn blocking<T: Send + 'static>(
 }
 
 #[tonic::async_trait]
-impl GraspService for Grasps {
+impl GraspService for GraspRpc {
     async fn detect_grasps(
         &self,
         request: Request<pb::DetectGraspsRequest>,
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
-        let caller = Caller::of(&request);
+        let caller = CallContext::of(&request);
         let mut request = request.into_inner();
         let id = std::mem::take(&mut request.request_id);
         self.begin(id, caller, async |call| self.submit(request, call).await).await.respond().await
@@ -247,7 +256,7 @@ impl GraspService for Grasps {
         &self,
         request: Request<pb::DetectGraspsFromDepthRequest>,
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
-        let caller = Caller::of(&request);
+        let caller = CallContext::of(&request);
         let mut request = request.into_inner();
         let id = std::mem::take(&mut request.request_id);
         self.begin(id, caller, async |call| self.submit_depth(request, call).await).await.respond().await
@@ -257,7 +266,7 @@ impl GraspService for Grasps {
         &self,
         request: Request<pb::DetectGraspsFromCloudRequest>,
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
-        let caller = Caller::of(&request);
+        let caller = CallContext::of(&request);
         let mut request = request.into_inner();
         let id = std::mem::take(&mut request.request_id);
         self.begin(id, caller, async |call| self.submit_cloud(request, call).await).await.respond().await
@@ -270,7 +279,7 @@ impl GraspService for Grasps {
         request: Request<Streaming<pb::DetectGraspsRequest>>,
     ) -> Result<Response<Self::DetectGraspsStreamStream>, Status> {
         // The stream's, hence that of every request in it.
-        let caller = Caller::of(&request);
+        let caller = CallContext::of(&request);
         let mut requests = request.into_inner();
         let service = self.clone();
         let (begun, calls) = mpsc::channel(READ_AHEAD);
@@ -293,7 +302,7 @@ impl GraspService for Grasps {
                 }
             }
         });
-        let replies = ReceiverStream::new(calls).then(async |begun: Result<Begun, Status>| {
+        let replies = ReceiverStream::new(calls).then(async |begun: Result<PendingCall, Status>| {
             let begun = begun?;
             let id = begun.call.id.clone();
             Ok(response(id, begun.finish().await))
@@ -307,7 +316,7 @@ impl GraspService for Grasps {
         &self,
         request: Request<Streaming<pb::TrackGraspsRequest>>,
     ) -> Result<Response<Self::TrackGraspsStream>, Status> {
-        let caller = Caller::of(&request);
+        let caller = CallContext::of(&request);
         let mut requests = request.into_inner();
         let service = self.clone();
         let place = self.kept.place().map_err(|refusal| self.refuse(refusal, caller.clone()))?;

@@ -7,14 +7,14 @@ use nalgebra::Isometry3;
 use prometheus::IntGauge;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
-use crate::call::Origin;
-use crate::engine::Engine;
-use crate::perceive::{Grid, eyes};
-use crate::refusal::Refusal;
+use crate::rpc::call::FrameStamp;
+use crate::rpc::refusal::Refusal;
+use crate::serving::engine::Engine;
+use crate::serving::scene::{FusionGrid, eyes};
 use grasp_planner::Scene;
 
 /// How many volumes are kept for calls of TrackGrasps, and for how long without a view.
-pub(crate) struct Kept {
+pub(crate) struct TrackedVolumes {
     places: Arc<Semaphore>,
     most: usize,
     timeout: Duration,
@@ -27,7 +27,7 @@ pub(crate) struct Place {
     gauge: IntGauge,
 }
 
-impl Kept {
+impl TrackedVolumes {
     pub fn new(most: usize, timeout: Duration, gauge: IntGauge) -> Self {
         Self { places: Arc::new(Semaphore::new(most)), most, timeout, gauge }
     }
@@ -56,16 +56,16 @@ impl Drop for Place {
 
 /// A volume that grows from view to view.
 pub(crate) struct Track {
-    grid: Grid,
+    grid: FusionGrid,
     fusion: Fusion,
     frame_from_task: Isometry3<f64>,
-    origin: Origin,
+    origin: FrameStamp,
     /// By the last request that asked for something.
     pub asked: Asked,
 }
 
 /// What is looked at next, what was asked of it, whence it comes, and how long fusing took.
-type Fused = (Scene, Asked, Origin, Duration);
+type Fused = (Scene, Asked, FrameStamp, Duration);
 
 impl Track {
     /// Adds views to the volume, or to a new one where a workspace is given. What is wrong with a view leaves the volume
@@ -105,12 +105,13 @@ impl Track {
         views: &[pb::DepthView],
     ) -> Result<(Self, Vec<View>), Refusal> {
         let mut workspace = Workspace::try_from(workspace)?;
-        let origin = Origin::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
+        let origin =
+            FrameStamp::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
         let frame_from_task = workspace.frame_from_task;
         // How the cube stands may depend on where they were taken from.
         check_count(views.len())?;
         let views = converted(views, &frame_from_task)?;
-        let grid = Grid::of(&engine.source, &workspace, &eyes(&views))?;
+        let grid = FusionGrid::of(&engine.source, &workspace, &eyes(&views))?;
         Ok((Self { fusion: grid.fusion(), grid, frame_from_task, origin, asked: asked.clone() }, views))
     }
 

@@ -1,0 +1,8 @@
+//! Connections, TLS, tokens, deadlines, and limits on what is received and sent.
+
+pub(crate) mod connections;
+pub(crate) mod deadline;
+pub(crate) mod listener;
+pub(crate) mod request_body;
+pub(crate) mod response_buffer;
+pub(crate) mod tokens;
