@@ -12,7 +12,7 @@ pub struct Options {
     /// Names the request in the reply and the server's log; generated there when empty.
     pub request_id: String,
     /// What is asked of the grasps: which planner, how good, where, for which hand.
-    pub asked: pb::Options,
+    pub detect: pb::Options,
     /// The frame of the volume's or the workspace's pose and of the grasps; echoed.
     pub frame_id: String,
     /// When it was seen; echoed.
@@ -138,7 +138,7 @@ impl Options {
     pub(crate) fn request(self, volume: &Volume) -> pb::DetectGraspsRequest {
         let mut volume = encode(volume, self.dtype, self.frame_id);
         volume.stamp = self.stamp.map(Into::into);
-        pb::DetectGraspsRequest { request_id: self.request_id, volume: Some(volume), options: Some(self.asked) }
+        pb::DetectGraspsRequest { request_id: self.request_id, volume: Some(volume), options: Some(self.detect) }
     }
 
     pub(crate) fn depth_request(self, views: &[DepthView], workspace: &Workspace) -> pb::DetectGraspsFromDepthRequest {
@@ -146,7 +146,7 @@ impl Options {
             views: views.iter().map(Into::into).collect(),
             workspace: Some(workspace.message(self.frame_id, self.stamp)),
             request_id: self.request_id,
-            options: Some(self.asked),
+            options: Some(self.detect),
         }
     }
 
@@ -155,7 +155,7 @@ impl Options {
             views: views.iter().map(Into::into).collect(),
             workspace: Some(workspace.message(self.frame_id, self.stamp)),
             request_id: self.request_id,
-            options: Some(self.asked),
+            options: Some(self.detect),
         }
     }
 
@@ -165,7 +165,7 @@ impl Options {
             views: views.iter().map(Into::into).collect(),
             workspace: workspace.map(|workspace| workspace.message(self.frame_id, self.stamp)),
             request_id: self.request_id,
-            options: Some(self.asked),
+            options: Some(self.detect),
         }
     }
 }

@@ -5,7 +5,7 @@
 //! [`LocalServer`] runs a server of one's own for as long as it is needed.
 //!
 //! ```no_run
-//! use grasp_client::{Access, Asked, Client, Depth, DepthView, Extrinsics, Options, Retry, Workspace};
+//! use grasp_client::{Access, Client, Depth, DepthView, DetectOptions, Extrinsics, Options, Retry, Workspace};
 //! use nalgebra::Isometry3;
 //!
 //! # async fn example(millimetres: Vec<u16>, k: [f64; 9], camera_from_task: Isometry3<f64>) -> Result<(), grasp_client::Error> {
@@ -18,8 +18,8 @@
 //!     k,
 //!     extrinsics: Extrinsics::CameraFromTask(camera_from_task),
 //! };
-//! let asked = Asked { max_grasps: 5, ..Asked::default() };
-//! let detection = client.detect_from_depth(&[view], &Workspace::default(), Options { asked, ..Options::default() }).await?;
+//! let detect = DetectOptions { max_grasps: 5, ..DetectOptions::default() };
+//! let detection = client.detect_from_depth(&[view], &Workspace::default(), Options { detect, ..Options::default() }).await?;
 //! for grasp in &detection.grasps {
 //!     println!("{:.2} at {}", grasp.quality, grasp.pose);
 //! }
@@ -38,7 +38,7 @@ pub use access::{Access, Retry, Token};
 pub use client::{Client, Health, Tracking};
 pub use detection::{CloudView, Depth, DepthView, Detection, Extrinsics, Options, Proposal, Workspace};
 pub use error::Error;
-pub use grasp_proto::pb::{self, DataType, Dropped, Latency, Model, Options as Asked};
+pub use grasp_proto::pb::{self, DataType, Dropped, Latency, Model, Options as DetectOptions};
 pub use load::{Arrivals, Report, Until, load};
 pub use local::{LocalServer, LocalServerError};
 pub use tonic::transport::{Certificate, Identity};

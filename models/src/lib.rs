@@ -12,10 +12,10 @@ mod metadata;
 mod networks;
 pub mod onnx;
 mod quantize;
+mod rotation_average;
 mod runtime;
 mod store;
 mod transformer;
-mod turns;
 mod upsampling;
 mod vgn;
 
@@ -24,10 +24,10 @@ pub use heads::{Orientation, with_published_heads};
 pub use metadata::{Metadata, MetadataError, ValueConvention};
 pub use networks::{Architecture, BuildError, build};
 pub use quantize::{QuantizeError, Range, quantized_activations, with_int8};
+pub use rotation_average::{RotationAverageError, averaged_over_rotations};
 pub use runtime::{
     Backend, BackendError, Choice, Classifier, INPUT, LoadError, LoadReason, NameError, Network, OUTPUTS, Options,
     Output, Precision, Provider, RuntimeError, RuntimeInfo, batch_sizes, init,
 };
 pub use store::{Entry, EntryError, Scan, Store, StoreError};
-pub use turns::{TurnsError, averaged_over_turns};
 pub use upsampling::{upsampled_convolutions, upsampled_taps};

@@ -361,7 +361,7 @@ fn cube(input: &crate::onnx::ValueInfoProto) -> Option<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Architecture, Orientation, averaged_over_turns};
+    use crate::{Architecture, Orientation, averaged_over_rotations};
 
     #[test]
     fn a_small_kernel_reads_what_the_large_one_reads() {
@@ -400,7 +400,7 @@ mod tests {
         assert!(weights(&folded) < 2 * weights(&vgn), "the old weights are gone");
         assert!(with_upsampling_folded(&folded).is_none());
 
-        let turns = averaged_over_turns(&vgn).unwrap();
+        let turns = averaged_over_rotations(&vgn).unwrap();
         assert_eq!(count(&with_upsampling_folded(&turns).unwrap(), "Resize"), 1);
         assert!(with_upsampling_folded(&Architecture::TransformerSmall.build(40, 0).unwrap()).is_none());
     }

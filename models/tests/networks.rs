@@ -4,7 +4,7 @@ use std::process::Command;
 
 use grasp_models::onnx::{ModelProto, TensorProto};
 use grasp_models::{
-    Architecture, BuildError, Orientation, Range, averaged_over_turns, build, gpd, quantized_activations,
+    Architecture, BuildError, Orientation, Range, averaged_over_rotations, build, gpd, quantized_activations,
     with_full_weights, with_half_weights, with_int8,
 };
 use prost::Message;
@@ -127,7 +127,7 @@ fn the_onnx_checker_accepts_every_network() {
     let ranges = quantized_activations(&vgn).into_iter().map(|name| (name, Range { low: -1.0, high: 2.0 })).collect();
     let int8 = with_int8(&vgn, &ranges).unwrap();
     let axes = Architecture::Vgn.build_with(40, Orientation::Axes, 0).unwrap();
-    let turns = averaged_over_turns(&axes).unwrap();
+    let turns = averaged_over_rotations(&axes).unwrap();
     let others = [("gpd", gpd::gpd(0)), ("half", half), ("int8", int8), ("axes", axes), ("turns", turns)];
     for (name, model) in networks.into_iter().chain(others) {
         let path = folder.path().join(format!("{name}.onnx"));

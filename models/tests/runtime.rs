@@ -7,8 +7,8 @@ use grasp::gpd::{Candidate, Cloud, Image};
 use grasp::{SurfacePoint, Volume};
 use grasp_models::onnx::{Dimension, ModelProto, StringStringEntryProto, ValueInfoProto};
 use grasp_models::{
-    Architecture, Backend, Classifier, Network, Options, Orientation, Precision, Provider, RuntimeError, TurnsError,
-    averaged_over_turns, build, gpd, init, with_published_heads,
+    Architecture, Backend, Classifier, Network, Options, Orientation, Precision, Provider, RotationAverageError,
+    RuntimeError, averaged_over_rotations, build, gpd, init, with_published_heads,
 };
 use nalgebra::{Isometry3, Point3, Quaternion, UnitQuaternion, Vector3};
 use tempfile::TempDir;
@@ -111,7 +111,7 @@ fn turned(volume: &Volume) -> Volume {
 fn an_average_over_turns_turns_with_the_volume() {
     const N: usize = 16;
     let single = Architecture::Vgn.build_with(N, Orientation::Axes, 3).unwrap();
-    let mut network = load(&averaged_over_turns(&single).unwrap());
+    let mut network = load(&averaged_over_rotations(&single).unwrap());
     let (volume, other) = (volume(N, 1), volume(N, 2));
     let turned = turned(&volume);
     let answers = network.infer(&[&volume, &turned, &other]).unwrap();
@@ -138,9 +138,9 @@ fn an_average_over_turns_turns_with_the_volume() {
     assert!(difference(alone.maps(0).quality, before.quality) > 1e-4, "the network alone does not turn");
 
     let quaternions = build("vgn", 0).unwrap();
-    assert_eq!(averaged_over_turns(&quaternions), Err(TurnsError::NotAxes));
-    let averaged = averaged_over_turns(&Architecture::Vgn.build_with(N, Orientation::Axes, 3).unwrap()).unwrap();
-    assert_eq!(averaged_over_turns(&averaged), Err(TurnsError::Already));
+    assert_eq!(averaged_over_rotations(&quaternions), Err(RotationAverageError::NotAxes));
+    let averaged = averaged_over_rotations(&Architecture::Vgn.build_with(N, Orientation::Axes, 3).unwrap()).unwrap();
+    assert_eq!(averaged_over_rotations(&averaged), Err(RotationAverageError::Already));
 }
 
 #[test]

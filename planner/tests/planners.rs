@@ -81,7 +81,7 @@ fn every_planner_grasps_the_boxes_and_says_the_same_again() {
             let near = |&([x, y], [a, b, height]): &([f64; 2], [f64; 3])| {
                 (tip.x - x).abs() < a && (tip.y - y).abs() < b && tip.z < TABLE + height + 0.02
             };
-            assert!(BOXES.iter().any(|one| near(one)), "{name}: {tip}");
+            assert!(BOXES.iter().any(near), "{name}: {tip}");
             assert!((0.0..=0.08).contains(&grasp.width), "{name}: {}", grasp.width);
         }
         assert_eq!(plan(planner.as_mut(), &scene, decode), decoded, "{name}");

@@ -23,7 +23,7 @@ pub mod oip {
 }
 
 pub use error::{FieldError, on_a_line};
-pub use options::{Asked, Collision, TABLE_HEIGHT};
+pub use options::{Collision, DetectParams, TABLE_HEIGHT};
 pub use pose::pose;
 pub use views::{MAX_VIEWS, Points, Workspace, check_count, cloud_view, depth_view};
 pub use volume::{encode, resolution};

@@ -29,7 +29,7 @@ const PARENT: PoseFields = PoseFields {
 
 /// What is asked of the grasps, checked.
 #[derive(Clone, Debug)]
-pub struct Asked {
+pub struct DetectParams {
     /// Which planner; empty if any.
     pub model: String,
     /// Which version of it; empty for the newest.
@@ -69,7 +69,7 @@ pub enum Collision {
     Filter,
 }
 
-impl Asked {
+impl DetectParams {
     /// A planner's own parameters, with what is asked instead.
     #[must_use]
     pub fn decode_params(&self, own: DecodeParams) -> DecodeParams {
@@ -98,7 +98,7 @@ impl Asked {
     }
 }
 
-impl TryFrom<&pb::Options> for Asked {
+impl TryFrom<&pb::Options> for DetectParams {
     type Error = FieldError;
 
     fn try_from(options: &pb::Options) -> Result<Self, FieldError> {
@@ -276,20 +276,20 @@ mod tests {
     use super::*;
 
     fn refused(options: pb::Options) -> String {
-        Asked::try_from(&options).unwrap_err().to_string()
+        DetectParams::try_from(&options).unwrap_err().to_string()
     }
 
     #[test]
     fn nothing_asked_is_what_the_papers_do() {
-        let asked = Asked::try_from(&pb::Options::default()).unwrap();
+        let params = DetectParams::try_from(&pb::Options::default()).unwrap();
         let own = DecodeParams { threshold: 0.8, force: Some(0.5), ..DecodeParams::default() };
-        assert_eq!(asked.decode_params(own), own);
+        assert_eq!(params.decode_params(own), own);
         let grasp = Isometry3::new(Vector3::new(0.1, 0.2, 0.3), Vector3::new(3.0, 0.0, 0.0));
-        let [pose, pregrasp, retreat] = asked.poses(&grasp);
+        let [pose, pregrasp, retreat] = params.poses(&grasp);
         assert_eq!(pose, grasp);
         let z = |pose: Isometry3<f64>| (grasp.inverse() * pose).translation.vector.z;
         assert!((z(pregrasp) + 0.05).abs() < 1e-12 && (z(retreat) + 0.1).abs() < 1e-12);
-        assert_eq!((asked.collision, asked.table, asked.max_grasps), (Collision::Off, Some(0.05), usize::MAX));
+        assert_eq!((params.collision, params.table, params.max_grasps), (Collision::Off, Some(0.05), usize::MAX));
     }
 
     #[test]
@@ -302,7 +302,7 @@ mod tests {
             ..Default::default()
         };
         let grasp = Isometry3::new(Vector3::new(0.1, 0.2, 0.3), Vector3::new(3.0, 0.0, 0.0));
-        let [pose, _, retreat] = Asked::try_from(&options).unwrap().poses(&grasp);
+        let [pose, _, retreat] = DetectParams::try_from(&options).unwrap().poses(&grasp);
         assert!((retreat.translation.vector - pose.translation.vector - Vector3::new(0.0, 0.0, 0.2)).norm() < 1e-12);
         assert!(
             (pose * Translation3::new(0.0, 0.0, 0.0584)).translation.vector.metric_distance(&grasp.translation.vector)

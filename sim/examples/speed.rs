@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use grasp::RESOLUTION;
 use grasp_sim::camera::{Views, fuse, look};
-use grasp_sim::label::Recipe;
+use grasp_sim::label::SceneConfig;
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::scene::{SceneKind, generate};
 use rand::SeedableRng;
@@ -61,17 +61,17 @@ fn main() {
 impl Times {
     fn measure(kind: SceneKind) -> Self {
         let objects = ObjectSet::procedural(Split::Train);
-        let recipe = Recipe {
+        let config = SceneConfig {
             kind,
             objects: objects.clone(),
             points: 120,
-            views: Views::Anywhere(1..=6),
-            looks: 1,
+            views: Views::Random(1..=6),
+            observations: 1,
             noise: 1.0,
             seed: 1,
         };
         let (points, labelling) =
-            timed(|| (0..SCENES).filter_map(|number| Some(recipe.label(number)?.points.len())).sum());
+            timed(|| (0..SCENES).filter_map(|number| Some(config.label(number)?.points.len())).sum());
 
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let (worlds, generating): (Vec<_>, _) =

@@ -31,7 +31,7 @@ pub enum Views {
     /// VGN's six views on a circle, 30° from the vertical.
     Circle,
     /// So many views from anywhere: azimuth any, polar angle 20–75°, distance 0.48–0.72 m.
-    Anywhere(RangeInclusive<usize>),
+    Random(RangeInclusive<usize>),
     /// As one of these has it, drawn anew for every observation.
     OneOf(Vec<Views>),
 }
@@ -47,7 +47,7 @@ impl Views {
             Self::Circle => (0..6)
                 .map(|i| look_at(&Point3::new(0.15, 0.15, 0.0), 0.6, TAU / 12.0, f64::from(i) * TAU / 6.0))
                 .collect(),
-            Self::Anywhere(count) => {
+            Self::Random(count) => {
                 let count = rng.random_range(count.clone());
                 (0..count)
                     .map(|_| {

@@ -10,10 +10,10 @@ use rand::seq::index;
 
 use crate::TABLE_HEIGHT;
 use crate::camera::{observe, points};
-use crate::label::Recipe;
+use crate::label::SceneConfig;
 use crate::trial;
 
-impl Recipe {
+impl SceneConfig {
     /// Makes scene number `index`, looks at it, and tries up to [`points`](Self::points) random ones of the candidates.
     #[must_use]
     pub fn candidates(&self, index: u64) -> Candidates {

@@ -5,9 +5,9 @@ mod candidates;
 mod convert;
 mod demo;
 mod label;
-mod look;
 mod merge;
 mod objects;
+mod observe;
 mod reliability;
 mod replay;
 mod stats;
@@ -16,7 +16,7 @@ mod tables;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use clap::{Args, Parser, ValueEnum};
 use grasp_picture::{Picture, object_color};
 use grasp_sim::camera::Views;
@@ -30,8 +30,14 @@ use grasp_sim::scene::SceneKind;
 pub enum Command {
     /// Make scenes, try grasps in them, and write what came of it as training data.
     Label(label::Label),
-    /// Look at labelled scenes anew: the same scenes and trials, other views and other noise.
-    Look(look::Look),
+    /// Observe labelled scenes again: the same scenes and trials, other views and other noise.
+    Observe(observe::Observe),
+    /// Is now `observe`.
+    #[command(hide = true, disable_help_flag = true)]
+    Look {
+        #[arg(num_args = 0.., trailing_var_arg = true, allow_hyphen_values = true)]
+        _rest: Vec<String>,
+    },
     /// Turn a data set into another form.
     Convert(convert::Convert),
     /// Join what several machines have labelled.
@@ -59,7 +65,8 @@ impl Command {
     pub fn run(self) -> anyhow::Result<()> {
         match self {
             Self::Label(command) => command.run(),
-            Self::Look(command) => command.run(),
+            Self::Observe(command) => command.run(),
+            Self::Look { .. } => bail!(renamed("look", "observe")),
             Self::Convert(command) => command.run(),
             Self::Merge(command) => command.run(),
             Self::Stats(command) => command.run(),
@@ -81,9 +88,9 @@ struct SceneArgs {
     #[arg(long, value_enum, default_value = "packed")]
     scene: Scene,
 
-    /// The objects: our own, `train`, `test` or `endless` (a new one at every draw), or a folder of URDF files [default:
+    /// The objects: our own, `train`, `test` or `generated` (a new one at every draw), or a folder of URDF files [default:
     /// train to label, else test].
-    #[arg(long)]
+    #[arg(long, value_parser = parse_objects)]
     objects: Option<String>,
 
     /// Of the folder's files by name, `validation` is every fifth, and `train` the others.
@@ -91,9 +98,9 @@ struct SceneArgs {
     part: Part,
 
     /// The cameras: `side[:DEGREES]` (the paper's one view, turned about the vertical), `circle` (six from above), or
-    /// `anywhere:MIN-MAX` (so many from any azimuth, 20–75° off the vertical). Of several, separated by commas, one is
+    /// `random:MIN-MAX` (so many from any azimuth, 20–75° off the vertical). Of several, separated by commas, one is
     /// drawn for each observation.
-    #[arg(long, default_value = "side")]
+    #[arg(long, default_value = "side", value_parser = parse_camera_words)]
     views: String,
 
     /// Share of the observations that carry the benchmark's depth noise.
@@ -146,7 +153,8 @@ impl Scene {
 
     fn objects(self, name: &str) -> anyhow::Result<ObjectSet> {
         Ok(match (name, self) {
-            ("endless", _) => ObjectSet::endless(),
+            // What data sets say that were made before the word was changed.
+            ("generated" | "endless", _) => ObjectSet::generated(),
             ("train", _) => ObjectSet::procedural(Split::Train),
             ("test", Self::Pile) => ObjectSet::procedural(Split::PileTest),
             ("test", Self::Packed) => ObjectSet::procedural(Split::PackedTest),
@@ -182,13 +190,31 @@ impl SceneArgs {
     }
 }
 
+/// A word of the command line that has another name now.
+fn renamed(old: &str, new: &str) -> String {
+    format!("`{old}` is now `{new}`")
+}
+
+fn parse_objects(text: &str) -> Result<String, String> {
+    if text == "endless" { Err(renamed("endless", "generated")) } else { Ok(text.to_owned()) }
+}
+
+fn parse_camera_words(text: &str) -> Result<String, String> {
+    if text.contains("anywhere") { Err(renamed("anywhere", "random")) } else { Ok(text.to_owned()) }
+}
+
+/// Refuses `--looks`.
+fn refuse_looks(_: &str) -> Result<String, String> {
+    Err(renamed("--looks", "--observations"))
+}
+
 fn parse_share(text: &str) -> Result<f64, String> {
     let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
     share.ok_or_else(|| "must be from 0 to 1".to_owned())
 }
 
 /// How cameras are written.
-const VIEWS: &str = "side, side:90, circle, anywhere:1-6, or several with commas between";
+const VIEWS: &str = "side, side:90, circle, random:1-6, or several with commas between";
 
 fn parse_views(text: &str) -> Option<Views> {
     if text.contains(',') {
@@ -199,10 +225,11 @@ fn parse_views(text: &str) -> Option<Views> {
         "side" if rest.is_empty() => Some(Views::Side { azimuth: 0.0 }),
         "side" => Some(Views::Side { azimuth: rest.parse::<f64>().ok()?.to_radians() }),
         "circle" if rest.is_empty() => Some(Views::Circle),
-        "anywhere" => {
+        // What data sets say that were made before the word was changed.
+        "random" | "anywhere" => {
             let (min, max) = rest.split_once('-').unwrap_or((rest, rest));
             let (min, max) = (min.parse().ok()?, max.parse().ok()?);
-            (1 <= min && min <= max).then_some(Views::Anywhere(min..=max))
+            (1 <= min && min <= max).then_some(Views::Random(min..=max))
         }
         _ => None,
     }
@@ -225,12 +252,11 @@ mod tests {
         assert_eq!(parse_views("side"), Some(Views::Side { azimuth: 0.0 }));
         assert_eq!(parse_views("side:180"), Some(Views::Side { azimuth: std::f64::consts::PI }));
         assert_eq!(parse_views("circle"), Some(Views::Circle));
-        assert_eq!(parse_views("anywhere:1-6"), Some(Views::Anywhere(1..=6)));
-        assert_eq!(parse_views("anywhere:2"), Some(Views::Anywhere(2..=2)));
-        let one_of = Views::OneOf(vec![Views::Anywhere(1..=1), Views::Circle]);
-        assert_eq!(parse_views("anywhere:1,circle"), Some(one_of));
-        for wrong in ["", "top", "side:x", "anywhere", "anywhere:0-2", "anywhere:3-2", "circle:1", "side,", "side,top"]
-        {
+        assert_eq!(parse_views("random:1-6"), Some(Views::Random(1..=6)));
+        assert_eq!(parse_views("random:2"), Some(Views::Random(2..=2)));
+        let one_of = Views::OneOf(vec![Views::Random(1..=1), Views::Circle]);
+        assert_eq!(parse_views("random:1,circle"), Some(one_of));
+        for wrong in ["", "top", "side:x", "anywhere", "random:0-2", "random:3-2", "circle:1", "side,", "side,top"] {
             assert_eq!(parse_views(wrong), None, "{wrong}");
         }
     }

@@ -42,7 +42,7 @@ const CLOUD_RESOLUTION: usize = 120;
 
 /// How scenes are made, looked at and tried.
 #[derive(Clone, Debug)]
-pub struct Recipe {
+pub struct SceneConfig {
     /// Pile or packed.
     pub kind: SceneKind,
     /// What the scenes are made of.
@@ -52,7 +52,7 @@ pub struct Recipe {
     /// What the network will see.
     pub views: Views,
     /// How often a scene is looked at anew, with other views and other noise.
-    pub looks: usize,
+    pub observations: usize,
     /// Share of the looks that carry the benchmark's noise.
     pub noise: f64,
     /// Seed of the whole data set.
@@ -65,7 +65,7 @@ pub struct LabelledScene {
     /// What stands in it.
     pub objects: Vec<Placed>,
     /// What was seen of it; at least one.
-    pub looks: Vec<Look>,
+    pub observations: Vec<LabelObservation>,
     /// The grasp points.
     pub points: Vec<Point>,
 }
@@ -83,7 +83,7 @@ pub struct Placed {
 
 /// One observation of a scene.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Look {
+pub struct LabelObservation {
     /// The depth images.
     pub views: Vec<View>,
     /// Their fused values, `[x][y][z]`, [`RESOLUTION`]³.
@@ -129,7 +129,7 @@ impl Point {
     }
 }
 
-impl Recipe {
+impl SceneConfig {
     /// The generator that makes a scene and tries it.
     pub(crate) fn rng(&self, index: u64) -> ChaCha8Rng {
         generator(self.seed, index)
@@ -153,33 +153,33 @@ impl Recipe {
             return None;
         }
         let points = (0..self.points).map(|_| try_point(&world, &cloud, &mut rng)).collect();
-        let looks = self.look_at(&world, index, self.seed);
+        let observations = self.look_at(&world, index, self.seed);
         let objects = world.objects().iter().map(|body| Placed {
             name: body.object.name.clone(),
             scale: body.scale,
             pose: world.pose(body.id),
         });
-        (!looks.is_empty()).then(|| LabelledScene { objects: objects.collect(), looks, points })
+        (!observations.is_empty()).then(|| LabelledScene { objects: objects.collect(), observations, points })
     }
 
     /// Looks at scene number `index` without trying it: other views of the very scene that [`label`](Self::label) makes, or
     /// the same if `seed` is the recipe's own.
     #[must_use]
-    pub fn look_anew(&self, index: u64, seed: u64) -> Vec<Look> {
+    pub fn observe_again(&self, index: u64, seed: u64) -> Vec<LabelObservation> {
         let world = self.scene(&mut self.rng(index));
         self.look_at(&world, index, seed)
     }
 
     /// From a generator of its own, so that how often a scene is looked at does not change its labels.
-    fn look_at(&self, world: &World, index: u64, seed: u64) -> Vec<Look> {
+    fn look_at(&self, world: &World, index: u64, seed: u64) -> Vec<LabelObservation> {
         let mut rng = generator(seed.wrapping_add(1 << 32), index);
-        (0..self.looks).filter_map(|_| self.look(world, &mut rng)).collect()
+        (0..self.observations).filter_map(|_| self.look(world, &mut rng)).collect()
     }
 
-    fn look(&self, world: &World, rng: &mut ChaCha8Rng) -> Option<Look> {
+    fn look(&self, world: &World, rng: &mut ChaCha8Rng) -> Option<LabelObservation> {
         let views = observe(world, &self.views, self.noise, rng);
         let volume = fuse(&views, RESOLUTION).volume(Isometry3::identity()).ok()?.values().to_vec();
-        Some(Look { views, volume })
+        Some(LabelObservation { views, volume })
     }
 }
 

@@ -64,7 +64,7 @@ impl ObjectSet {
 
     /// A new object at every draw, to learn from: none of any test set, hardly ever one twice.
     #[must_use]
-    pub fn endless() -> ObjectSet {
+    pub fn generated() -> ObjectSet {
         ObjectSet { objects: Vec::new() }
     }
 
@@ -87,7 +87,7 @@ impl ObjectSet {
     /// Any of them, each as likely.
     pub fn draw(&self, rng: &mut impl Rng) -> Arc<Object> {
         if self.objects.is_empty() {
-            return Arc::new(procedural::object(rng.random_range(procedural::ENDLESS)));
+            return Arc::new(procedural::object(rng.random_range(procedural::GENERATED)));
         }
         Arc::clone(&self.objects[rng.random_range(0..self.objects.len())])
     }

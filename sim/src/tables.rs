@@ -18,7 +18,7 @@ pub const VIEWS: [(&str, &str); 5] = [
     ("side", "the paper's side view"),
     ("side:90", "turned by 90°"),
     ("side:180", "turned by 180°"),
-    ("anywhere:1-6", "one to six from anywhere"),
+    ("random:1-6", "one to six from anywhere"),
     ("circle", "six from above"),
 ];
 
@@ -54,7 +54,7 @@ impl Simulator {
 
 /// What a cell of a table is about.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-pub struct Game {
+pub struct Condition {
     /// The planner's name in the tables.
     pub method: String,
     /// The scenario that its network learnt from, if it learnt from one only.
@@ -73,7 +73,7 @@ pub struct Game {
     pub forced: bool,
 }
 
-impl Game {
+impl Condition {
     /// Whether the planner's network learnt from the scenario that it is tried on, if it learnt from one only.
     fn learnt_here(&self) -> bool {
         self.learnt.as_ref().is_none_or(|learnt| *learnt == self.scenario)
@@ -94,7 +94,7 @@ impl Game {
 #[derive(Clone, Debug, Default)]
 pub struct Results {
     /// A summary for each seed.
-    pub games: BTreeMap<Game, Vec<Summary>>,
+    pub conditions: BTreeMap<Condition, Vec<Summary>>,
     /// Milliseconds to plan, by method and scenario, one observation at a time.
     pub times: BTreeMap<(String, String), Spread>,
     /// What the networks learnt from, by the names of their files: scenes and grasps.
@@ -144,7 +144,7 @@ impl Results {
         let mut text = String::new();
         self.data(&mut text);
         text.push_str("\n## Table 2: clearing tables\n\n");
-        self.success(&mut text, &PUBLISHED, &self.simulators(), Game::learnt_here);
+        self.success(&mut text, &PUBLISHED, &self.simulators(), Condition::learnt_here);
         self.elsewhere(&mut text);
         text.push_str("\n## Table 3: milliseconds to plan\n\n");
         self.times(&mut text);
@@ -152,7 +152,7 @@ impl Results {
         text.push_str(
             "A network that began with the weights of one for the other scenario has seen it: its card says so.\n\n",
         );
-        self.success(&mut text, &PUBLISHED_CROSSED, &[Simulator::Rapier], |game| !game.learnt_here());
+        self.success(&mut text, &PUBLISHED_CROSSED, &[Simulator::Rapier], |condition| !condition.learnt_here());
         text.push_str("\n## How sure a grasp must be\n\n");
         self.epsilons(&mut text);
         text.push_str("\n## Where the camera stands\n\n");
@@ -176,7 +176,7 @@ impl Results {
 
     /// Those in which tables were cleared.
     fn simulators(&self) -> Vec<Simulator> {
-        self.games.keys().map(|game| game.simulator).collect::<BTreeSet<_>>().into_iter().collect()
+        self.conditions.keys().map(|condition| condition.simulator).collect::<BTreeSet<_>>().into_iter().collect()
     }
 
     fn success(
@@ -184,7 +184,7 @@ impl Results {
         text: &mut String,
         published: &[(&str, [&str; 4])],
         simulators: &[Simulator],
-        wanted: impl Fn(&Game) -> bool,
+        wanted: impl Fn(&Condition) -> bool,
     ) {
         let columns = SCENARIOS.into_iter().flat_map(|scenario| [(scenario, "GSR"), (scenario, "DR")]);
         text.push('|');
@@ -195,17 +195,19 @@ impl Results {
             text.push_str(" | published");
         }
         let _ = writeln!(text, " |\n|{}", "---|".repeat(1 + 4 * (simulators.len() + 1)));
-        let games = || self.games.iter().filter(|(game, _)| game.is_as_published() && wanted(game));
-        for method in in_order(games().map(|(game, _)| game.method.as_str())) {
+        let conditions =
+            || self.conditions.iter().filter(|(condition, _)| condition.is_as_published() && wanted(condition));
+        for method in in_order(conditions().map(|(condition, _)| condition.method.as_str())) {
             let name = method.strip_suffix(LEARNT_BOTH).unwrap_or(method);
             let of_method = published.iter().find(|(other, _)| *other == name).map(|(_, figures)| figures);
             let _ = write!(text, "| {method} ");
             for (column, scenario) in SCENARIOS.into_iter().enumerate() {
                 let played = |simulator| {
-                    let is_it = |game: &Game| {
-                        (game.method.as_str(), game.scenario.as_str(), game.simulator) == (method, scenario, simulator)
+                    let is_it = |condition: &Condition| {
+                        (condition.method.as_str(), condition.scenario.as_str(), condition.simulator)
+                            == (method, scenario, simulator)
                     };
-                    games().find(|(game, _)| is_it(game)).map(|(_, played)| played)
+                    conditions().find(|(condition, _)| is_it(condition)).map(|(_, played)| played)
                 };
                 let figures: [fn(&Summary) -> f64; 2] = [|summary| summary.gsr, |summary| summary.dr];
                 for (index, figure) in figures.into_iter().enumerate() {
@@ -222,8 +224,8 @@ impl Results {
 
     /// A table for each other set of objects.
     fn elsewhere(&self, text: &mut String) {
-        let others = || self.games.iter().filter(|(game, _)| game.objects != TEST_OBJECTS);
-        for objects in others().map(|(game, _)| game.objects.as_str()).collect::<BTreeSet<_>>() {
+        let others = || self.conditions.iter().filter(|(condition, _)| condition.objects != TEST_OBJECTS);
+        for objects in others().map(|(condition, _)| condition.objects.as_str()).collect::<BTreeSet<_>>() {
             let _ = write!(text, "\n### The same with the objects of `{objects}`\n\nGSR / DR in %, pooled.\n\n|");
             let columns: Vec<_> = SCENARIOS
                 .into_iter()
@@ -233,14 +235,15 @@ impl Results {
                 let _ = write!(text, " | {scenario}, {}", simulator.name());
             });
             let _ = writeln!(text, " |\n|{}", "---|".repeat(1 + columns.len()));
-            let games = || others().filter(|(game, _)| game.objects == objects);
-            for method in in_order(games().map(|(game, _)| game.method.as_str())) {
+            let conditions = || others().filter(|(condition, _)| condition.objects == objects);
+            for method in in_order(conditions().map(|(condition, _)| condition.method.as_str())) {
                 let _ = write!(text, "| {method} |");
                 for &(scenario, simulator) in &columns {
-                    let is_it = |game: &Game| {
-                        (game.method.as_str(), game.scenario.as_str(), game.simulator) == (method, scenario, simulator)
+                    let is_it = |condition: &Condition| {
+                        (condition.method.as_str(), condition.scenario.as_str(), condition.simulator)
+                            == (method, scenario, simulator)
                     };
-                    let played = games().find(|(game, _)| is_it(game));
+                    let played = conditions().find(|(condition, _)| is_it(condition));
                     let _ = write!(text, " {} |", played.map_or_else(|| "–".to_owned(), |(_, played)| pooled(played)));
                 }
                 text.push('\n');
@@ -282,8 +285,8 @@ impl Results {
         text.push_str("best grasp is the same whatever ε is.\n\n| |");
         EPSILONS.iter().for_each(|epsilon| text.push_str(&format!(" 0.{epsilon} |")));
         text.push_str(&format!("\n|---|{}\n", "---|".repeat(EPSILONS.len())));
-        let strict = self.games.keys().filter(|game| !game.forced);
-        let cell = |epsilon| move |game: &Game| Game { epsilon, forced: false, ..game.clone() };
+        let strict = self.conditions.keys().filter(|condition| !condition.forced);
+        let cell = |epsilon| move |condition: &Condition| Condition { epsilon, forced: false, ..condition.clone() };
         self.rows(text, strict, EPSILONS.map(cell));
     }
 
@@ -291,11 +294,13 @@ impl Results {
         text.push_str("GSR / DR in rapier in %, pooled.\n\n| |");
         VIEWS.iter().for_each(|(_, name)| text.push_str(&format!(" {name} |")));
         text.push_str(&format!("\n|---|{}\n", "---|".repeat(VIEWS.len())));
-        let others = self.games.keys().filter(|game| game.views != VIEWS[0].0);
+        let others = self.conditions.keys().filter(|condition| condition.views != VIEWS[0].0);
         self.rows(
             text,
             others,
-            VIEWS.map(|(views, _)| move |game: &Game| Game { views: views.to_owned(), ..game.clone() }),
+            VIEWS.map(|(views, _)| {
+                move |condition: &Condition| Condition { views: views.to_owned(), ..condition.clone() }
+            }),
         );
     }
 
@@ -303,15 +308,20 @@ impl Results {
     fn rows<'a>(
         &self,
         text: &mut String,
-        games: impl Iterator<Item = &'a Game>,
-        cells: impl IntoIterator<Item = impl Fn(&Game) -> Game> + Clone,
+        conditions: impl Iterator<Item = &'a Condition>,
+        cells: impl IntoIterator<Item = impl Fn(&Condition) -> Condition> + Clone,
     ) {
-        let as_published =
-            |game: &Game| Game { views: VIEWS[0].0.to_owned(), epsilon: EPSILON, forced: true, ..game.clone() };
-        for game in games.map(as_published).collect::<BTreeSet<_>>() {
-            let _ = write!(text, "| {} on {} |", game.method, game.scenario);
+        let as_published = |condition: &Condition| Condition {
+            views: VIEWS[0].0.to_owned(),
+            epsilon: EPSILON,
+            forced: true,
+            ..condition.clone()
+        };
+        for condition in conditions.map(as_published).collect::<BTreeSet<_>>() {
+            let _ = write!(text, "| {} on {} |", condition.method, condition.scenario);
             for cell in cells.clone() {
-                let figures = self.games.get(&cell(&game)).map_or_else(|| "–".to_owned(), |played| pooled(played));
+                let figures =
+                    self.conditions.get(&cell(&condition)).map_or_else(|| "–".to_owned(), |played| pooled(played));
                 let _ = write!(text, " {figures} |");
             }
             text.push('\n');
@@ -323,9 +333,11 @@ impl Results {
         text.push_str("| | attempts | lifted | blocked at the pre-grasp | closed on nothing | lost in the lift | ");
         text.push_str("rounds | cleared | nothing seen | no proposal | two failures |\n");
         text.push_str("|---|---|---|---|---|---|---|---|---|---|---|\n");
-        let games = || self.games.iter().filter(|(game, _)| game.is_as_published_here());
-        let methods = in_order(games().map(|(game, _)| game.method.as_str()));
-        for (game, played) in methods.iter().flat_map(|method| games().filter(|(game, _)| game.method == *method)) {
+        let conditions = || self.conditions.iter().filter(|(condition, _)| condition.is_as_published_here());
+        let methods = in_order(conditions().map(|(condition, _)| condition.method.as_str()));
+        for (condition, played) in
+            methods.iter().flat_map(|method| conditions().filter(|(condition, _)| condition.method == *method))
+        {
             let sum = |figure: fn(&Summary) -> usize| played.iter().map(figure).sum::<usize>();
             let share = |part: usize, whole: usize| match whole {
                 0 => "–".to_owned(),
@@ -345,8 +357,8 @@ impl Results {
             let _ = writeln!(
                 text,
                 "| {} on {} | {attempts} | {} | {rounds} | {} |",
-                name(game),
-                game.scenario,
+                name(condition),
+                condition.scenario,
                 of_attempts.join(" | "),
                 of_rounds.join(" | ")
             );
@@ -364,10 +376,10 @@ fn in_order<'a>(methods: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
     methods
 }
 
-fn name(game: &Game) -> String {
-    match &game.learnt {
-        Some(learnt) if *learnt != game.scenario => format!("{}, learnt from {learnt},", game.method),
-        _ => game.method.clone(),
+fn name(condition: &Condition) -> String {
+    match &condition.learnt {
+        Some(learnt) if *learnt != condition.scenario => format!("{}, learnt from {learnt},", condition.method),
+        _ => condition.method.clone(),
     }
 }
 

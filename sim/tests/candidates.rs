@@ -9,7 +9,7 @@ use grasp_planner::object_points;
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
 use grasp_sim::camera::{Views, points};
-use grasp_sim::label::Recipe;
+use grasp_sim::label::SceneConfig;
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::planner::{Observation, PlannerSpec};
 use grasp_sim::scene::SceneKind;
@@ -40,18 +40,18 @@ fn plan(spec: &str, observation: &Observation) -> Vec<grasp::Grasp> {
 fn what_is_written_depends_on_the_seed_and_not_on_the_threads() {
     let folder = tempfile::tempdir().unwrap();
     let made = |threads: usize, seed: u64| {
-        let recipe = Recipe {
+        let config = SceneConfig {
             kind: SceneKind::Packed,
             objects: ObjectSet::procedural(Split::Train),
             points: 8,
             views: Views::Side { azimuth: 0.0 },
-            looks: 1,
+            observations: 1,
             noise: 1.0,
             seed,
         };
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let scenes: Vec<Candidates> =
-            pool.install(|| (0..5).into_par_iter().map(|number| recipe.candidates(number)).collect());
+            pool.install(|| (0..5).into_par_iter().map(|number| config.candidates(number)).collect());
         let mut tried = Candidates::default();
         scenes.into_iter().for_each(|candidates| tried.append(candidates));
         assert!(tried.len() > 20 && tried.len() <= 40, "{} candidates", tried.len());

@@ -65,7 +65,7 @@ fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-const LABEL: &str = "label --scene packed --objects endless --views anywhere:1-2 --looks 2 --points 6 --seed 4";
+const LABEL: &str = "label --scene packed --objects generated --views random:1-2 --observations 2 --points 6 --seed 4";
 
 fn bytes_of(folder: &Path) -> u64 {
     let files = fs::read_dir(folder).into_iter().flatten().flatten();
@@ -307,9 +307,9 @@ fn scenes_are_looked_at_anew() {
     let desk = Desk::new();
     desk.run(&format!("{LABEL} --scenes 5 --out data"));
     let before = desk.scenes("data");
-    desk.run("look data --views anywhere:1-2 --looks 2 --seed 4 --out same");
+    desk.run("observe data --views random:1-2 --observations 2 --seed 4 --out same");
     assert_eq!(desk.scenes("same"), before, "with the seed and the views of the labels nothing changes");
-    desk.run("look data --views anywhere:1,circle --looks 3 --noise 0 --seed 9 --out other");
+    desk.run("observe data --views random:1,circle --observations 3 --noise 0 --seed 9 --out other");
     let other = desk.scenes("other");
     assert_eq!(other.len(), before.len());
     for ((id, volumes, trials), (id_before, volumes_before, trials_before)) in other.iter().zip(&before) {
@@ -318,16 +318,16 @@ fn scenes_are_looked_at_anew() {
     }
 
     // Looks may be looked at anew, too, and a run goes on where it stopped.
-    desk.run("look other --views anywhere:1-2 --looks 2 --seed 4 --out again");
+    desk.run("observe other --views random:1-2 --observations 2 --seed 4 --out again");
     assert_eq!(desk.scenes("again"), before);
     let bytes = bytes_of(&desk.path("again"));
-    desk.run("look other --views anywhere:1-2 --looks 2 --seed 4 --out again");
+    desk.run("observe other --views random:1-2 --observations 2 --seed 4 --out again");
     assert_eq!(bytes_of(&desk.path("again")), bytes);
 
     // A data set of another simulator: its first scene looks otherwise.
     let setup = fs::read_to_string(desk.path("data/setup.json")).unwrap();
     fs::write(desk.path("data/setup.json"), setup.replace("\"seed\": 4", "\"seed\": 5")).unwrap();
-    let said = desk.refused("look data --views side --out refused");
+    let said = desk.refused("observe data --views side --out refused");
     assert!(said.contains("another simulator"), "{said}");
 }
 
@@ -394,13 +394,17 @@ fn mistakes_name_what_is_wrong() {
         (format!("{label} urdf"), "urdf/a.urdf"),
         (format!("{label} flat"), "flat/a.obj"),
         (format!("{label} wide"), "wide/a.urdf"),
-        ("label --scenes 1 --out never --views top".to_owned(), "use side, side:90, circle, anywhere:1-6"),
+        ("label --scenes 1 --out never --views top".to_owned(), "use side, side:90, circle, random:1-6"),
         ("label --scenes 1 --out never --noise 2".to_owned(), "must be from 0 to 1"),
-        ("label --scenes 1 --out never --looks 2 --format raw".to_owned(), "only --format packed"),
+        ("label --scenes 1 --out never --observations 2 --format raw".to_owned(), "only --format packed"),
         ("label --scenes 3 --scene pile --points 6 --format processed --out half".to_owned(), "half/setup.json"),
         ("bench --planner nowhere.onnx --rounds 1".to_owned(), "nowhere.onnx"),
         ("bench --planner grpc:127.0.0.1:1 --rounds 1".to_owned(), "127.0.0.1:1"),
         ("tables --models nowhere".to_owned(), "nowhere"),
+        ("look data --views side --looks 2 --out never".to_owned(), "`look` is now `observe`"),
+        ("label --scenes 1 --looks 2 --out never".to_owned(), "`--looks` is now `--observations`"),
+        ("label --scenes 1 --objects endless --out never".to_owned(), "`endless` is now `generated`"),
+        ("label --scenes 1 --views side,anywhere:1 --out never".to_owned(), "`anywhere` is now `random`"),
         ("stats empty".to_owned(), "empty"),
     ] {
         let said = desk.refused(&arguments);

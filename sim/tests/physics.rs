@@ -7,7 +7,7 @@ use grasp_picture::Mesh;
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::camera::Views;
 use grasp_sim::hull::convex_hull;
-use grasp_sim::label::{LabelledScene, Recipe};
+use grasp_sim::label::{LabelledScene, SceneConfig};
 use grasp_sim::objects::{Object, ObjectSet, Split};
 use grasp_sim::physics::{Gripper, HandPart, STEPS_PER_SECOND, World};
 use grasp_sim::scene::{SceneKind, generate, is_at_rest};
@@ -171,19 +171,19 @@ fn a_hundred_piles_come_to_rest_and_stay() {
 
 #[test]
 fn labels_do_not_depend_on_order_or_threads() {
-    let recipe = Recipe {
+    let config = SceneConfig {
         kind: SceneKind::Pile,
         objects: ObjectSet::procedural(Split::Train),
         points: 10,
-        views: Views::Anywhere(1..=2),
-        looks: 2,
+        views: Views::Random(1..=2),
+        observations: 2,
         noise: 1.0,
         seed: 3,
     };
-    let forward: Vec<Option<LabelledScene>> = (0..4).map(|index| recipe.label(index)).collect();
-    let mut backward: Vec<_> = (0..4).rev().map(|index| recipe.label(index)).collect();
+    let forward: Vec<Option<LabelledScene>> = (0..4).map(|index| config.label(index)).collect();
+    let mut backward: Vec<_> = (0..4).rev().map(|index| config.label(index)).collect();
     backward.reverse();
-    let parallel: Vec<_> = (0..4).into_par_iter().map(|index| recipe.label(index)).collect();
+    let parallel: Vec<_> = (0..4).into_par_iter().map(|index| config.label(index)).collect();
     assert_eq!(forward, backward);
     assert_eq!(forward, parallel);
     assert!(forward.iter().flatten().count() > 0);

@@ -8,7 +8,7 @@ use std::process::{Command, Output, Stdio};
 use foxglove::Decode;
 use foxglove::messages::{PointCloud, SceneUpdate};
 use grasp::Volume;
-use grasp_client::{Asked, Client, Error, Options};
+use grasp_client::{Client, DetectOptions, Error, Options};
 use grasp_tests::scene::{CAMERA, camera, depth};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs, grasp};
 use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
@@ -159,7 +159,8 @@ fn wrong_combinations_are_refused_before_anything_is_read() {
 async fn the_library_names_the_field_that_is_wrong() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let client = Client::connect(server.grpc().to_string()).await.unwrap();
-    let wrong = || Options { asked: Asked { threshold: Some(7.0), ..Asked::default() }, ..Options::default() };
+    let wrong =
+        || Options { detect: DetectOptions { threshold: Some(7.0), ..DetectOptions::default() }, ..Options::default() };
     let unary = client.detect(&volume(), wrong()).await.unwrap_err();
     let volumes = tokio_stream::iter([(volume(), wrong())]);
     let streamed = client.detect_stream(volumes).await.unwrap().next().await.unwrap().unwrap_err();
@@ -167,7 +168,8 @@ async fn the_library_names_the_field_that_is_wrong() {
         assert_eq!(error.field(), Some("options.threshold"), "{error:?}");
         assert!(matches!(error, Error::Refused { .. }) && error.to_string().contains("options.threshold is 7"));
     }
-    let named = Options { asked: Asked { model: "vgn".to_owned(), ..Asked::default() }, ..Options::default() };
+    let named =
+        Options { detect: DetectOptions { model: "vgn".to_owned(), ..DetectOptions::default() }, ..Options::default() };
     assert_eq!(client.detect(&volume(), named).await.unwrap_err().field(), Some("options.model"));
 }
 

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use grasp::{DepthImage, Fusion, RESOLUTION as PAPERS, Volume, WORKSPACE_SIZE};
 use grasp_client::{
-    Asked, Client, CloudView, Depth, DepthView, Detection, Error, Extrinsics, Options, Proposal, Workspace,
+    Client, CloudView, Depth, DepthView, DetectOptions, Detection, Error, Extrinsics, Options, Proposal, Workspace,
 };
 use grasp_proto::pb;
 use grasp_tests::scene::{BLOCK, CAMERA, TABLE, camera, depth, view};
@@ -13,11 +13,11 @@ use nalgebra::{Isometry3, Point3, Vector3};
 use tonic::Code;
 
 fn low() -> Options {
-    Options { asked: Asked { threshold: Some(0.6), ..Asked::default() }, ..Options::default() }
+    Options { detect: DetectOptions { threshold: Some(0.6), ..DetectOptions::default() }, ..Options::default() }
 }
 
-fn asking(asked: Asked) -> Options {
-    Options { asked, ..Options::default() }
+fn asking(detect: DetectOptions) -> Options {
+    Options { detect, ..Options::default() }
 }
 
 /// What the server should fuse.
@@ -88,7 +88,7 @@ async fn a_network_that_wants_its_camera_on_one_side_has_it_there() {
     let pose = Isometry3::new(Vector3::new(0.4, -0.2, 1.1), Vector3::new(0.0, 0.0, 2.0));
     let workspace = Workspace { pose, size: None };
     let eye = camera(40.0, -90.0);
-    let options = || asking(Asked { model: "turned".to_owned(), ..low().asked });
+    let options = || asking(DetectOptions { model: "turned".to_owned(), ..low().detect });
     let detection = client.detect_from_depth(&[view(&eye)], &workspace, options()).await.unwrap();
 
     // The cube turns about its middle by -30°, which brings the camera to -60° in it.
@@ -138,7 +138,7 @@ async fn points_are_answered_like_the_depth_that_they_were_seen_in() {
     };
     let network = client.detect_from_cloud(std::slice::from_ref(&cloud), &Workspace::default(), low()).await.unwrap();
     assert!(!network.grasps.is_empty() && network.latency.fusion > 0.0);
-    let shaf = || asking(Asked { model: "shaf".to_owned(), ..Asked::default() });
+    let shaf = || asking(DetectOptions { model: "shaf".to_owned(), ..DetectOptions::default() });
     let detection =
         client.detect_from_cloud(std::slice::from_ref(&cloud), &Workspace::default(), shaf()).await.unwrap();
     assert!(!detection.grasps.is_empty(), "{:?}", detection.dropped);
@@ -228,7 +228,7 @@ async fn planners_without_a_network_answer_by_their_names() {
     let views = cameras.map(|camera| view(&camera));
     let volume = fused(&cameras, PAPERS, Isometry3::identity());
     for planner in ["gpd", "shaf"] {
-        let options = || asking(Asked { model: planner.to_owned(), ..Asked::default() });
+        let options = || asking(DetectOptions { model: planner.to_owned(), ..DetectOptions::default() });
         let seen = client.detect_from_depth(&views, &Workspace::default(), options()).await.unwrap();
         assert!(!seen.grasps.is_empty() && seen.model == planner, "{planner}: {:?}", seen.dropped);
         assert!(seen.grasps.is_sorted_by(|a, b| a.quality >= b.quality));
@@ -241,20 +241,25 @@ async fn planners_without_a_network_answer_by_their_names() {
     }
     // What the classifier doubts comes to who asks for it.
     let doubted = async |threshold| {
-        let asked = Asked { model: "gpd".to_owned(), threshold: Some(threshold), max_grasps: 1000, ..Asked::default() };
-        let detection = client.detect_from_depth(&views, &Workspace::default(), asking(asked)).await.unwrap();
+        let detect = DetectOptions {
+            model: "gpd".to_owned(),
+            threshold: Some(threshold),
+            max_grasps: 1000,
+            ..DetectOptions::default()
+        };
+        let detection = client.detect_from_depth(&views, &Workspace::default(), asking(detect)).await.unwrap();
         detection.grasps.iter().any(|grasp| grasp.quality < 0.5)
     };
     assert_eq!((doubted(0.5).await, doubted(0.001).await), (false, true));
     // Nothing lies on a table that is said to be as high as the block.
     let table = Some(pb::CollisionCheck { mode: 0, table_height: Some(0.2) });
-    let asked = Asked { model: "shaf".to_owned(), collision: table, ..Asked::default() };
-    let none = client.detect_from_depth(&views, &Workspace::default(), asking(asked)).await.unwrap();
+    let detect = DetectOptions { model: "shaf".to_owned(), collision: table, ..DetectOptions::default() };
+    let none = client.detect_from_depth(&views, &Workspace::default(), asking(detect)).await.unwrap();
     assert!(none.grasps.is_empty() && none.dropped.as_ref().unwrap().mask > 1000, "{:?}", none.dropped);
     let own =
         pb::Gripper { max_opening: 0.03, finger_depth: 0.05, finger_width: 0.01, finger_breadth: 0.02, palm: None };
-    let asked = Asked { model: "shaf".to_owned(), gripper: Some(own), ..Asked::default() };
-    let narrow = client.detect_from_depth(&views, &Workspace::default(), asking(asked)).await.unwrap();
+    let detect = DetectOptions { model: "shaf".to_owned(), gripper: Some(own), ..DetectOptions::default() };
+    let narrow = client.detect_from_depth(&views, &Workspace::default(), asking(detect)).await.unwrap();
     let widest = narrow.grasps.iter().map(|grasp| grasp.width).fold(0.0, f64::max);
     assert!(widest <= 0.02, "a hand that opens to 3 cm takes nothing of {widest} m");
 }
@@ -275,7 +280,7 @@ async fn a_planner_stops_when_nobody_waits() {
     // A hand that reaches everywhere has everything in its way.
     let large =
         pb::Gripper { max_opening: 0.5, finger_depth: 0.5, finger_width: 0.01, finger_breadth: 0.5, palm: None };
-    let shaf = |gripper| Asked { model: "shaf".to_owned(), gripper, ..Asked::default() };
+    let shaf = |gripper| DetectOptions { model: "shaf".to_owned(), gripper, ..DetectOptions::default() };
     let hurried = Options { timeout: Some(Duration::from_millis(500)), ..asking(shaf(Some(large))) };
     let late = client.detect(&checkered(100), hurried).await;
     // The client's own timer may be faster, which calls it cancelled.
@@ -293,10 +298,10 @@ async fn a_planner_stops_when_nobody_waits() {
     );
 }
 
-async fn asked_with(client: &Client, asked: Asked) -> Detection {
+async fn asked_with(client: &Client, detect: DetectOptions) -> Detection {
     let views = [camera(30.0, -90.0), camera(40.0, 90.0)].map(|camera| view(&camera));
-    let asked = Asked { threshold: Some(0.6), ..asked };
-    client.detect_from_depth(&views, &Workspace::default(), asking(asked)).await.unwrap()
+    let detect = DetectOptions { threshold: Some(0.6), ..detect };
+    client.detect_from_depth(&views, &Workspace::default(), asking(detect)).await.unwrap()
 }
 
 fn vector(x: f64, y: f64, z: f64) -> Option<pb::Vector3> {
@@ -308,21 +313,26 @@ async fn what_is_asked_of_the_grasps_is_kept() {
     // Straight down, half a turn about x.
     let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS).rotation([1.0, 0.0, 0.0, 0.0])], &[]);
     let client = server.client().await;
-    let all = asked_with(&client, Asked::default()).await.grasps;
+    let all = asked_with(&client, DetectOptions::default()).await.grasps;
     let tips = |grasp: &Proposal| grasp.pose * Point3::new(0.0, 0.0, 0.05);
 
     let region = pb::Box { min: vector(0.1, 0.0, 0.0), max: vector(0.2, 0.15, 0.3) };
-    let detection = asked_with(&client, Asked { region: Some(region), explain: true, ..Asked::default() }).await;
+    let detection =
+        asked_with(&client, DetectOptions { region: Some(region), explain: true, ..DetectOptions::default() }).await;
     assert!(!detection.grasps.is_empty() && detection.grasps.len() < all.len());
     assert!(detection.grasps.iter().all(|g| (0.1..=0.2).contains(&tips(g).x) && tips(g).y <= 0.15));
     assert!(detection.dropped.unwrap().region > 0);
 
     let cone = |z| Some(pb::Cone { axis: vector(0.0, 0.0, z), angle: 0.2 });
-    assert_same(&asked_with(&client, Asked { approach: cone(-3.0), ..Asked::default() }).await.grasps, &all);
-    let up = asked_with(&client, Asked { approach: cone(3.0), ..Asked::default() }).await;
+    assert_same(
+        &asked_with(&client, DetectOptions { approach: cone(-3.0), ..DetectOptions::default() }).await.grasps,
+        &all,
+    );
+    let up = asked_with(&client, DetectOptions { approach: cone(3.0), ..DetectOptions::default() }).await;
     assert!(up.grasps.is_empty() && up.dropped.is_some_and(|dropped| dropped.approach > 0), "an empty answer says why");
 
-    let high = asked_with(&client, Asked { min_height: Some(0.12), explain: true, ..Asked::default() }).await;
+    let high =
+        asked_with(&client, DetectOptions { min_height: Some(0.12), explain: true, ..DetectOptions::default() }).await;
     assert!(high.grasps.iter().all(|g| tips(g).z >= 0.1199) && high.dropped.unwrap().height > 0);
 
     assert!(all.iter().all(|grasp| grasp.collides.is_none()), "nobody asked");
@@ -337,11 +347,13 @@ async fn hands_that_would_meet_something_are_marked_or_dropped() {
     // A hand without a palm, lest all of them meet the table.
     let (max_opening, finger_depth, finger_width, finger_breadth) = (0.08, 0.05, 0.01, 0.02);
     let gripper = Some(pb::Gripper { max_opening, finger_depth, finger_width, finger_breadth, palm: None });
-    let asked_with = async |client: &Client, asked| asked_with(client, Asked { gripper, ..asked }).await;
-    let all = asked_with(&client, Asked::default()).await.grasps;
+    let asked_with = async |client: &Client, detect| asked_with(client, DetectOptions { gripper, ..detect }).await;
+    let all = asked_with(&client, DetectOptions::default()).await.grasps;
     let collision = |mode: i32| Some(pb::CollisionCheck { mode, table_height: None });
-    let flagged = asked_with(&client, Asked { collision: collision(1), ..Asked::default() }).await.grasps;
-    let filtered = asked_with(&client, Asked { collision: collision(2), explain: true, ..Asked::default() }).await;
+    let flagged =
+        asked_with(&client, DetectOptions { collision: collision(1), ..DetectOptions::default() }).await.grasps;
+    let filtered =
+        asked_with(&client, DetectOptions { collision: collision(2), explain: true, ..DetectOptions::default() }).await;
     assert_same(&flagged, &all);
     let free: Vec<_> = flagged.iter().filter(|grasp| grasp.collides == Some(false)).copied().collect();
     assert!(free.len() < flagged.len(), "hands in the block or the table");
@@ -351,7 +363,7 @@ async fn hands_that_would_meet_something_are_marked_or_dropped() {
     assert!(filtered.dropped.unwrap().collision as usize >= flagged.len() - free.len());
     assert!(filtered.grasps.iter().all(|grasp| grasp.pose.translation.z >= TABLE + 0.01), "none through the table");
     let buried = Some(pb::CollisionCheck { mode: 1, table_height: Some(0.3) });
-    let buried = asked_with(&client, Asked { collision: buried, ..Asked::default() }).await.grasps;
+    let buried = asked_with(&client, DetectOptions { collision: buried, ..DetectOptions::default() }).await.grasps;
     assert!(buried.iter().all(|grasp| grasp.collides == Some(true)), "under a table");
 }
 
@@ -359,20 +371,20 @@ async fn hands_that_would_meet_something_are_marked_or_dropped() {
 async fn poses_are_told_as_the_robot_wants_them() {
     let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS).rotation([1.0, 0.0, 0.0, 0.0])], &[]);
     let client = server.client().await;
-    let own = asked_with(&client, Asked::default()).await.grasps;
+    let own = asked_with(&client, DetectOptions::default()).await.grasps;
     let offset = |a: &Isometry3<f64>, b: &Isometry3<f64>| (a.inverse() * b).translation.vector;
     for grasp in &own {
         assert!((offset(&grasp.pose, &grasp.pregrasp) - Vector3::new(0.0, 0.0, -0.05)).norm() < 1e-9);
         assert!((offset(&grasp.pose, &grasp.retreat) - Vector3::new(0.0, 0.0, -0.1)).norm() < 1e-9);
     }
 
-    let asked = Asked {
+    let detect = DetectOptions {
         convention: Some(pb::Convention { origin: 1, closing_axis: 1, parent_from_grasp: None }),
         pregrasp_distance: Some(0.12),
         retreat: Some(pb::Retreat { distance: Some(0.2), direction: vector(0.0, 0.0, 1.0) }),
-        ..Asked::default()
+        ..DetectOptions::default()
     };
-    let told = asked_with(&client, asked).await.grasps;
+    let told = asked_with(&client, detect).await.grasps;
     for (own, told) in own.iter().zip(&told) {
         assert!((offset(&own.pose, &told.pose) - Vector3::new(0.0, 0.0, 0.05)).norm() < 1e-9, "the fingertips");
         let closing = own.pose.inverse() * (told.pose * Vector3::x());
@@ -385,12 +397,12 @@ async fn poses_are_told_as_the_robot_wants_them() {
     // Twice as long fingers stand further back, with their tips in the same place.
     let gripper =
         pb::Gripper { max_opening: 0.1, finger_depth: 0.1, finger_width: 0.01, finger_breadth: 0.02, palm: None };
-    let long = asked_with(&client, Asked { gripper: Some(gripper), ..Asked::default() }).await.grasps;
+    let long = asked_with(&client, DetectOptions { gripper: Some(gripper), ..DetectOptions::default() }).await.grasps;
     assert_eq!(long.len(), own.len());
     for (own, long) in own.iter().zip(&long) {
         assert!((offset(&own.pose, &long.pose) - Vector3::new(0.0, 0.0, -0.05)).norm() < 1e-9);
     }
-    let bad = Asked { gripper: Some(pb::Gripper { max_opening: 85.0, ..gripper }), ..Asked::default() };
+    let bad = DetectOptions { gripper: Some(pb::Gripper { max_opening: 85.0, ..gripper }), ..DetectOptions::default() };
     let views = [view(&camera(30.0, -90.0))];
     let (code, message) = refusal(client.detect_from_depth(&views, &Workspace::default(), asking(bad)).await);
     assert_eq!(code, Code::InvalidArgument);

@@ -3,7 +3,7 @@
 use std::time::{Duration, SystemTime};
 
 use grasp::{DecodeParams, Grasp, Volume};
-use grasp_client::{Asked, DataType, Dropped, Options, Proposal};
+use grasp_client::{DataType, DetectOptions, Dropped, Options, Proposal};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs, expected};
 use nalgebra::{Isometry3, Vector3};
 use tokio_stream::StreamExt;
@@ -76,8 +76,9 @@ async fn every_voxel_is_explained_once() {
     let client = server.client().await;
     for threshold in [0.3, 0.7, 0.9, 1.0] {
         for max_grasps in [0, 1] {
-            let asked = Asked { threshold: Some(threshold), max_grasps, explain: true, ..Asked::default() };
-            let options = Options { asked, ..Options::default() };
+            let detect =
+                DetectOptions { threshold: Some(threshold), max_grasps, explain: true, ..DetectOptions::default() };
+            let options = Options { detect, ..Options::default() };
             let detection = client.detect(&volume(), options).await.unwrap();
             let dropped = detection.dropped.expect("it was asked for");
             assert_eq!(voxels(&dropped) + detection.grasps.len(), RESOLUTION.pow(3), "{dropped:?}");
@@ -93,8 +94,8 @@ async fn every_voxel_is_explained_once() {
 #[tokio::test]
 async fn an_empty_answer_is_always_explained() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
-    let asked = Asked { threshold: Some(1.0), ..Asked::default() };
-    let options = Options { asked, ..Options::default() };
+    let detect = DetectOptions { threshold: Some(1.0), ..DetectOptions::default() };
+    let options = Options { detect, ..Options::default() };
     let detection = server.client().await.detect(&volume(), options).await.unwrap();
     assert!(detection.grasps.is_empty());
     assert_eq!(voxels(&detection.dropped.expect("no grasp needs a reason")), RESOLUTION.pow(3));
@@ -103,8 +104,8 @@ async fn an_empty_answer_is_always_explained() {
 #[tokio::test]
 async fn force_gives_the_best_grasp_alone() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
-    let asked = Asked { threshold: Some(1.0), force: Some(0.5), ..Asked::default() };
-    let options = Options { asked, ..Options::default() };
+    let detect = DetectOptions { threshold: Some(1.0), force: Some(0.5), ..DetectOptions::default() };
+    let options = Options { detect, ..Options::default() };
     let detection = server.client().await.detect(&volume(), options).await.unwrap();
     let best = expected(&volume(), &DecodeParams::default()).grasps[0];
     assert_same(&detection.grasps, &[best]);
@@ -141,8 +142,8 @@ async fn a_stream_answers_in_order_and_survives_bad_volumes() {
     let requests: Vec<_> = (0..50)
         .map(|index| {
             let model = if index % 5 == 3 { "nobody" } else { "" }.to_owned();
-            let asked = Asked { model, ..Asked::default() };
-            (volume(), Options { request_id: format!("volume {index}"), asked, ..Options::default() })
+            let detect = DetectOptions { model, ..DetectOptions::default() };
+            (volume(), Options { request_id: format!("volume {index}"), detect, ..Options::default() })
         })
         .collect();
     let replies = server.client().await.detect_stream(tokio_stream::iter(requests)).await.unwrap();
@@ -183,8 +184,8 @@ async fn the_model_is_the_one_asked_for_or_the_first_that_fits() {
         (&volume(), "mirror", "", "mirror 1.10"),
         (&volume(), "mirror", "1.9", "mirror 1.9"),
     ] {
-        let asked = Asked { model: model.to_owned(), version: version.to_owned(), ..Asked::default() };
-        let options = Options { asked, ..Options::default() };
+        let detect = DetectOptions { model: model.to_owned(), version: version.to_owned(), ..DetectOptions::default() };
+        let options = Options { detect, ..Options::default() };
         let detection = client.detect(volume, options).await.unwrap();
         assert_eq!(format!("{} {}", detection.model, detection.version), wanted);
     }

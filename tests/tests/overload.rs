@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use grasp::Volume;
-use grasp_client::{Asked, Error, Options, Workspace};
+use grasp_client::{DetectOptions, Error, Options, Workspace};
 use grasp_proto::pb::{CollisionCheck, DetectGraspsRequest, collision_check};
 use grasp_tests::scene::{camera, view};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
@@ -83,8 +83,8 @@ async fn the_hint_when_to_come_back_counts_all_the_work_on_an_answer() {
     let centres: Vec<[usize; 3]> = (0..343).map(|i| [i / 49, i / 7 % 7, i % 7].map(|c| 12 + 12 * c)).collect();
     let volume = blobs(96, Isometry3::identity(), &centres);
     let flag = CollisionCheck { mode: collision_check::Mode::Flag.into(), table_height: None };
-    let asked = Asked { collision: Some(flag), max_grasps: 1000, ..Asked::default() };
-    let options = || Options { asked: asked.clone(), ..Options::default() };
+    let detect = DetectOptions { collision: Some(flag), max_grasps: 1000, ..DetectOptions::default() };
+    let options = || Options { detect: detect.clone(), ..Options::default() };
     let first = client.detect(&volume, options()).await.unwrap();
     let mut calls = JoinSet::new();
     for _ in 0..8 {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use grasp::Volume;
-use grasp_client::{Asked, Client, Options};
+use grasp_client::{Client, DetectOptions, Options};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
 use nalgebra::Isometry3;
 use tokio::task::JoinSet;
@@ -42,8 +42,8 @@ async fn a_new_version_is_served_at_sighup_and_the_old_one_stays_for_who_asks_fo
     server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
     assert_eq!(newest(&client).await, "2");
     assert_eq!(served(&client).await, ["mirror 2", "mirror 1"]);
-    let asked = Asked { model: "mirror".into(), version: "1".into(), ..Asked::default() };
-    let old = Options { asked, ..Options::default() };
+    let detect = DetectOptions { model: "mirror".into(), version: "1".into(), ..DetectOptions::default() };
+    let old = Options { detect, ..Options::default() };
     assert_eq!(client.detect(&volume(), old).await.unwrap().version, "1");
 }
 

@@ -1,6 +1,6 @@
 //! A volume that the server keeps from view to view.
 
-use grasp_client::{Asked, Detection, Error, Extrinsics, Options, Workspace};
+use grasp_client::{DetectOptions, Detection, Error, Extrinsics, Options, Workspace};
 use grasp_proto::pb;
 use grasp_tests::scene::{camera, view};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
@@ -12,7 +12,7 @@ use tonic::Code;
 const TRACKED: &str = "graspd_tracked_volumes";
 
 fn low() -> Options {
-    Options { asked: Asked { threshold: Some(0.6), ..Asked::default() }, ..Options::default() }
+    Options { detect: DetectOptions { threshold: Some(0.6), ..DetectOptions::default() }, ..Options::default() }
 }
 
 fn code(outcome: Result<Detection, Error>) -> (Code, String) {
@@ -42,8 +42,8 @@ async fn each_view_is_added_to_those_before_it() {
         assert_eq!(server.metric(TRACKED), 1.0);
     }
     // Looks once more, at nothing new, with other wishes.
-    let asked = Asked { max_grasps: 1, ..low().asked };
-    let one = tracking.add(&[], Options { asked, ..Options::default() }).await.unwrap();
+    let detect = DetectOptions { max_grasps: 1, ..low().detect };
+    let one = tracking.add(&[], Options { detect, ..Options::default() }).await.unwrap();
     assert_eq!(one.grasps.len(), 1);
 
     drop(tracking);
@@ -64,8 +64,8 @@ async fn a_bad_view_costs_neither_the_stream_nor_the_volume() {
     assert!(status == Code::InvalidArgument && message.starts_with("views[0] is blind"), "{message}");
     let again = tracking.add(&[], low()).await.unwrap();
     assert_eq!(again.grasps, first.grasps);
-    let other = Asked { model: "other".to_owned(), ..low().asked };
-    let (status, message) = code(tracking.add(&[], Options { asked: other, ..Options::default() }).await);
+    let other = DetectOptions { model: "other".to_owned(), ..low().detect };
+    let (status, message) = code(tracking.add(&[], Options { detect: other, ..Options::default() }).await);
     assert_eq!(status, Code::InvalidArgument);
     assert!(message.starts_with("options.model is `other`, which reads another volume"), "{message}");
     assert_eq!(tracking.add(&[], low()).await.unwrap().grasps, first.grasps);

@@ -46,15 +46,16 @@ pub struct Provenance {
     pub points: usize,
     /// Where the scenes were looked at from.
     pub views: String,
-    /// How often each scene was looked at anew.
-    pub looks: usize,
-    /// Share of the looks whose depth images carried the benchmark's noise.
+    /// Observations of each scene.
+    #[serde(alias = "looks")]
+    pub observations: usize,
+    /// Share of the observations whose depth images carried the benchmark's noise.
     pub noise: f64,
     /// Seed of the data set; scene numbers select its streams.
     pub seed: u64,
-    /// Seed of the looks, if they were not made with the labels.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub look_seed: Option<u64>,
+    /// Seed of the observations, if they were not made with the labels.
+    #[serde(default, alias = "look_seed", skip_serializing_if = "Option::is_none")]
+    pub observation_seed: Option<u64>,
     /// Version of the simulator: another may give other labels.
     pub version: String,
 }

@@ -14,10 +14,10 @@ fn setup() -> Setup {
         objects: "train".into(),
         points: 2,
         views: "side".into(),
-        looks: 2,
+        observations: 2,
         noise: 0.0,
         seed: 1,
-        look_seed: None,
+        observation_seed: None,
         version: "0".into(),
     })
 }

@@ -7,7 +7,9 @@ use clap::{Args, ValueEnum};
 use grasp::{Maps, Volume};
 use grasp_data::Dataset;
 use grasp_models::onnx::ModelProto;
-use grasp_models::{Metadata, Network, Options, averaged_over_turns, with_full_weights, with_half_weights, with_int8};
+use grasp_models::{
+    Metadata, Network, Options, averaged_over_rotations, with_full_weights, with_half_weights, with_int8,
+};
 use nalgebra::Isometry3;
 use serde::Serialize;
 
@@ -26,7 +28,9 @@ pub(crate) struct Export {
     /// Let the network look at each volume from four sides, turned by 90° each, and average: four times the work, for
     /// grasps that turn exactly with the volume. For networks that regress axes.
     #[arg(long)]
-    turns: bool,
+    average_rotations: bool,
+    #[arg(long, hide = true, num_args = 0..=1, default_missing_value = "", value_parser = refuse_turns)]
+    turns: Option<String>,
     /// The file to write. Its stem becomes the model's name.
     #[arg(long)]
     out: PathBuf,
@@ -39,6 +43,10 @@ pub(crate) struct Export {
     /// Calibrated on so many volumes, from all over the data.
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
     calibrate: u64,
+}
+
+fn refuse_turns(_: &str) -> Result<String, String> {
+    Err("`--turns` is now `--average-rotations`".to_owned())
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -105,13 +113,13 @@ impl Export {
             (Precision::Int8, Some(data)) => self.quantized(&model, data)?,
             (Precision::Int8, None) => bail!("int8 is calibrated on volumes: name folders of them with --data"),
         };
-        let model = if self.turns { averaged_over_turns(&model)? } else { model };
+        let model = if self.average_rotations { averaged_over_rotations(&model)? } else { model };
         let mut model = if self.precision == Precision::Fp16 { with_half_weights(&model)? } else { model };
         let mut metadata = Metadata::of(&model, &self.from)?;
         metadata.name = self.out.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let mut note = |key: &str, value: &str| metadata.provenance.insert(key.to_owned(), value.to_owned());
         note("precision", self.precision.name());
-        if self.turns {
+        if self.average_rotations {
             note("averaged_over_turns", "4");
         }
         metadata.write_to(&mut model);

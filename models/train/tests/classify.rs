@@ -13,7 +13,7 @@ use grasp_models::gpd::gpd;
 use grasp_models::onnx::ModelProto;
 use grasp_sim::benchmark::Benchmark;
 use grasp_sim::camera::Views;
-use grasp_sim::label::Recipe;
+use grasp_sim::label::SceneConfig;
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::planner::PlannerSpec;
 use grasp_sim::scene::SceneKind;
@@ -66,7 +66,7 @@ fn a_small_set_is_learnt_by_heart() {
 #[test]
 fn candidates_become_a_classifier_that_plans() {
     let folder = tempfile::tempdir().unwrap();
-    let recipe = Recipe {
+    let config = SceneConfig {
         kind: SceneKind::Packed,
         objects: ObjectSet::procedural(Split::Train),
         points: 10,
@@ -76,7 +76,7 @@ fn candidates_become_a_classifier_that_plans() {
         seed: 1,
     };
     let mut tried = Candidates::default();
-    (0..6).for_each(|number| tried.append(recipe.candidates(number)));
+    (0..6).for_each(|number| tried.append(config.candidates(number)));
     tried.write(&folder.path().join("packed.npz")).unwrap();
 
     let arguments = "--data packed.npz --out models/gpd.onnx --epochs 2 --val 0.3 --batch 16 --model-version 2";
@@ -99,7 +99,7 @@ fn candidates_become_a_classifier_that_plans() {
         kind: SceneKind::Packed,
         objects: ObjectSet::procedural(Split::PackedTest),
         count: 3,
-        views: recipe.views,
+        views: config.views,
         noise: 1.0,
         rounds: 2,
         seed: 1,

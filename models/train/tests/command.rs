@@ -222,8 +222,9 @@ fn an_average_over_turns_is_exported_in_every_precision() {
     axes.write(&folder.path().join("axes.onnx")).unwrap();
     fs::create_dir(folder.path().join("zoo")).unwrap();
     for precision in ["fp32", "fp16", "int8"] {
-        let arguments =
-            format!("export --from axes.onnx --precision {precision} --turns --data data --out zoo/{precision}.onnx");
+        let arguments = format!(
+            "export --from axes.onnx --precision {precision} --average-rotations --data data --out zoo/{precision}.onnx"
+        );
         let output = command(folder.path(), &arguments).output().unwrap();
         assert!(output.status.success(), "{}", said(&output));
         let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -235,8 +236,9 @@ fn an_average_over_turns_is_exported_in_every_precision() {
     assert_eq!(metadata.provenance["precision"], "fp16");
     assert_eq!(metadata.provenance["averaged_over_turns"], "4");
 
-    let output =
-        command(folder.path(), "export --from start.onnx --precision fp32 --turns --out x.onnx").output().unwrap();
+    let output = command(folder.path(), "export --from start.onnx --precision fp32 --average-rotations --out x.onnx")
+        .output()
+        .unwrap();
     assert!(said(&output).contains("start.onnx") && said(&output).contains("--orientation axes"), "{}", said(&output));
 }
 
@@ -256,6 +258,7 @@ fn what_cannot_be_done_is_said() {
         ("train --data data --out x.onnx", "--network"),
         ("train --from start.onnx --data data --out x.onnx --device cuda:99", "--device is cuda:99"),
         ("train --from start.onnx --data data --out x.onnx --device gpu", "cuda:N"),
+        ("export --from start.onnx --precision fp16 --turns --out x.onnx", "`--turns` is now `--average-rotations`"),
         ("export --from start.onnx --precision int8 --out x.onnx", "name folders of them with --data"),
     ] {
         let output = command(folder.path(), arguments).output().unwrap();

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use grasp_proto::{Asked, FieldError, pb};
+use grasp_proto::{DetectParams, FieldError, pb};
 use opentelemetry::Context;
 use tokio::sync::watch;
 use tonic::{Code, Request, Status};
@@ -68,7 +68,7 @@ impl CallContext {
 /// What a request that was taken needs for its reply.
 pub(crate) struct PendingReply {
     reply: Reply<Detection>,
-    asked: Asked,
+    params: DetectParams,
     /// What to look at was made in this time, checking and fusing.
     preprocessing: Duration,
     fusion: Option<Duration>,
@@ -171,13 +171,13 @@ impl Call {
         &self,
         engine: &Engine,
         scene: Scene,
-        asked: Asked,
+        params: DetectParams,
         origin: FrameStamp,
         fusion: Option<Duration>,
     ) -> Result<PendingReply, Refusal> {
         let preprocessing = self.started.elapsed().saturating_sub(fusion.unwrap_or_default());
-        let reply = engine.detect(scene, asked.clone(), self.deadline, self.span.clone())?;
-        Ok(PendingReply { reply, asked, preprocessing, fusion, origin })
+        let reply = engine.detect(scene, params.clone(), self.deadline, self.span.clone())?;
+        Ok(PendingReply { reply, params, preprocessing, fusion, origin })
     }
 
     /// Waits for the session, and says in the log and the metrics how it went.
@@ -230,7 +230,7 @@ impl Call {
     }
 
     async fn reply(&mut self, work: PendingReply) -> Result<pb::DetectGraspsResponse, Refusal> {
-        let PendingReply { reply, asked, preprocessing, fusion, origin } = work;
+        let PendingReply { reply, params, preprocessing, fusion, origin } = work;
         let SessionOutput { made, queue, inference, postprocessing } = reply.wait(self.deadline).await?;
         let Detection { grasps: found, collides, dropped, over_limit, volume } = made;
 
@@ -238,16 +238,16 @@ impl Call {
             .iter()
             .enumerate()
             .map(|(index, grasp)| {
-                let [pose, pregrasp, retreat] = asked.poses(&grasp.pose).map(|pose| Some((&pose).into()));
+                let [pose, pregrasp, retreat] = params.poses(&grasp.pose).map(|pose| Some((&pose).into()));
                 let collides = collides.as_ref().map(|collides| collides[index]);
                 pb::Grasp { pose, width: grasp.width, quality: grasp.quality, pregrasp, retreat, collides }
             })
             .collect();
         // At most one grasp per voxel.
         let over_limit = over_limit as u32;
-        let dropped = (asked.explain || grasps.is_empty()).then(|| pb::Dropped { over_limit, ..(&dropped).into() });
+        let dropped = (params.explain || grasps.is_empty()).then(|| pb::Dropped { over_limit, ..(&dropped).into() });
 
-        let finger_depth = asked.hand.map_or(grasp::FINGER_DEPTH, |hand| hand.depth);
+        let finger_depth = params.hand.map_or(grasp::FINGER_DEPTH, |hand| hand.depth);
         let total = self.started.elapsed();
         let timings = StageTimings { queue, preprocessing, fusion, inference, postprocessing, total };
         self.answered(&timings, grasps.len());

@@ -6,7 +6,7 @@ use std::time::Instant;
 use grasp::{View, Volume};
 use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::grasp_service_server::GraspService;
-use grasp_proto::{Asked, FieldError, Workspace, check_count, cloud_view, depth_view, pb, resolution};
+use grasp_proto::{DetectParams, FieldError, Workspace, check_count, cloud_view, depth_view, pb, resolution};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::time::timeout_at;
 use tokio_stream::StreamExt;
@@ -37,11 +37,11 @@ const AT_ONCE: usize = 1 << 20;
 pub(crate) struct GraspRpc {
     models: Arc<ModelRegistry>,
     calls: Calls,
-    kept: Arc<TrackedVolumes>,
+    tracked_volumes: Arc<TrackedVolumes>,
     /// As many requests as there are processors convert and fuse at a time...
-    fusing: Arc<Semaphore>,
+    fusion_permits: Arc<Semaphore>,
     /// ... and as many more as a model's queue takes wait for that: a crowd of them would fill the memory.
-    turns: Arc<Semaphore>,
+    conversion_permits: Arc<Semaphore>,
 }
 
 /// A request that was taken, or refused without anyone having been told yet.
@@ -63,11 +63,11 @@ impl PendingCall {
 
 impl GraspRpc {
     /// `queue` requests may wait to be converted and fused.
-    pub fn new(models: Arc<ModelRegistry>, calls: Calls, kept: TrackedVolumes, queue: usize) -> Self {
+    pub fn new(models: Arc<ModelRegistry>, calls: Calls, tracked_volumes: TrackedVolumes, queue: usize) -> Self {
         let processors = thread::available_parallelism().map_or(1, NonZero::get);
         let semaphore = |places: usize| Arc::new(Semaphore::new(places.min(Semaphore::MAX_PERMITS)));
-        let (fusing, turns) = (semaphore(processors), semaphore(processors.saturating_add(queue)));
-        Self { models, calls, kept: Arc::new(kept), fusing, turns }
+        let (fusion_permits, conversion_permits) = (semaphore(processors), semaphore(processors.saturating_add(queue)));
+        Self { models, calls, tracked_volumes: Arc::new(tracked_volumes), fusion_permits, conversion_permits }
     }
 
     /// Opens a call and submits what it asks for. What is wrong with it comes out of [`PendingCall::finish`], like the answer.
@@ -89,19 +89,19 @@ impl GraspRpc {
         let pb::DetectGraspsRequest { volume, options, .. } = request;
         let mut volume = volume.ok_or_else(|| FieldError::new("volume", "absent", "must be given"))?;
         let origin = FrameStamp::checked("volume.frame_id", std::mem::take(&mut volume.frame_id), volume.stamp)?;
-        let asked = Asked::try_from(&options.unwrap_or_default())?;
+        let params = DetectParams::try_from(&options.unwrap_or_default())?;
         // The model before the data: nothing is converted that no model takes.
-        let engine = self.models.select(&asked.model, &asked.version, Some(resolution(&volume)?))?;
+        let engine = self.models.select(&params.model, &params.version, Some(resolution(&volume)?))?;
         call.by(&engine);
         let checked = if volume.data.len() <= AT_ONCE {
             Volume::try_from(&volume)?
         } else {
-            let held = (self.turn(&engine)?, self.fusing_place(call).await?);
+            let held = (self.conversion_permit(&engine)?, self.fusion_permit(call).await?);
             engine.check_place()?;
             blocking(held, move || Ok(Volume::try_from(&volume)?)).await?
         };
         check_voxel_size(&checked, &engine)?;
-        call.submit(&engine, Scene { volume: checked, points: None }, asked, origin, None)
+        call.submit(&engine, Scene { volume: checked, points: None }, params, origin, None)
     }
 
     async fn submit_depth(
@@ -143,21 +143,21 @@ impl GraspRpc {
         seen: impl FnOnce(&Workspace, f64) -> Result<Vec<View>, FieldError> + Send + 'static,
     ) -> Result<PendingReply, Refusal> {
         check_count(count)?;
-        let asked = Asked::try_from(&options.unwrap_or_default())?;
+        let params = DetectParams::try_from(&options.unwrap_or_default())?;
         let mut workspace = Workspace::try_from(workspace.unwrap_or_default())?;
         let origin =
             FrameStamp::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
-        let engine = self.models.select(&asked.model, &asked.version, None)?;
+        let engine = self.models.select(&params.model, &params.version, None)?;
         call.by(&engine);
-        let held = (self.turn(&engine)?, self.fusing_place(call).await?);
+        let held = (self.conversion_permit(&engine)?, self.fusion_permit(call).await?);
         engine.check_place()?;
         let from = Arc::clone(&engine);
         let fused = blocking(held, move || {
             let views = seen(&workspace, size(&from.source, &workspace))?;
-            fuse(&from, asked, &workspace, &views)
+            fuse(&from, params, &workspace, &views)
         });
-        let (scene, asked, fusion) = fused.await?;
-        call.submit(&engine, scene, asked, origin, Some(fusion))
+        let (scene, params, fusion) = fused.await?;
+        call.submit(&engine, scene, params, origin, Some(fusion))
     }
 
     /// Ends a stream, and counts and tells that.
@@ -168,15 +168,16 @@ impl GraspRpc {
     }
 
     /// A turn to convert and fuse, or a refusal at once: where too many wait already, or the planner has no place.
-    fn turn(&self, engine: &Engine) -> Result<OwnedSemaphorePermit, Refusal> {
+    fn conversion_permit(&self, engine: &Engine) -> Result<OwnedSemaphorePermit, Refusal> {
         engine.check_place()?;
-        let turn = Arc::clone(&self.turns).try_acquire_owned();
-        Ok(turn.map_err(|_| engine.overloaded("too many requests wait to be converted and fused".to_owned()))?)
+        let conversion_permit = Arc::clone(&self.conversion_permits).try_acquire_owned();
+        Ok(conversion_permit
+            .map_err(|_| engine.overloaded("too many requests wait to be converted and fused".to_owned()))?)
     }
 
     /// Waits for a place to do it, but no longer than anybody waits for the reply.
-    async fn fusing_place(&self, call: &Call) -> Result<OwnedSemaphorePermit, Refusal> {
-        let place = Arc::clone(&self.fusing).acquire_owned();
+    async fn fusion_permit(&self, call: &Call) -> Result<OwnedSemaphorePermit, Refusal> {
+        let place = Arc::clone(&self.fusion_permits).acquire_owned();
         let place = match call.deadline {
             None => place.await,
             Some(Deadline(deadline)) => timeout_at(deadline.into(), place).await.map_err(|_| EngineError::Expired)?,
@@ -193,37 +194,38 @@ impl GraspRpc {
         call: &mut Call,
     ) -> Result<PendingReply, Refusal> {
         let pb::TrackGraspsRequest { views, workspace, options, .. } = request;
-        let before = track.as_ref().map(|track| track.asked.clone());
-        let asked = match (options, before) {
+        let before = track.as_ref().map(|track| track.params.clone());
+        let params = match (options, before) {
             (None, Some(before)) => before,
-            (options, _) => Asked::try_from(&options.unwrap_or_default())?,
+            (options, _) => DetectParams::try_from(&options.unwrap_or_default())?,
         };
-        let engine = self.models.select(&asked.model, &asked.version, None)?;
+        let engine = self.models.select(&params.model, &params.version, None)?;
         call.by(&engine);
         // Without a turn: there are no more of these than volumes that are kept.
-        let place = self.fusing_place(call).await?;
+        let place = self.fusion_permit(call).await?;
         let (from, old) = (Arc::clone(&engine), track.take());
         // It comes back in any case: what is wrong with a view does not cost the volume.
-        let (kept, fused) = blocking(place, move || Ok(Track::integrate(old, &from, asked, workspace, &views))).await?;
+        let (kept, fused) =
+            blocking(place, move || Ok(Track::integrate(old, &from, params, workspace, &views))).await?;
         *track = kept;
-        let (scene, asked, origin, fusion) = fused?;
-        call.submit(&engine, scene, asked, origin, Some(fusion))
+        let (scene, params, origin, fusion) = fused?;
+        call.submit(&engine, scene, params, origin, Some(fusion))
     }
 }
 
 /// Views into a volume, and how long that took.
 fn fuse(
     engine: &Engine,
-    mut asked: Asked,
+    mut params: DetectParams,
     workspace: &Workspace,
     views: &[View],
-) -> Result<(Scene, Asked, std::time::Duration), Refusal> {
+) -> Result<(Scene, DetectParams, std::time::Duration), Refusal> {
     let started = Instant::now();
     let grid = FusionGrid::of(&engine.source, workspace, &eyes(views))?;
     let mut fusion = grid.fusion();
     let sights = grid.integrate(&mut fusion, views)?;
-    asked.constraints = grid.within(asked.constraints);
-    Ok((grid.scene(&fusion, Some(sights))?, asked, started.elapsed()))
+    params.constraints = grid.within(params.constraints);
+    Ok((grid.scene(&fusion, Some(sights))?, params, started.elapsed()))
 }
 
 /// On a thread that may take its time; those that move messages must not.
@@ -282,10 +284,10 @@ impl GraspService for GraspRpc {
         let caller = CallContext::of(&request);
         let mut requests = request.into_inner();
         let service = self.clone();
-        let (begun, calls) = mpsc::channel(READ_AHEAD);
+        let (pending, calls) = mpsc::channel(READ_AHEAD);
         tokio::spawn(async move {
             // A place first, then the next message: what is read is in flight, the rest waits with the client.
-            while let Ok(place) = begun.reserve().await {
+            while let Ok(place) = pending.reserve().await {
                 let message = tokio::select! {
                     message = requests.message() => message,
                     () = draining(service.calls.state()) => return place.send(Err(service.refuse(Refusal::Draining, caller))),
@@ -302,10 +304,10 @@ impl GraspService for GraspRpc {
                 }
             }
         });
-        let replies = ReceiverStream::new(calls).then(async |begun: Result<PendingCall, Status>| {
-            let begun = begun?;
-            let id = begun.call.id.clone();
-            Ok(response(id, begun.finish().await))
+        let replies = ReceiverStream::new(calls).then(async |pending: Result<PendingCall, Status>| {
+            let pending = pending?;
+            let id = pending.call.id.clone();
+            Ok(response(id, pending.finish().await))
         });
         Ok(Response::new(Box::pin(replies)))
     }
@@ -319,7 +321,7 @@ impl GraspService for GraspRpc {
         let caller = CallContext::of(&request);
         let mut requests = request.into_inner();
         let service = self.clone();
-        let place = self.kept.place().map_err(|refusal| self.refuse(refusal, caller.clone()))?;
+        let place = self.tracked_volumes.place().map_err(|refusal| self.refuse(refusal, caller.clone()))?;
         let (replies, sent) = mpsc::channel(2);
         // Half of it is for what ends the stream, which must not wait for who reads nothing.
         let Ok(end) = replies.clone().try_reserve_owned() else {
@@ -341,7 +343,7 @@ impl GraspService for GraspRpc {
                         None => return,
                     },
                     () = draining(service.calls.state()) => break service.refuse(Refusal::Draining, caller),
-                    refusal = service.kept.expired() => break service.refuse(refusal, caller),
+                    refusal = service.tracked_volumes.expired() => break service.refuse(refusal, caller),
                 };
                 let mut request = match message {
                     Ok(Some(request)) => request,
@@ -351,9 +353,9 @@ impl GraspService for GraspRpc {
                 let id = std::mem::take(&mut request.request_id);
                 let answer = async {
                     let submit = async |call: &mut Call| service.submit_track(request, &mut track, call).await;
-                    let begun = service.begin(id, caller.clone(), submit).await;
-                    let id = begun.call.id.clone();
-                    response(id, begun.finish().await)
+                    let pending = service.begin(id, caller.clone(), submit).await;
+                    let id = pending.call.id.clone();
+                    response(id, pending.finish().await)
                 };
                 tokio::select! {
                     // What was read is opened first, and counted.

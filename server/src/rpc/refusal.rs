@@ -22,9 +22,9 @@ pub(crate) enum Refusal {
     #[error("the server is shutting down; another one may be up")]
     Draining,
     #[error("{0} volumes are kept already, no more are; end a stream, or raise --max-tracked")]
-    TooManyKept(usize),
+    TooManyTracked(usize),
     #[error("no request came for {0:?}: the volume is gone; open another stream")]
-    Forgotten(Duration),
+    TrackExpired(Duration),
     #[error(transparent)]
     Failed(#[from] EngineError),
 }
@@ -40,9 +40,9 @@ impl Refusal {
         match self {
             Self::Field(_) => Code::InvalidArgument,
             Self::UnknownModel { .. } => Code::NotFound,
-            Self::Overloaded(_) | Self::TooManyKept(_) => Code::ResourceExhausted,
+            Self::Overloaded(_) | Self::TooManyTracked(_) => Code::ResourceExhausted,
             Self::Starting(_) | Self::Draining => Code::Unavailable,
-            Self::Forgotten(_) => Code::Aborted,
+            Self::TrackExpired(_) => Code::Aborted,
             Self::Failed(EngineError::Expired) => Code::DeadlineExceeded,
             Self::Failed(_) => Code::Internal,
         }
@@ -62,8 +62,10 @@ impl Refusal {
         match self {
             Self::Overloaded(overloaded) => Some(overloaded.retry_after),
             Self::Starting(retry_after) => Some(*retry_after),
-            Self::TooManyKept(_) => Some(KEPT),
-            Self::Field(_) | Self::UnknownModel { .. } | Self::Draining | Self::Forgotten(_) | Self::Failed(_) => None,
+            Self::TooManyTracked(_) => Some(KEPT),
+            Self::Field(_) | Self::UnknownModel { .. } | Self::Draining | Self::TrackExpired(_) | Self::Failed(_) => {
+                None
+            }
         }
     }
 }

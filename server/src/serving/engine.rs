@@ -8,14 +8,14 @@ use anyhow::Context;
 use grasp::{DecodeError, Dropped, Grasp, Volume};
 use grasp_models::{Backend, Options, RuntimeError};
 use grasp_planner::{Loaded, PlanError, Scene, Source};
-use grasp_proto::Asked;
+use grasp_proto::DetectParams;
 use prometheus::{Histogram, IntGauge};
 use thiserror::Error;
 use tokio::sync::oneshot;
 use tracing::{Span, info, warn};
 
 use super::session::{Session, warm_up};
-use crate::serving::queue::{Batching, Full, Place, Queue};
+use crate::serving::queue::{Batching, Full, Queue, QueueSlot};
 use crate::telemetry::metrics::Metrics;
 use crate::transport::deadline::Deadline;
 
@@ -121,7 +121,7 @@ impl From<PlanError> for EngineError {
 /// What a session's answer comes by. Who drops it has gone, and the volume is not looked at any more.
 pub(crate) struct Reply<T> {
     answer: Receiver<T>,
-    _place: Place<Job>,
+    _slot: QueueSlot<Job>,
 }
 
 pub(super) type Sender<T> = oneshot::Sender<Result<SessionOutput<T>, EngineError>>;
@@ -130,7 +130,7 @@ type Receiver<T> = oneshot::Receiver<Result<SessionOutput<T>, EngineError>>;
 impl<T> Reply<T> {
     /// Waits for it, but no longer than anybody waits for the reply.
     pub async fn wait(self, deadline: Option<Deadline>) -> Result<SessionOutput<T>, EngineError> {
-        let Self { answer, _place } = self;
+        let Self { answer, _slot } = self;
         let answer = match deadline {
             None => answer.await,
             Some(Deadline(deadline)) => {
@@ -153,7 +153,7 @@ pub(super) struct Job {
 
 /// What is to be made of a scene.
 pub(super) enum Task {
-    Grasps(Box<Asked>, Sender<Detection>),
+    Grasps(Box<DetectParams>, Sender<Detection>),
     /// The network's own output.
     Maps(Sender<Tensors>),
 }
@@ -218,20 +218,20 @@ impl Engine {
     pub fn detect(
         &self,
         scene: Scene,
-        asked: Asked,
+        params: DetectParams,
         deadline: Option<Deadline>,
         span: Span,
     ) -> Result<Reply<Detection>, Overloaded> {
         let (reply, answer) = oneshot::channel();
-        let place = self.push(scene, Task::Grasps(Box::new(asked), reply), deadline, span)?;
-        Ok(Reply { answer, _place: place })
+        let slot = self.push(scene, Task::Grasps(Box::new(params), reply), deadline, span)?;
+        Ok(Reply { answer, _slot: slot })
     }
 
     /// Queues a volume to have a network's own output, or refuses at once.
     pub fn maps(&self, volume: Volume, deadline: Option<Deadline>, span: Span) -> Result<Reply<Tensors>, Overloaded> {
         let (reply, answer) = oneshot::channel();
-        let place = self.push(Scene { volume, points: None }, Task::Maps(reply), deadline, span)?;
-        Ok(Reply { answer, _place: place })
+        let slot = self.push(Scene { volume, points: None }, Task::Maps(reply), deadline, span)?;
+        Ok(Reply { answer, _slot: slot })
     }
 
     /// The most scenes that wait.
@@ -244,7 +244,13 @@ impl Engine {
         if self.queue.is_full() { Err(self.full()) } else { Ok(()) }
     }
 
-    fn push(&self, scene: Scene, task: Task, deadline: Option<Deadline>, span: Span) -> Result<Place<Job>, Overloaded> {
+    fn push(
+        &self,
+        scene: Scene,
+        task: Task,
+        deadline: Option<Deadline>,
+        span: Span,
+    ) -> Result<QueueSlot<Job>, Overloaded> {
         // The queue is closed only when the engine goes.
         let job = Job { scene, task, deadline, span, submitted: Instant::now() };
         self.queue.push(job).map_err(|Full| self.full())

@@ -30,7 +30,7 @@ struct Waiting<T> {
 }
 
 /// A place in the queue. Who drops it has gone: the job leaves the queue, if no session has taken it yet.
-pub(crate) struct Place<T> {
+pub(crate) struct QueueSlot<T> {
     queue: Arc<Queue<T>>,
     number: u64,
 }
@@ -65,7 +65,7 @@ impl<T> Queue<T> {
     }
 
     /// Appends a job, or refuses it at once. Not for a queue that is closed.
-    pub fn push(self: &Arc<Self>, job: T) -> Result<Place<T>, Full> {
+    pub fn push(self: &Arc<Self>, job: T) -> Result<QueueSlot<T>, Full> {
         let mut state = self.lock();
         // A free session may not have woken up yet for a job that waits.
         if state.waiting.len() >= self.capacity + state.free {
@@ -77,7 +77,7 @@ impl<T> Queue<T> {
         self.gauge.inc();
         drop(state);
         self.changed.notify_one();
-        Ok(Place { queue: Arc::clone(self), number })
+        Ok(QueueSlot { queue: Arc::clone(self), number })
     }
 
     /// How many may wait.
@@ -153,7 +153,7 @@ impl<T> Queue<T> {
     }
 }
 
-impl<T> Drop for Place<T> {
+impl<T> Drop for QueueSlot<T> {
     fn drop(&mut self) {
         self.queue.remove(self.number);
     }
@@ -209,7 +209,7 @@ mod tests {
     #[test]
     fn a_closed_queue_gives_out_what_it_has_and_ends() {
         let (queue, _) = queue(1, 2);
-        let _place = queue.push(1).ok().unwrap();
+        let _slot = queue.push(1).ok().unwrap();
         queue.close();
         assert_eq!(queue.take(ONE), Some(vec![1]));
         queue.free();
@@ -241,7 +241,7 @@ mod tests {
         assert_eq!(session.join().unwrap(), Some(vec![0, 1, 2]));
 
         // And it does not wait any longer than it may.
-        let _place = queue.push(7).ok().unwrap();
+        let _slot = queue.push(7).ok().unwrap();
         assert_eq!(queue.take(Batching { max: 3, delay: Duration::from_millis(1) }), Some(vec![7]));
     }
 

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use grasp::{DecodeParams, Decoded, Obstacles, Volume, decode};
 use grasp_models::{Output, batch_sizes};
 use grasp_planner::{Loaded, NetworkPlanner, PlanParams, Planner};
-use grasp_proto::{Asked, Collision};
+use grasp_proto::{Collision, DetectParams};
 use nalgebra::Isometry3;
 use prometheus::Histogram;
 use tracing::error;
@@ -95,9 +95,9 @@ fn infer(network: &mut NetworkPlanner, own: DecodeParams, jobs: Vec<Job>, done: 
             }
         };
         match task {
-            Task::Grasps(asked, reply) => answer(reply, submitted, taken, || {
-                let decoded = decode(&scene.volume, &output.maps(index), &asked.decode_params(own))?;
-                Ok(found(decoded, scene.volume, &asked))
+            Task::Grasps(params, reply) => answer(reply, submitted, taken, || {
+                let decoded = decode(&scene.volume, &output.maps(index), &params.decode_params(own))?;
+                Ok(found(decoded, scene.volume, &params))
             }),
             Task::Maps(reply) => answer(reply, submitted, taken, || Ok(tensors(output, index))),
         }
@@ -109,15 +109,15 @@ fn plan(planner: &mut dyn Planner, own: DecodeParams, job: Job, done: impl FnOnc
     let Job { scene, task, deadline, span, submitted } = job;
     let _entered = span.enter();
     match task {
-        Task::Grasps(asked, reply) => {
+        Task::Grasps(params, reply) => {
             let started = Instant::now();
             let wanted = || !reply.is_closed() && !deadline.is_some_and(Deadline::has_passed);
             let decoded = caught(|| {
-                let params = PlanParams { decode: asked.decode_params(own), table: asked.table };
+                let params = PlanParams { decode: params.decode_params(own), table: params.table };
                 Ok(planner.plan(&scene, &params, &wanted)?)
             });
             let taken = done(started.elapsed());
-            answer(reply, submitted, taken, || Ok(found(decoded?, scene.volume, &asked)));
+            answer(reply, submitted, taken, || Ok(found(decoded?, scene.volume, &params)));
         }
         Task::Maps(_) => {
             done(Duration::ZERO);
@@ -143,12 +143,12 @@ fn answer<T>(reply: Sender<T>, submitted: Instant, taken: Taken, make: impl FnOn
 }
 
 /// As many of the grasps as were asked for, and whether the hand would meet something there.
-fn found(decoded: Decoded, volume: Volume, asked: &Asked) -> Detection {
+fn found(decoded: Decoded, volume: Volume, params: &DetectParams) -> Detection {
     let Decoded { mut grasps, dropped } = decoded;
-    let over_limit = grasps.len().saturating_sub(asked.max_grasps);
-    grasps.truncate(asked.max_grasps);
-    let collides = (asked.collision == Collision::Flag).then(|| {
-        let obstacles = Obstacles::observed(&volume, asked.clearance());
+    let over_limit = grasps.len().saturating_sub(params.max_grasps);
+    grasps.truncate(params.max_grasps);
+    let collides = (params.collision == Collision::Flag).then(|| {
+        let obstacles = Obstacles::observed(&volume, params.clearance());
         grasps.iter().map(|grasp| obstacles.meet(&grasp.pose)).collect()
     });
     Detection { grasps, collides, dropped, over_limit, volume }

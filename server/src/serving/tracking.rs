@@ -2,7 +2,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use grasp::{Fusion, View};
-use grasp_proto::{Asked, FieldError, MAX_VIEWS, Workspace, check_count, depth_view, pb};
+use grasp_proto::{DetectParams, FieldError, MAX_VIEWS, Workspace, check_count, depth_view, pb};
 use nalgebra::Isometry3;
 use prometheus::IntGauge;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
@@ -22,7 +22,7 @@ pub(crate) struct TrackedVolumes {
 }
 
 /// The place of one volume. Dropped, it is free.
-pub(crate) struct Place {
+pub(crate) struct TrackPermit {
     _permit: OwnedSemaphorePermit,
     gauge: IntGauge,
 }
@@ -33,22 +33,22 @@ impl TrackedVolumes {
     }
 
     /// A place, if there is one.
-    pub fn place(&self) -> Result<Place, Refusal> {
+    pub fn place(&self) -> Result<TrackPermit, Refusal> {
         let Ok(permit) = Arc::clone(&self.places).try_acquire_owned() else {
-            return Err(Refusal::TooManyKept(self.most));
+            return Err(Refusal::TooManyTracked(self.most));
         };
         self.gauge.inc();
-        Ok(Place { _permit: permit, gauge: self.gauge.clone() })
+        Ok(TrackPermit { _permit: permit, gauge: self.gauge.clone() })
     }
 
     /// Returns when a volume has been kept for too long without a view.
     pub async fn expired(&self) -> Refusal {
         tokio::time::sleep(self.timeout).await;
-        Refusal::Forgotten(self.timeout)
+        Refusal::TrackExpired(self.timeout)
     }
 }
 
-impl Drop for Place {
+impl Drop for TrackPermit {
     fn drop(&mut self) {
         self.gauge.dec();
     }
@@ -61,11 +61,11 @@ pub(crate) struct Track {
     frame_from_task: Isometry3<f64>,
     origin: FrameStamp,
     /// By the last request that asked for something.
-    pub asked: Asked,
+    pub params: DetectParams,
 }
 
 /// What is looked at next, what was asked of it, whence it comes, and how long fusing took.
-type Fused = (Scene, Asked, FrameStamp, Duration);
+type Fused = (Scene, DetectParams, FrameStamp, Duration);
 
 impl Track {
     /// Adds views to the volume, or to a new one where a workspace is given. What is wrong with a view leaves the volume
@@ -73,7 +73,7 @@ impl Track {
     pub fn integrate(
         track: Option<Self>,
         engine: &Engine,
-        asked: Asked,
+        params: DetectParams,
         workspace: Option<pb::Workspace>,
         views: &[pb::DepthView],
     ) -> (Option<Self>, Result<Fused, Refusal>) {
@@ -84,12 +84,12 @@ impl Track {
             }
             (Some(mut track), None) => {
                 let views = converted(views, &track.frame_from_task);
-                let fused = views.map_err(Refusal::from).and_then(|views| track.add(engine, asked, &views));
+                let fused = views.map_err(Refusal::from).and_then(|views| track.add(engine, params, &views));
                 (Some(track), fused)
             }
-            (track, Some(workspace)) => match Self::start(engine, &asked, workspace, views) {
+            (track, Some(workspace)) => match Self::start(engine, &params, workspace, views) {
                 Ok((mut track, views)) => {
-                    let fused = track.add(engine, asked, &views);
+                    let fused = track.add(engine, params, &views);
                     (Some(track), fused)
                 }
                 Err(refusal) => (track, Err(refusal)),
@@ -100,7 +100,7 @@ impl Track {
     /// An empty one, and the views that it begins with.
     fn start(
         engine: &Engine,
-        asked: &Asked,
+        params: &DetectParams,
         workspace: pb::Workspace,
         views: &[pb::DepthView],
     ) -> Result<(Self, Vec<View>), Refusal> {
@@ -112,17 +112,17 @@ impl Track {
         check_count(views.len())?;
         let views = converted(views, &frame_from_task)?;
         let grid = FusionGrid::of(&engine.source, &workspace, &eyes(&views))?;
-        Ok((Self { fusion: grid.fusion(), grid, frame_from_task, origin, asked: asked.clone() }, views))
+        Ok((Self { fusion: grid.fusion(), grid, frame_from_task, origin, params: params.clone() }, views))
     }
 
-    fn add(&mut self, engine: &Engine, asked: Asked, views: &[View]) -> Result<Fused, Refusal> {
+    fn add(&mut self, engine: &Engine, params: DetectParams, views: &[View]) -> Result<Fused, Refusal> {
         let started = Instant::now();
         self.grid.check(&engine.source)?;
         self.grid.integrate(&mut self.fusion, views)?;
         // Of a view long ago the volume has kept all there is.
         let scene = self.grid.scene(&self.fusion, None)?;
-        self.asked = Asked { constraints: self.grid.within(asked.constraints), ..asked };
-        Ok((scene, self.asked.clone(), self.origin.clone(), started.elapsed()))
+        self.params = DetectParams { constraints: self.grid.within(params.constraints), ..params };
+        Ok((scene, self.params.clone(), self.origin.clone(), started.elapsed()))
     }
 }
 

@@ -171,22 +171,22 @@ impl Bench {
         }
         for name in &self.planners {
             let progress = ProgressBar::new(self.rounds * self.seeds).with_message(name.clone());
-            let mut games = Vec::new();
+            let mut conditions = Vec::new();
             for seed in benchmark.seed..benchmark.seed + self.seeds {
                 let benchmark = Benchmark { seed, ..benchmark.clone() };
                 let played = benchmark.run(&PlannerSpec::from(name.as_str()), &params, &options, |event| match event {
                     Event::Round => progress.inc(1),
                     Event::Attempt { .. } => watcher.attempt(name, seed, &event),
                 });
-                games.push(played.with_context(|| format!("planner `{name}`"))?);
+                conditions.push(played.with_context(|| format!("planner `{name}`"))?);
                 watcher.finish()?;
             }
             if let Some(path) = &self.failures {
                 watcher.draw_failures(path)?;
             }
             progress.finish_and_clear();
-            let whole = Summary::of(&games.concat());
-            let each: Vec<Summary> = games.iter().map(|rounds| Summary::of(rounds)).collect();
+            let whole = Summary::of(&conditions.concat());
+            let each: Vec<Summary> = conditions.iter().map(|rounds| Summary::of(rounds)).collect();
             let spread = |figure: fn(&Summary) -> f64| Spread::of(&each.iter().map(figure).collect::<Vec<_>>());
             let (gsr, dr) = (spread(|summary| summary.gsr), spread(|summary| summary.dr));
             match self.format {

@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 use grasp_data::Candidates as Tried;
-use grasp_sim::label::Recipe;
+use grasp_sim::label::SceneConfig;
 use grasp_sim::ordered;
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -31,12 +31,12 @@ pub struct Candidates {
 
 impl Candidates {
     pub fn run(self) -> anyhow::Result<()> {
-        let recipe = Recipe {
+        let config = SceneConfig {
             kind: self.scene.kind(),
             objects: self.scene.objects("train")?,
             points: self.candidates,
             views: self.scene.views()?,
-            looks: 1,
+            observations: 1,
             noise: self.scene.noise,
             seed: self.scene.seed,
         };
@@ -48,7 +48,7 @@ impl Candidates {
         let mut tried = Tried::default();
         ordered::for_each(
             0..self.scenes,
-            |number| recipe.candidates(number),
+            |number| config.candidates(number),
             |_, candidates| {
                 tried.append(candidates);
                 progress.inc(1);

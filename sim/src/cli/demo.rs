@@ -4,7 +4,7 @@ use anyhow::Context;
 use clap::Args;
 use comfy_table::{CellAlignment, Table, presets};
 use grasp::FINGER_DEPTH;
-use grasp_client::{Asked, Client, DepthView, Detection, LocalServer, Options, Workspace};
+use grasp_client::{Client, DepthView, DetectOptions, Detection, LocalServer, Options, Workspace};
 use grasp_picture::{Picture, quality_color};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
@@ -62,8 +62,8 @@ impl Demo {
         let detection = runtime.block_on(async {
             let client = Client::connect(server.grpc().to_string()).await?;
             // Lower than anyone would execute: a picture should show what is weighed up, too.
-            let asked = Asked { threshold: Some(0.5), ..Asked::default() };
-            let options = Options { asked, ..Options::default() };
+            let detect = DetectOptions { threshold: Some(0.5), ..DetectOptions::default() };
+            let options = Options { detect, ..Options::default() };
             let views: Vec<DepthView> = observation.views.iter().map(depth_view).collect();
             client.detect_from_depth(&views, &Workspace::default(), options).await
         })?;

@@ -5,11 +5,11 @@ use clap::{Args, ValueEnum};
 use grasp::{RESOLUTION, WORKSPACE_SIZE};
 use grasp_data::{Provenance, Setup, Trial, packed, processed, raw};
 use grasp_sim::export::{Export, Line};
-use grasp_sim::label::{LabelledScene, Recipe};
+use grasp_sim::label::{LabelledScene, SceneConfig};
 use grasp_sim::ordered;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::SceneArgs;
+use super::{SceneArgs, refuse_looks};
 
 /// What scenes are made of unless the command says otherwise.
 const OBJECTS: &str = "train";
@@ -33,10 +33,12 @@ pub struct Label {
     #[arg(long, default_value_t = 120)]
     points: usize,
 
-    /// How often each scene is looked at anew, with other views and other noise; only the packed form keeps more than
-    /// one.
+    /// Observations of each scene, with other views and other noise; only the packed form keeps more than one.
     #[arg(long, default_value_t = 1)]
-    looks: usize,
+    observations: usize,
+
+    #[arg(long, hide = true, value_parser = refuse_looks)]
+    looks: Option<String>,
 
     /// Folder to write into.
     #[arg(long)]
@@ -61,26 +63,30 @@ pub enum Format {
 
 impl Label {
     pub fn run(self) -> anyhow::Result<()> {
-        let several = self.looks != 1 && self.format != Format::Packed;
-        anyhow::ensure!(!several && self.looks > 0, "--looks is {}; only --format packed takes several", self.looks);
-        let recipe = Recipe {
+        let several = self.observations != 1 && self.format != Format::Packed;
+        anyhow::ensure!(
+            !several && self.observations > 0,
+            "--observations is {}; only --format packed takes several",
+            self.observations
+        );
+        let config = SceneConfig {
             kind: self.scene.kind(),
             objects: self.scene.objects(OBJECTS)?,
             points: self.points,
             views: self.scene.views()?,
-            looks: self.looks,
+            observations: self.observations,
             noise: self.scene.noise,
             seed: self.scene.seed,
         };
         let setup = Setup::benchmark(Provenance {
             scene: self.scene.scene.name().to_owned(),
             objects: self.scene.objects.clone().unwrap_or_else(|| OBJECTS.to_owned()),
-            points: recipe.points,
+            points: config.points,
             views: self.scene.views.clone(),
-            looks: recipe.looks,
-            noise: recipe.noise,
-            seed: recipe.seed,
-            look_seed: None,
+            observations: config.observations,
+            noise: config.noise,
+            seed: config.seed,
+            observation_seed: None,
             version: env!("CARGO_PKG_VERSION").to_owned(),
         });
         let mut writer = Writer::open(self.format, &self.out, &setup)?;
@@ -94,7 +100,7 @@ impl Label {
         progress.reset_eta();
         ordered::for_each(
             next..end.max(next),
-            |number| recipe.label(number),
+            |number| config.label(number),
             |number, scene| {
                 if let Some(scene) = scene {
                     if let Some(export) = &mut export {
@@ -139,11 +145,11 @@ impl Writer {
         let voxel_size = WORKSPACE_SIZE / RESOLUTION as f64;
         let id = format!("{number:08}");
         match self {
-            Self::Raw(writer) => writer.append(&id, &scene.looks[0].views, &trials(1.0))?,
-            Self::Processed(writer) => writer.append(&id, &scene.looks[0].volume, &trials(voxel_size))?,
+            Self::Raw(writer) => writer.append(&id, &scene.observations[0].views, &trials(1.0))?,
+            Self::Processed(writer) => writer.append(&id, &scene.observations[0].volume, &trials(voxel_size))?,
             Self::Packed(writer) => {
                 let trials = trials(voxel_size);
-                let volumes: Vec<Vec<f32>> = scene.looks.drain(..).map(|look| look.volume).collect();
+                let volumes: Vec<Vec<f32>> = scene.observations.drain(..).map(|look| look.volume).collect();
                 writer.append(number, &volumes, &trials)?;
             }
         }

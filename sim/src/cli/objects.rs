@@ -10,7 +10,7 @@ use nalgebra::{Isometry3, Point3};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::Scene;
+use super::{Scene, parse_objects};
 
 /// Objects across and down, and the distance between them, metres.
 const COLUMNS: usize = 10;
@@ -20,8 +20,8 @@ const PITCH: f64 = 0.16;
 /// What scenes are made of, to look at, or for another simulator.
 #[derive(Args)]
 pub struct Objects {
-    /// The objects: our own, `train`, `test` or `endless`, or a folder of URDF files.
-    #[arg(long, default_value = "train")]
+    /// The objects: our own, `train`, `test` or `generated`, or a folder of URDF files.
+    #[arg(long, default_value = "train", value_parser = parse_objects)]
     objects: String,
 
     /// Of which scene the test objects are.

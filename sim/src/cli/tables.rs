@@ -16,13 +16,13 @@ use grasp_sim::objects::ObjectSet;
 use grasp_sim::planner::PlannerSpec;
 use grasp_sim::score::{Spread, Summary};
 use grasp_sim::tables::{
-    EPSILON, EPSILONS, Game, LEARNT_BOTH, RELEASED, Results, SCENARIOS, Simulator, TEST_OBJECTS, VIEWS,
+    Condition, EPSILON, EPSILONS, LEARNT_BOTH, RELEASED, Results, SCENARIOS, Simulator, TEST_OBJECTS, VIEWS,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{Scene, parse_views};
 use fingerprint::{decoding, digest, hash, hash_folder, simulator};
-use log::{Log, Played};
+use log::{Log, Measurement};
 use pybullet::{FOLDER, PyBullet, model};
 
 /// Plays what the paper's tables need, and writes them beside the published figures. What was played is kept beside the
@@ -88,7 +88,7 @@ struct Entry {
 /// Something to play.
 struct Task {
     key: String,
-    game: Game,
+    condition: Condition,
     planner: String,
     seed: u64,
     timed: bool,
@@ -106,7 +106,7 @@ impl Tables {
             .with_style(ProgressStyle::with_template("{wide_bar} {pos}/{len} scenes, {eta} left {msg}")?);
         let mut pybullet = self.pybullet.as_deref().zip(self.graspd.as_deref()).map(|(p, g)| PyBullet::new(p, g));
         for task in missing {
-            let Game { method, scenario, objects, simulator, .. } = &task.game;
+            let Condition { method, scenario, objects, simulator, .. } = &task.condition;
             progress.set_message(format!("{method} on {scenario}, {objects}, {}", simulator.name()));
             let played = match (simulator, &mut pybullet) {
                 (Simulator::PyBullet, Some(pybullet)) => self.play_there(task, pybullet, &progress),
@@ -178,7 +178,7 @@ impl Tables {
                 if crossed && of_proposals {
                     continue;
                 }
-                let as_published = Game {
+                let as_published = Condition {
                     method: entry.method.clone(),
                     learnt: entry.learnt.map(str::to_owned),
                     scenario: scenario.to_owned(),
@@ -189,14 +189,14 @@ impl Tables {
                     forced: true,
                 };
                 let kind = entry.planner.split(':').next().filter(|_| !is_network || of_proposals);
-                let mut add = |game: Game, of_objects: &str, seed, timed| {
-                    let Game { views, epsilon, forced, .. } = &game;
+                let mut add = |condition: Condition, of_objects: &str, seed, timed| {
+                    let Condition { views, epsilon, forced, .. } = &condition;
                     let scenes = if timed { self.timed } else { self.rounds };
                     let on = (scenario, views, epsilon, forced, seed, scenes, timed);
-                    let simulator = there.as_ref().filter(|_| game.simulator == Simulator::PyBullet);
+                    let simulator = there.as_ref().filter(|_| condition.simulator == Simulator::PyBullet);
                     let key =
                         digest(&format!("{kind:?} {:?} {on:?} {fingerprint} {of_objects} {simulator:?}", entry.sha256));
-                    tasks.push(Task { key, game, planner: entry.planner.clone(), seed, timed });
+                    tasks.push(Task { key, condition, planner: entry.planner.clone(), seed, timed });
                 };
                 (self.seed..self.seed + self.seeds).for_each(|seed| add(as_published.clone(), "", seed, false));
                 if crossed {
@@ -205,10 +205,12 @@ impl Tables {
                 let mut more = Vec::new();
                 if is_network && !of_proposals {
                     let elsewhere = VIEWS.into_iter().skip(1);
-                    more.extend(elsewhere.map(|(views, _)| Game { views: views.to_owned(), ..as_published.clone() }));
-                    more.extend(EPSILONS.map(|epsilon| Game { epsilon, forced: false, ..as_published.clone() }));
+                    more.extend(
+                        elsewhere.map(|(views, _)| Condition { views: views.to_owned(), ..as_published.clone() }),
+                    );
+                    more.extend(EPSILONS.map(|epsilon| Condition { epsilon, forced: false, ..as_published.clone() }));
                 }
-                more.into_iter().for_each(|game| add(game, "", self.seed, false));
+                more.into_iter().for_each(|condition| add(condition, "", self.seed, false));
                 add(as_published.clone(), "", self.seed, true);
 
                 let planner = PlannerSpec::from(entry.planner.as_str());
@@ -217,10 +219,10 @@ impl Tables {
                 let ours = (TEST_OBJECTS.to_owned(), String::new());
                 for (objects, hash) in std::iter::once(&ours).chain(&others) {
                     for simulator in [Simulator::Rapier, Simulator::PyBullet] {
-                        let game = Game { objects: objects.clone(), simulator, ..as_published.clone() };
-                        let is_new = game != as_published;
+                        let condition = Condition { objects: objects.clone(), simulator, ..as_published.clone() };
+                        let is_new = condition != as_published;
                         if is_new && (is_there || simulator == Simulator::Rapier) {
-                            add(game, hash, self.seed, false);
+                            add(condition, hash, self.seed, false);
                         }
                     }
                 }
@@ -234,13 +236,13 @@ impl Tables {
     }
 
     /// The folder of a game's objects; `None` of ours.
-    fn folder(&self, game: &Game) -> Option<&Path> {
-        self.others.iter().map(PathBuf::as_path).find(|folder| name_of(folder) == game.objects)
+    fn folder(&self, condition: &Condition) -> Option<&Path> {
+        self.others.iter().map(PathBuf::as_path).find(|folder| name_of(folder) == condition.objects)
     }
 
-    fn benchmark(&self, game: &Game, seed: u64) -> anyhow::Result<Benchmark> {
-        let scene = scene_of(&game.scenario);
-        let objects = match self.folder(game) {
+    fn benchmark(&self, condition: &Condition, seed: u64) -> anyhow::Result<Benchmark> {
+        let scene = scene_of(&condition.scenario);
+        let objects = match self.folder(condition) {
             Some(folder) => ObjectSet::load(folder)?,
             None => scene.objects("test")?,
         };
@@ -248,25 +250,26 @@ impl Tables {
             kind: scene.kind(),
             objects,
             count: 5,
-            views: parse_views(&game.views).context("views of a table")?,
+            views: parse_views(&condition.views).context("views of a table")?,
             noise: 1.0,
             rounds: self.rounds,
             seed,
         })
     }
 
-    fn play_there(&self, task: &Task, pybullet: &mut PyBullet, progress: &ProgressBar) -> anyhow::Result<Played> {
+    fn play_there(&self, task: &Task, pybullet: &mut PyBullet, progress: &ProgressBar) -> anyhow::Result<Measurement> {
         let planner = PlannerSpec::from(task.planner.as_str());
         let model = model(&planner, &self.models);
-        let summary = pybullet.play(&task.game, model.as_ref(), self.folder(&task.game), self.rounds, task.seed)?;
+        let summary =
+            pybullet.play(&task.condition, model.as_ref(), self.folder(&task.condition), self.rounds, task.seed)?;
         progress.inc(self.rounds);
-        let (key, game) = (task.key.clone(), task.game.clone());
-        Ok(Played { key, game, seed: task.seed, summary: Some(summary), milliseconds: None })
+        let (key, condition) = (task.key.clone(), task.condition.clone());
+        Ok(Measurement { key, condition, seed: task.seed, summary: Some(summary), milliseconds: None })
     }
 
-    fn play(&self, task: &Task, progress: &ProgressBar) -> anyhow::Result<Played> {
-        let benchmark = self.benchmark(&task.game, task.seed)?;
-        let params = params(task.game.epsilon, task.game.forced);
+    fn play(&self, task: &Task, progress: &ProgressBar) -> anyhow::Result<Measurement> {
+        let benchmark = self.benchmark(&task.condition, task.seed)?;
+        let params = params(task.condition.epsilon, task.condition.forced);
         let planner = PlannerSpec::from(task.planner.as_str());
         let (mut summary, mut milliseconds) = (None, None);
         if task.timed {
@@ -290,17 +293,25 @@ impl Tables {
             })?;
             summary = Some(Summary::of(&rounds));
         }
-        Ok(Played { key: task.key.clone(), game: task.game.clone(), seed: task.seed, summary, milliseconds })
+        Ok(Measurement {
+            key: task.key.clone(),
+            condition: task.condition.clone(),
+            seed: task.seed,
+            summary,
+            milliseconds,
+        })
     }
 
     fn results(&self, entries: &[Entry], tasks: &[Task], log: &Log) -> anyhow::Result<Results> {
         let mut results = Results::default();
         for played in tasks.iter().filter_map(|task| log.played.get(&task.key)) {
             if let Some(summary) = &played.summary {
-                results.games.entry(played.game.clone()).or_default().push(summary.clone());
+                results.conditions.entry(played.condition.clone()).or_default().push(summary.clone());
             }
             if let Some(milliseconds) = played.milliseconds {
-                results.times.insert((played.game.method.clone(), played.game.scenario.clone()), milliseconds);
+                results
+                    .times
+                    .insert((played.condition.method.clone(), played.condition.scenario.clone()), milliseconds);
             }
         }
         for entry in entries.iter().filter(|entry| entry.method != RELEASED) {

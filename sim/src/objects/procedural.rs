@@ -29,7 +29,7 @@ const SMALLEST: f64 = 0.045;
 const HEAVIEST: f64 = 1.5;
 
 /// Seeds of the objects that are in no split.
-pub(super) const ENDLESS: Range<u64> = 1 << 32..1 << 63;
+pub(super) const GENERATED: Range<u64> = 1 << 32..1 << 63;
 
 /// A kind of object.
 struct Kind {
@@ -168,7 +168,7 @@ mod tests {
         let names: HashSet<String> = all().into_iter().map(|object| object.name).collect();
         assert_eq!(names.len(), 303 + 40 + 16);
         let seeds = [Split::Train, Split::PileTest, Split::PackedTest].into_iter().flat_map(seeds);
-        assert!(seeds.into_iter().all(|seed| !ENDLESS.contains(&seed)));
+        assert!(seeds.into_iter().all(|seed| !GENERATED.contains(&seed)));
     }
 
     #[test]

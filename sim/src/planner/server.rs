@@ -1,6 +1,6 @@
 use anyhow::Context;
 use grasp::{DecodeParams, Grasp, Intrinsics};
-use grasp_client::{Asked, Client, Depth, DepthView, Extrinsics, Options, Workspace};
+use grasp_client::{Client, Depth, DepthView, DetectOptions, Extrinsics, Options, Workspace};
 use tokio::runtime::Runtime;
 
 use super::Observation;
@@ -27,8 +27,8 @@ impl Server {
 
     pub(super) fn plan(&self, observation: &Observation) -> anyhow::Result<Vec<Grasp>> {
         let DecodeParams { threshold, force, .. } = self.params;
-        let asked = Asked { threshold: Some(threshold), force, ..Asked::default() };
-        let options = Options { asked, ..Options::default() };
+        let detect = DetectOptions { threshold: Some(threshold), force, ..DetectOptions::default() };
+        let options = Options { detect, ..Options::default() };
         let views: Vec<DepthView> = observation.views.iter().map(depth_view).collect();
         let workspace = Workspace::default();
         let detection = self.runtime.block_on(self.client.detect_from_depth(&views, &workspace, options))?;

@@ -3,7 +3,7 @@
 #![no_main]
 
 use grasp::{DepthImage, Fusion, seen_from};
-use grasp_proto::{Asked, Workspace, cloud_view, depth_view, pb};
+use grasp_proto::{DetectParams, Workspace, cloud_view, depth_view, pb};
 use libfuzzer_sys::fuzz_target;
 use nalgebra::Isometry3;
 use prost::Message;
@@ -11,7 +11,7 @@ use prost::Message;
 fuzz_target!(|bytes: &[u8]| {
     let Some((&kind, bytes)) = bytes.split_first() else { return };
     match kind % 4 {
-        0 => asked(bytes),
+        0 => options(bytes),
         1 => depth(bytes),
         2 => cloud(bytes),
         _ => fitting(bytes),
@@ -19,14 +19,14 @@ fuzz_target!(|bytes: &[u8]| {
 });
 
 /// Whatever was taken can be told in poses that are finite.
-fn asked(bytes: &[u8]) {
+fn options(bytes: &[u8]) {
     let Ok(options) = pb::Options::decode(bytes) else { return };
-    let Ok(asked) = Asked::try_from(&options) else { return };
+    let Ok(params) = DetectParams::try_from(&options) else { return };
     let grasp = Isometry3::translation(0.1, 0.2, 0.3);
-    for pose in asked.poses(&grasp) {
+    for pose in params.poses(&grasp) {
         assert!(pose.translation.vector.iter().all(|c| c.is_finite()), "{pose}");
     }
-    let _ = asked.constraints.violation(&grasp, &asked.clearance().hand);
+    let _ = params.constraints.violation(&grasp, &params.clearance().hand);
 }
 
 fn depth(bytes: &[u8]) {

@@ -1,6 +1,7 @@
 //! The command line of graspd.
 
 mod cloud;
+mod detect_args;
 mod export;
 mod files;
 mod image;
@@ -11,7 +12,6 @@ mod scene;
 mod show;
 mod view;
 mod volume;
-mod wishes;
 
 use std::fs;
 use std::io::{self, IsTerminal};
@@ -24,14 +24,15 @@ use std::time::{Duration, Instant, SystemTime};
 use anyhow::{Context, anyhow};
 use clap::{Args, Parser, Subcommand};
 use grasp_client::{
-    Access, Arrivals, Asked, Certificate, Client, Detection, Health, Identity, Options, Retry, Token, Until, load,
+    Access, Arrivals, Certificate, Client, DetectOptions, Detection, Health, Identity, Options, Retry, Token, Until,
+    load,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 use tonic::Code;
 
+use crate::detect_args::DetectArgs;
 use crate::scene::SceneArgs;
 use crate::view::ViewArgs;
-use crate::wishes::WishArgs;
 
 /// Asks a graspd for grasps.
 #[derive(Parser)]
@@ -93,7 +94,7 @@ struct Detect {
     scene: SceneArgs,
 
     #[command(flatten)]
-    wishes: WishArgs,
+    detect: DetectArgs,
 
     /// Also write them as a table with commas.
     #[arg(long, value_name = "FILE")]
@@ -114,7 +115,7 @@ struct Watch {
     scene: SceneArgs,
 
     #[command(flatten)]
-    wishes: WishArgs,
+    detect: DetectArgs,
 
     /// How often it is looked whether a file has changed, seconds.
     #[arg(long, value_name = "SECONDS", default_value_t = 0.1, value_parser = positive)]
@@ -131,7 +132,7 @@ struct View {
     scene: SceneArgs,
 
     #[command(flatten)]
-    wishes: WishArgs,
+    detect: DetectArgs,
 
     #[command(flatten)]
     view: ViewArgs,
@@ -143,7 +144,7 @@ struct Bench {
     scene: SceneArgs,
 
     #[command(flatten)]
-    wishes: WishArgs,
+    detect: DetectArgs,
 
     /// How many ask at the same time, each again as soon as there is an answer.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..), conflicts_with = "rate")]
@@ -191,8 +192,8 @@ async fn main() -> ExitCode {
     }
 }
 
-fn options(scene: &SceneArgs, asked: Asked) -> Options {
-    Options { asked, frame_id: scene.frame_id(), stamp: Some(SystemTime::now()), ..Options::default() }
+fn options(scene: &SceneArgs, detect: DetectOptions) -> Options {
+    Options { detect, frame_id: scene.frame_id(), stamp: Some(SystemTime::now()), ..Options::default() }
 }
 
 async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitCode> {
@@ -201,11 +202,11 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
         show::print(&if json { show::detection_json(detection) } else { show::detection(detection) })
     };
     match command {
-        Command::Detect(Detect { scene: args, wishes, csv, moveit, isaac }) => {
+        Command::Detect(Detect { scene: args, detect, csv, moveit, isaac }) => {
             // The files first: a mistake in them needs no server to be found.
-            let (scene, asked) = (args.read()?, wishes.read()?);
-            let opening = asked.gripper.as_ref().map_or(grasp::MAX_OPENING, |gripper| gripper.max_opening);
-            let detection = scene.detect(&connect().await?, options(&args, asked)).await?;
+            let (scene, detect) = (args.read()?, detect.read()?);
+            let opening = detect.gripper.as_ref().map_or(grasp::MAX_OPENING, |gripper| gripper.max_opening);
+            let detection = scene.detect(&connect().await?, options(&args, detect)).await?;
             print(&detection)?;
             let write = |path: Option<PathBuf>, text: &dyn Fn(&Detection) -> String| match path {
                 Some(path) => fs::write(&path, text(&detection)).with_context(|| path.display().to_string()),
@@ -215,8 +216,8 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             write(moveit, &export::moveit)?;
             write(isaac, &|detection| export::isaac(detection, opening))?;
         }
-        Command::Watch(Watch { scene: args, wishes, every, count }) => {
-            let asked = wishes.read()?;
+        Command::Watch(Watch { scene: args, detect, every, count }) => {
+            let detect = detect.read()?;
             let client = connect().await?;
             let stamps = || args.files().map(|path| fs::metadata(path)?.modified()).collect::<io::Result<Vec<_>>>();
             let (mut seen, mut answers) = (None, 0);
@@ -226,7 +227,7 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
                 if now.is_some() && now != seen {
                     let answer = async {
                         let scene = args.read()?;
-                        anyhow::Ok(scene.detect(&client, options(&args, asked.clone())).await?)
+                        anyhow::Ok(scene.detect(&client, options(&args, detect.clone())).await?)
                     };
                     match answer.await {
                         Ok(detection) => {
@@ -243,18 +244,18 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
                 tokio::time::sleep(Duration::from_secs_f64(every)).await;
             }
         }
-        Command::View(View { scene: args, wishes, view }) => {
+        Command::View(View { scene: args, detect, view }) => {
             // Hands are drawn by their finger base, whatever frame of them is asked for.
-            let (scene, asked) = (args.read()?, Asked { convention: None, ..wishes.read()? });
-            let table = asked.collision.and_then(|collision| collision.table_height);
-            let depth = asked.gripper.as_ref().map(|gripper| gripper.finger_depth);
-            let detection = scene.detect(&connect().await?, options(&args, asked)).await?;
+            let (scene, detect) = (args.read()?, DetectOptions { convention: None, ..detect.read()? });
+            let table = detect.collision.and_then(|collision| collision.table_height);
+            let depth = detect.gripper.as_ref().map(|gripper| gripper.finger_depth);
+            let detection = scene.detect(&connect().await?, options(&args, detect)).await?;
             let path = view.write(&scene.volume()?, table, depth, &detection)?;
             show::print(&format!("{} grasps in {}", detection.grasps.len(), path.display()))?;
         }
-        Command::Bench(Bench { scene: args, wishes, callers, rate, seconds }) => {
+        Command::Bench(Bench { scene: args, detect, callers, rate, seconds }) => {
             let scene = Arc::new(args.read()?);
-            let options = options(&args, wishes.read()?);
+            let options = options(&args, detect.read()?);
             // What is refused is to be seen, not to be tried again.
             let access = Access { retry: Retry::NONE, ..access.read()? };
             let client = Client::connect_with(server, access).await?;

@@ -49,7 +49,7 @@ pub fn provenance() -> Provenance {
         looks: 1,
         noise: 0.0,
         seed: 0,
-        look_seed: None,
+        observation_seed: None,
         version: String::new(),
     }
 }

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::{fs, io};
 
 use anyhow::Context;
-use grasp::{Maps, RESOLUTION, Volume, WORKSPACE_SIZE, decode};
-use grasp_sim::label::Recipe;
+use grasp::{Grasp, Maps, RESOLUTION, Volume, WORKSPACE_SIZE, decode};
+use grasp_sim::label::SceneConfig;
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::tables::{EPSILON, VIEWS};
 use nalgebra::Isometry3;
@@ -19,18 +19,24 @@ use crate::cli::{Scene, parse_views};
 /// Changes when the simulator does: a hash of two labelled scenes.
 pub(super) fn simulator() -> String {
     let scenes = [Scene::Pile, Scene::Packed].map(|scene| {
-        let recipe = Recipe {
+        let config = SceneConfig {
             kind: scene.kind(),
             objects: ObjectSet::procedural(Split::PileTest),
             points: 10,
             views: parse_views(VIEWS[0].0).expect("the paper's view is one"),
-            looks: 1,
+            observations: 1,
             noise: 1.0,
             seed: 1,
         };
-        recipe.label(1)
+        config.label(1)
     });
-    digest(&format!("{scenes:?}"))
+    // Numbers alone: the names of types and fields may change.
+    let seen = scenes.iter().flatten().flat_map(|scene| &scene.observations).flat_map(|seen| &seen.volume);
+    let tried = scenes.iter().flatten().flat_map(|scene| &scene.points).flat_map(|point| {
+        let own = [point.share, point.clearance, f32::from(u8::from(point.success()))].map(f64::from);
+        [numbers(&point.grasp), own.to_vec(), point.lifted.map(|lifted| f64::from(u8::from(lifted))).to_vec()].concat()
+    });
+    digest(&format!("{:?} {:?}", seen.collect::<Vec<_>>(), tried.collect::<Vec<_>>()))
 }
 
 /// Changes when decoding does: a hash of what is found in a volume and maps by chance.
@@ -54,7 +60,13 @@ pub(super) fn decoding() -> String {
         let decoded = decode(&volume, &maps, &params(EPSILON, forced)).expect("maps of the volume's size");
         decoded.grasps
     });
-    digest(&format!("{found:?}"))
+    digest(&format!("{:?}", found.iter().flatten().map(numbers).collect::<Vec<_>>()))
+}
+
+fn numbers(grasp: &Grasp) -> Vec<f64> {
+    let Grasp { pose, width, quality } = grasp;
+    let (position, rotation) = (pose.translation.vector, pose.rotation.coords);
+    [position.as_slice(), rotation.as_slice(), &[*width, f64::from(*quality)]].concat()
 }
 
 pub(super) fn digest(text: &str) -> String {

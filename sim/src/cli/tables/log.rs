@@ -7,16 +7,16 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use grasp_sim::score::{Spread, Summary};
-use grasp_sim::tables::Game;
+use grasp_sim::tables::Condition;
 use serde::{Deserialize, Serialize};
 
 /// A line of what was played.
 #[derive(Clone, Serialize, Deserialize)]
-pub(super) struct Played {
+pub(super) struct Measurement {
     /// A hash of everything that it depends on.
     pub(super) key: String,
     #[serde(flatten)]
-    pub(super) game: Game,
+    pub(super) condition: Condition,
     pub(super) seed: u64,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) summary: Option<Summary>,
@@ -28,7 +28,7 @@ pub(super) struct Played {
 pub(super) struct Log {
     path: PathBuf,
     file: File,
-    pub(super) played: BTreeMap<String, Played>,
+    pub(super) played: BTreeMap<String, Measurement>,
 }
 
 impl Log {
@@ -41,7 +41,7 @@ impl Log {
         if path.exists() {
             for line in BufReader::new(File::open(path).with_context(context)?).lines() {
                 // What a killed run left half written is played again.
-                if let Ok(line) = serde_json::from_str::<Played>(&line.with_context(context)?) {
+                if let Ok(line) = serde_json::from_str::<Measurement>(&line.with_context(context)?) {
                     played.insert(line.key.clone(), line);
                 }
             }
@@ -50,7 +50,7 @@ impl Log {
         Ok(Self { path: path.to_owned(), file, played })
     }
 
-    pub(super) fn append(&mut self, played: Played) -> anyhow::Result<()> {
+    pub(super) fn append(&mut self, played: Measurement) -> anyhow::Result<()> {
         // After a half-written line a new one begins.
         let line = format!("\n{}\n", serde_json::to_string(&played)?);
         self.file.write_all(line.as_bytes()).with_context(|| self.path.display().to_string())?;

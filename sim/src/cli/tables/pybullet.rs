@@ -9,7 +9,7 @@ use anyhow::{Context, ensure};
 use grasp_client::LocalServer;
 use grasp_sim::planner::PlannerSpec;
 use grasp_sim::score::Summary;
-use grasp_sim::tables::Game;
+use grasp_sim::tables::Condition;
 use tempfile::TempDir;
 
 use super::{FORCE, scene_of};
@@ -59,7 +59,7 @@ impl PyBullet {
     /// Clears tables; without a model, by random grasps. `folder` has the objects, if they are not ours.
     pub(super) fn play(
         &mut self,
-        game: &Game,
+        condition: &Condition,
         model: Option<&Model>,
         folder: Option<&Path>,
         rounds: u64,
@@ -67,13 +67,17 @@ impl PyBullet {
     ) -> anyhow::Result<Summary> {
         let objects = match folder {
             Some(folder) => folder.to_owned(),
-            None => self.ours(&game.scenario)?,
+            None => self.ours(&condition.scenario)?,
         };
         let mut command = Command::new(&self.python);
-        command.arg(Path::new(FOLDER).join("clear.py")).args(["--scene", &game.scenario]).arg("--objects").arg(objects);
+        command
+            .arg(Path::new(FOLDER).join("clear.py"))
+            .args(["--scene", &condition.scenario])
+            .arg("--objects")
+            .arg(objects);
         if let Some(model) = model {
             let address = self.server(model.folder)?;
-            let epsilon = format!("0.{}", game.epsilon);
+            let epsilon = format!("0.{}", condition.epsilon);
             let (threshold, force) = match model.threshold {
                 Some(threshold) => (threshold, "none".to_owned()),
                 None => (epsilon.as_str(), FORCE.to_string()),

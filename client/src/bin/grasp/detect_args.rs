@@ -2,14 +2,14 @@ use std::path::PathBuf;
 
 use anyhow::ensure;
 use clap::{Args, ValueEnum};
-use grasp_client::{Asked, pb};
+use grasp_client::{DetectOptions, pb};
 
 use crate::numbers::Numbers;
 use crate::pose;
 
 /// What is asked of the grasps.
 #[derive(Args, Clone)]
-pub(crate) struct WishArgs {
+pub(crate) struct DetectArgs {
     /// Which planner answers: a network, `gpd` or `shaf`. By default the server chooses.
     #[arg(long, default_value = "", hide_default_value = true)]
     model: String,
@@ -114,9 +114,9 @@ enum Closing {
     X,
 }
 
-impl WishArgs {
+impl DetectArgs {
     /// As the protocol has it.
-    pub fn read(&self) -> anyhow::Result<Asked> {
+    pub fn read(&self) -> anyhow::Result<DetectOptions> {
         ensure!(
             self.parent_from_grasp.is_none() || self.origin == Origin::Parent,
             "--parent-from-grasp needs --origin parent"
@@ -125,7 +125,7 @@ impl WishArgs {
         let vector = |[x, y, z]: [f64; 3]| Some(pb::Vector3 { x, y, z });
         let corners = |Numbers([a, b, c, x, y, z])| pb::Box { min: vector([a, b, c]), max: vector([x, y, z]) };
         let Self { model, version, threshold, force, max_grasps, explain, min_height, table_height, .. } = self.clone();
-        Ok(Asked {
+        Ok(DetectOptions {
             model,
             version,
             threshold,

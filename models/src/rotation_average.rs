@@ -12,7 +12,7 @@ use crate::onnx::{AttributeProto, GraphProto, ModelProto, NodeProto, TensorProto
 
 /// Why a network cannot be averaged over turns.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
-pub enum TurnsError {
+pub enum RotationAverageError {
     /// It was not made here, or regresses quaternions.
     #[error(
         "only networks that regress axes can be averaged over turns: those of `grasp-train train --orientation axes`"
@@ -33,13 +33,13 @@ const TURNED: &str = "turns.all";
 /// The model, averaged over the four quarter turns of its volume.
 ///
 /// # Errors
-/// [`TurnsError`] when it is not one of those that can be.
-pub fn averaged_over_turns(model: &ModelProto) -> Result<ModelProto, TurnsError> {
-    let graph = model.graph.as_ref().ok_or(TurnsError::NotAxes)?;
-    let input = graph.input.first().ok_or(TurnsError::NotAxes)?.name();
-    let heads = heads(graph).ok_or(TurnsError::NotAxes)?;
+/// [`RotationAverageError`] when it is not one of those that can be.
+pub fn averaged_over_rotations(model: &ModelProto) -> Result<ModelProto, RotationAverageError> {
+    let graph = model.graph.as_ref().ok_or(RotationAverageError::NotAxes)?;
+    let input = graph.input.first().ok_or(RotationAverageError::NotAxes)?.name();
+    let heads = heads(graph).ok_or(RotationAverageError::NotAxes)?;
     if graph.node.iter().flat_map(|node| &node.output).any(|output| output == TURNED) {
-        return Err(TurnsError::Already);
+        return Err(RotationAverageError::Already);
     }
     let answer = &heads.output[0];
     let answers = format!("{answer}.turned");

@@ -4,27 +4,30 @@ use anyhow::{Context, ensure};
 use clap::{Args, ValueEnum};
 use grasp_data::packed::{Reader, Writer};
 use grasp_data::{Provenance, Setup, quantise};
-use grasp_sim::label::Recipe;
+use grasp_sim::label::SceneConfig;
 use grasp_sim::ordered;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{Scene, VIEWS, parse_share, parse_views};
+use super::{Scene, VIEWS, parse_camera_words, parse_share, parse_views, refuse_looks};
 
 /// A fraction of the work of labelling: nothing is tried. A run that was cut off goes on where it stopped.
 #[derive(Args)]
-pub struct Look {
+pub struct Observe {
     /// Folder that `label` wrote, packed.
     data: PathBuf,
 
     /// The cameras, as for `label`.
-    #[arg(long)]
+    #[arg(long, value_parser = parse_camera_words)]
     views: String,
 
-    /// How often each scene is looked at.
+    /// Observations of each scene.
     #[arg(long, default_value_t = 1)]
-    looks: usize,
+    observations: usize,
 
-    /// Share of the looks that carry the benchmark's depth noise.
+    #[arg(long, hide = true, value_parser = refuse_looks)]
+    looks: Option<String>,
+
+    /// Share of the observations that carry the benchmark's depth noise.
     #[arg(long, default_value_t = 1.0, value_parser = parse_share)]
     noise: f64,
 
@@ -37,9 +40,9 @@ pub struct Look {
     out: PathBuf,
 }
 
-impl Look {
+impl Observe {
     pub fn run(self) -> anyhow::Result<()> {
-        ensure!(self.looks > 0, "--looks is 0");
+        ensure!(self.observations > 0, "--observations is 0");
         let parse = |views: &str| parse_views(views).with_context(|| format!("--views is `{views}`: use {VIEWS}"));
         let views = parse(&self.views)?;
         let data = Reader::open(&self.data)?;
@@ -49,18 +52,18 @@ impl Look {
         let missing = || format!("{} does not say how its scenes were made", self.data.display());
         let made = Setup::read(&self.data)?.provenance.with_context(missing)?;
         let scene = Scene::from_str(&made.scene, false).map_err(anyhow::Error::msg)?;
-        let before = Recipe {
+        let before = SceneConfig {
             kind: scene.kind(),
             objects: scene.objects(&made.objects)?,
             points: made.points,
             views: parse(&made.views)?,
-            looks: made.looks,
+            observations: made.observations,
             noise: made.noise,
             seed: made.seed,
         };
         if let Some(&first) = scenes.first() {
-            let looks = before.look_anew(data.number(first), made.look_seed.unwrap_or(made.seed));
-            let same = looks.first().is_some_and(|look| quantise(&look.volume) == data.volume(first, 0));
+            let observations = before.observe_again(data.number(first), made.observation_seed.unwrap_or(made.seed));
+            let same = observations.first().is_some_and(|look| quantise(&look.volume) == data.volume(first, 0));
             ensure!(
                 same,
                 "{} was labelled with another simulator, in which other scenes came out",
@@ -70,9 +73,9 @@ impl Look {
 
         let setup = Setup::benchmark(Provenance {
             views: self.views.clone(),
-            looks: self.looks,
+            observations: self.observations,
             noise: self.noise,
-            look_seed: Some(self.seed),
+            observation_seed: Some(self.seed),
             ..made
         });
         let mut writer = Writer::open(&self.out, &setup)?;
@@ -82,14 +85,14 @@ impl Look {
         let progress = ProgressBar::new(scenes.len() as u64).with_style(ProgressStyle::with_template(style)?);
         progress.set_position(done as u64);
         progress.reset_eta();
-        let recipe = Recipe { views, looks: self.looks, noise: self.noise, ..before };
+        let config = SceneConfig { views, observations: self.observations, noise: self.noise, ..before };
         ordered::for_each(
             done as u64..scenes.len() as u64,
-            |place| recipe.look_anew(data.number(scenes[place as usize]), self.seed),
-            |place, looks| {
+            |place| config.observe_again(data.number(scenes[place as usize]), self.seed),
+            |place, observations| {
                 let index = scenes[place as usize];
-                if !looks.is_empty() {
-                    let volumes: Vec<Vec<f32>> = looks.into_iter().map(|look| look.volume).collect();
+                if !observations.is_empty() {
+                    let volumes: Vec<Vec<f32>> = observations.into_iter().map(|look| look.volume).collect();
                     writer.append(data.number(index), &volumes, &data.trials(index))?;
                 }
                 progress.inc(1);
