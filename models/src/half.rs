@@ -26,7 +26,7 @@ pub fn with_half_weights(model: &ModelProto) -> Result<ModelProto, TensorError> 
     let Some(graph) = &mut model.graph else { return Ok(model) };
     let mut casts = Vec::new();
     for weight in &mut graph.initializer {
-        if weight.data_type() != DataType::Float || weight.elements() < SMALLEST {
+        if weight.element_type() != DataType::Float || weight.elements() < SMALLEST {
             continue;
         }
         let values = weight.to_f32()?;
@@ -75,7 +75,7 @@ fn casts(graph: &GraphProto) -> HashMap<String, String> {
     let halves: HashSet<&str> = graph
         .initializer
         .iter()
-        .filter(|weight| weight.data_type() == DataType::Float16)
+        .filter(|weight| weight.element_type() == DataType::Float16)
         .map(|weight| weight.name())
         .collect();
     let of_half = |node: &&NodeProto| {

@@ -171,9 +171,9 @@ impl Metadata {
 
 /// The resolution an input of shape `[batch, 1, N, N, N]` fixes.
 fn fixed_resolution(input: &ValueInfoProto) -> Option<usize> {
-    let dims = &input.r#type.as_ref()?.tensor_type.as_ref()?.shape.as_ref()?.dim;
+    let dims = &input.tensor_type()?.shape.as_ref()?.dim;
     match dims.last()?.value {
-        Some(DimensionValue::Size(size)) => usize::try_from(size).ok().filter(|&size| size > 0),
+        Some(DimensionValue::DimValue(size)) => usize::try_from(size).ok().filter(|&size| size > 0),
         _ => None,
     }
 }

@@ -207,7 +207,7 @@ impl<'a> Facts<'a> {
         }
         let weight = self.constants.get(node.input.get(1)?.as_str())?;
         let &[channels, inputs, ..] = weight.dims.as_slice() else { return None };
-        if weight.data_type() != DataType::Float {
+        if weight.element_type() != DataType::Float {
             return None;
         }
         let name = node.output.first()?;
@@ -350,10 +350,10 @@ fn shape(node: &NodeProto) -> Option<Shape> {
 
 /// The edge of an input `[batch, channels, edge, edge, edge]`.
 fn cube(input: &crate::onnx::ValueInfoProto) -> Option<usize> {
-    let shape = input.r#type.as_ref()?.tensor_type.as_ref()?.shape.as_ref()?;
+    let shape = input.tensor_type()?.shape.as_ref()?;
     let [_, _, x, y, z] = shape.dim.as_slice() else { return None };
     match (&x.value, x == y && y == z) {
-        (Some(DimensionValue::Size(edge)), true) => usize::try_from(*edge).ok(),
+        (Some(DimensionValue::DimValue(edge)), true) => usize::try_from(*edge).ok(),
         _ => None,
     }
 }

@@ -87,10 +87,16 @@ impl TensorProto {
         self.dims.iter().map(|&dim| usize::try_from(dim).unwrap_or(0)).product()
     }
 
+    /// What it holds; `Undefined` where the number is not one of ONNX's.
+    #[must_use]
+    pub fn element_type(&self) -> DataType {
+        DataType::try_from(self.data_type()).unwrap_or_default()
+    }
+
     /// Whether it holds floating-point numbers.
     #[must_use]
     pub fn is_float(&self) -> bool {
-        matches!(self.data_type(), DataType::Float | DataType::Float16)
+        matches!(self.element_type(), DataType::Float | DataType::Float16)
     }
 
     /// The values of an f32 or f16 tensor.
@@ -99,7 +105,7 @@ impl TensorProto {
     /// [`TensorError`] when it holds something else, or too little of it.
     pub fn to_f32(&self) -> Result<Vec<f32>, TensorError> {
         let halves = |bits: u16| f16::from_bits(bits).to_f32();
-        match (self.data_type(), self.raw()?) {
+        match (self.element_type(), self.raw()?) {
             (DataType::Float, Some(raw)) => self.checked(raw.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b))),
             (DataType::Float, None) => self.checked(self.float_data.iter().copied()),
             (DataType::Float16, Some(raw)) => {
@@ -115,7 +121,7 @@ impl TensorProto {
     /// # Errors
     /// [`TensorError`] when it holds something else, or too little of it.
     pub fn to_i64(&self) -> Result<Vec<i64>, TensorError> {
-        match (self.data_type(), self.raw()?) {
+        match (self.element_type(), self.raw()?) {
             (DataType::Int64, Some(raw)) => self.checked(raw.as_chunks().0.iter().map(|b| i64::from_le_bytes(*b))),
             (DataType::Int64, None) => self.checked(self.int64_data.iter().copied()),
             _ => Err(self.wrong_type("INT64 (7)")),

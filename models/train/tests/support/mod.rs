@@ -46,7 +46,7 @@ pub fn provenance() -> Provenance {
         objects: "boxes".into(),
         points: 2,
         views: "all".into(),
-        looks: 1,
+        observations: 1,
         noise: 0.0,
         seed: 0,
         observation_seed: None,
