@@ -14,16 +14,16 @@ RELEASE = $(CARGO_TARGET_DIR)/release
 
 # Put before a command. Each stops the recipe if it cannot be had.
 with_onnxruntime = ORT_DYLIB_PATH="$$($(PYTHON) deploy/native.py onnxruntime)" && export ORT_DYLIB_PATH &&
-with_python = GRASPD_PYTHON="$$($(PYTHON) deploy/native.py python)" && export GRASPD_PYTHON &&
+with_python = GRASPD_PYTHON="$$($(PYTHON) tests/tools.py python)" && export GRASPD_PYTHON &&
 # The real ones, which tests run.
-with_programs = GRASPD_PROMETHEUS="$$($(PYTHON) deploy/native.py prometheus)" && export GRASPD_PROMETHEUS && \
-	GRASPD_PROMTOOL="$$($(PYTHON) deploy/native.py promtool)" && export GRASPD_PROMTOOL && \
-	GRASPD_CPP="$$($(PYTHON) deploy/native.py cpp)" && export GRASPD_CPP && \
-	GRASPD_CHROMIUM="$$($(PYTHON) deploy/native.py chromium)" && export GRASPD_CHROMIUM &&
+with_programs = GRASPD_PROMETHEUS="$$($(PYTHON) tests/tools.py prometheus)" && export GRASPD_PROMETHEUS && \
+	GRASPD_PROMTOOL="$$($(PYTHON) tests/tools.py promtool)" && export GRASPD_PROMTOOL && \
+	GRASPD_CPP="$$($(PYTHON) tests/tools.py cpp)" && export GRASPD_CPP && \
+	GRASPD_CHROMIUM="$$($(PYTHON) tests/tools.py chromium)" && export GRASPD_CHROMIUM &&
 with_libtorch = LIBTORCH="$$($(PYTHON) deploy/native.py libtorch)" && export LIBTORCH && \
 	LD_LIBRARY_PATH="$$LIBTORCH/lib$${LD_LIBRARY_PATH:+:$$LD_LIBRARY_PATH}" && export LD_LIBRARY_PATH &&
 
-with_haproxy = GRASPD_HAPROXY="$$($(PYTHON) deploy/native.py haproxy)" && export GRASPD_HAPROXY &&
+with_haproxy = GRASPD_HAPROXY="$$($(PYTHON) tests/tools.py haproxy)" && export GRASPD_HAPROXY &&
 
 .PHONY: help demo build test fmt fmt-check lint doc deny test-rust test-train test-python test-faults fuzz bench-sim \
 	bench-serve soak tables clean
@@ -83,7 +83,7 @@ bench-serve: ## how fast the server answers, beside libtorch, OpenVINO, Triton a
 	$(CARGO) build --release $(WORKSPACE) --bins
 	$(CARGO) build --release $(WORKSPACE) --example serve
 	$(with_libtorch) $(CARGO) build --release $(TRAIN)
-	$(with_onnxruntime) $(with_libtorch) GRASPD_PEERS="$$($(PYTHON) deploy/native.py peers)" && export GRASPD_PEERS && \
+	$(with_onnxruntime) $(with_libtorch) GRASPD_PEERS="$$($(PYTHON) tests/tools.py peers)" && export GRASPD_PEERS && \
 		GRASP_TRAIN=$(RELEASE)/grasp-train $(RELEASE)/examples/serve 5 $(CARGO_TARGET_DIR)/bench-serve.json
 
 soak: ## a minute of four times what the server can do, then 20 minutes of 80 % of it; MINUTES=N

@@ -1,19 +1,12 @@
 #!/usr/bin/env python3
-"""Gets the native libraries that cargo cannot get, and prints where they are.
+"""Downloads the native libraries that cargo cannot download, and prints their paths.
 
     native.py onnxruntime      the shared library, for ORT_DYLIB_PATH
     native.py onnxruntime-gpu  the one for NVIDIA cards, likewise; it needs CUDA 13
     native.py libtorch         a folder with lib/ and include/, for LIBTORCH (training only)
-    native.py python           the interpreter that runs the tests in Python, for GRASPD_PYTHON
-    native.py peers            the interpreter that runs what graspd is compared with, for GRASPD_PEERS
-    native.py haproxy          the load balancer of `make test-faults`, for GRASPD_HAPROXY
-    native.py prometheus       what the tests of deploy/prometheus and deploy/grafana ask, for GRASPD_PROMETHEUS
-    native.py promtool         what checks its rules, for GRASPD_PROMTOOL
-    native.py cpp              a prefix with CMake, protoc and gRPC for C++, for GRASPD_CPP
-    native.py chromium         the browser that the page is tested in, for GRASPD_CHROMIUM
 
-The path is all that goes to stdout. Where the named variable is set already, its path is checked and
-printed. What is fetched stays in ${GRASPD_CACHE:-~/.cache/graspd}: a second run touches no network.
+Only the path goes to stdout. If the variable is set, its path is checked and printed. Downloads stay in
+${GRASPD_CACHE:-~/.cache/graspd}: a second run does not use the network.
 """
 
 import os
@@ -23,7 +16,7 @@ from pathlib import Path
 from typing import Callable, Dict, List, NamedTuple
 
 # Wheels are the one form in which these libraries are published, with a hash, for every platform.
-# Only C libraries are taken out of them, so one CPython's wheels do whatever Python runs this file.
+# Only C libraries are unpacked, so the wheels of one CPython serve every Python that runs this file.
 WHEEL_PYTHON = ["--implementation", "cp", "--python-version", "3.11", "--abi", "cp311"]
 PLATFORM_TAGS = {
     "Linux-x86_64": ["manylinux_2_28_x86_64", "manylinux_2_25_x86_64", "manylinux2014_x86_64"],
@@ -87,7 +80,6 @@ UNPACKED = [
 CACHE_HOME = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
 CACHE = Path(os.environ.get("GRASPD_CACHE") or f"{CACHE_HOME}/graspd").expanduser().absolute()
 WHEELS = CACHE / "wheels"  # for wheels brought from another machine; looked at first
-TESTS = Path(__file__).resolve().parent.parent / "tests"
 PLATFORM = "{0.sysname}-{0.machine}".format(os.uname()) if hasattr(os, "uname") else sys.platform
 
 
@@ -123,137 +115,6 @@ def libtorch() -> Path:
     return from_wheels(LIBTORCH[PLATFORM], "set LIBTORCH to the folder of a libtorch 2.11.0")
 
 
-def python() -> Path:
-    if os.environ.get("GRASPD_PYTHON"):
-        return given("GRASPD_PYTHON")
-    if sys.version_info < (3, 11):
-        version = "{}.{}".format(*sys.version_info)
-        raise Unavailable(f"The Python client's tests need Python 3.11 or newer; {sys.executable} is {version}.")
-    return interpreter("python", sys.executable, "The Python packages of the tests", 234, "GRASPD_PYTHON")
-
-
-def peers() -> Path:
-    if os.environ.get("GRASPD_PEERS"):
-        return given("GRASPD_PEERS")
-    # The system's, which has a shared library beside it for Triton to load, wherever others are first on PATH.
-    system = "/usr/bin/python3"
-    if PLATFORM != "Linux-x86_64" or not os.path.exists(system):
-        raise Unavailable(f"The peers are for Linux on x86-64 with a {system}; this is {PLATFORM}.")
-    return interpreter("peers", system, "The Python packages of graspd's peers", 283, "GRASPD_PEERS")
-
-
-def haproxy() -> Path:
-    if os.environ.get("GRASPD_HAPROXY"):
-        return given("GRASPD_HAPROXY")
-    return from_debian("haproxy", "haproxy", "GRASPD_HAPROXY")
-
-
-def prometheus() -> Path:
-    if os.environ.get("GRASPD_PROMETHEUS"):
-        return given("GRASPD_PROMETHEUS")
-    return from_debian("prometheus", "prometheus", "GRASPD_PROMETHEUS")
-
-
-def promtool() -> Path:
-    if os.environ.get("GRASPD_PROMTOOL"):
-        return given("GRASPD_PROMTOOL")
-    return from_debian("prometheus", "promtool", "GRASPD_PROMTOOL")
-
-
-def chromium() -> Path:
-    if os.environ.get("GRASPD_CHROMIUM"):
-        return given("GRASPD_CHROMIUM")
-    # The shell without a window: the same engine, and none of GTK.
-    return from_debian("chromium-headless-shell", "chromium-headless-shell", "GRASPD_CHROMIUM")
-
-
-def cpp() -> Path:
-    import shutil
-
-    if os.environ.get("GRASPD_CPP"):
-        return given("GRASPD_CPP", "include/grpcpp", "include/google/protobuf")
-    programs = [shutil.which(name) for name in ["grpc_cpp_plugin", "protoc", "cmake"]]
-    if all(programs):
-        prefix = Path(programs[0]).resolve().parent.parent
-        if (prefix / "include/grpcpp").exists():
-            return prefix
-    packages = ["cmake", "libgrpc++-dev", "libprotobuf-dev", "protobuf-compiler-grpc"]
-    return unpacked("cpp", packages, "prefix with CMake, protoc and gRPC for C++", "GRASPD_CPP") / "usr"
-
-
-def from_debian(package: str, name: str, variable: str) -> Path:
-    """A program of Debian's."""
-    import shutil
-
-    there = shutil.which(name, path=os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin"]))
-    return Path(there) if there else unpacked(package, [package], name, variable) / name
-
-
-def unpacked(name: str, packages: List[str], title: str, variable: str) -> Path:
-    """A folder with packages of Debian's and the libraries that this machine lacks, unpacked instead of installed: nobody
-    has to be root, and nothing starts at boot."""
-    import shutil
-    import subprocess
-
-    if not shutil.which("apt-get"):
-        raise Unavailable(f"There is no {title} here, and no apt-get to fetch it: set {variable} to one.")
-    folder = CACHE / f"debian-{name}-{PLATFORM}"
-
-    def build(part: Path) -> None:
-        wanted = " ".join(packages)
-        say(f"Debian's {wanted} -> {folder}")
-        simulate = ["apt-get", "install", "--simulate", "--no-install-recommends", *packages]
-        plan = subprocess.run(simulate, capture_output=True, text=True)
-        names = [line.split()[1] for line in plan.stdout.splitlines() if line.startswith("Inst ")]
-        if not names or subprocess.run(["apt-get", "download", *names], cwd=part, stdout=sys.stderr).returncode:
-            said = plan.stderr.strip() or "apt-get says above why"
-            raise Unavailable(f"{wanted} could not be fetched ({said}): run `apt-get update` as root or set {variable}.")
-        for archive in part.glob("*.deb"):
-            subprocess.run(["dpkg-deb", "--extract", archive, part], check=True)
-            archive.unlink()
-        for link in part.glob("usr/lib/*-linux-gnu/*.so"):
-            if not link.exists():  # what is linked with is here, but its library is the system's
-                library = Path("/", link.relative_to(part)).with_name(os.readlink(link))
-                for name in {library.name, library.resolve().name}:
-                    link.with_name(name).symlink_to(library)
-        # PulseAudio's library has half of itself in a folder of its own.
-        holding = [*part.glob("usr/lib/*-linux-gnu"), *part.glob("usr/lib/*-linux-gnu/pulseaudio")]
-        libraries = os.pathsep.join(str(folder / path.relative_to(part)) for path in holding)
-        # A script for each program: the package may have several. Chromium's in usr/bin is one that looks in /usr.
-        for program in [*part.glob("usr/bin/*"), *part.glob("usr/sbin/*"), *part.glob("usr/lib/chromium/chromium-*")]:
-            script = part / program.name
-            script.write_text(f'#!/bin/sh\nLD_LIBRARY_PATH="{libraries}" exec "{folder / program.relative_to(part)}" "$@"\n')
-            script.chmod(0o755)
-
-    return built_once(folder, build)
-
-
-def interpreter(name: str, base: str, title: str, megabytes: int, variable: str) -> Path:
-    """One of its own, made from `base`, with the packages that `tests/{name}/requirements.txt` lists."""
-    import hashlib
-    import subprocess
-
-    requirements = TESTS / name / "requirements.txt"
-    ask = [base, "-c", "import sysconfig; print(sysconfig.get_python_version())"]
-    version = subprocess.check_output(ask, text=True).strip()
-    folder = CACHE / f"{name}-{version}-{hashlib.sha256(requirements.read_bytes()).hexdigest()[:12]}"
-
-    def build(part: Path) -> None:
-        say(f"{title}, {megabytes} MB of wheels -> {folder}")
-        # Without a pip of its own, since Debian's Python has none to give. Nothing in bin/ but
-        # `python` is used, which is what survives the renaming of the folder.
-        subprocess.run([base, "-m", "venv", "--without-pip", str(part)], stdout=sys.stderr, check=True)
-        names = [word for word in requirements.read_text().split() if "==" in word]
-        pip(["--python", f"{part}/bin/python", "install", "--requirement", str(requirements)], names, f"""\
-{title} could not be installed; pip says above why.
-To bring them from a machine with a network and Python {version}, run this there,
-    python3 -m pip download --dest wheels --requirement {requirements}
-and copy the wheels into {WHEELS}/
-or set {variable} to an interpreter that has these packages.""")
-
-    return built_once(folder, build) / "bin/python"
-
-
 def given(variable: str, *inside: str) -> Path:
     path = Path(os.environ[variable]).absolute()
     for wanted in [path, *map(path.joinpath, inside)]:
@@ -263,7 +124,7 @@ def given(variable: str, *inside: str) -> Path:
 
 
 def from_wheels(artefact: Artefact, otherwise: str) -> Path:
-    # The platform is in the name for the sake of homes that several machines share.
+    # The platform is in the name because several machines may share a home directory.
     folder = CACHE / f"{artefact.folder}-{PLATFORM}"
 
     def build(part: Path) -> None:
@@ -307,7 +168,7 @@ def pip(arguments: List[str], names: List[str], failure: str) -> None:
     if all(any(WHEELS.glob(name.replace("-", "_").replace("==", "-") + "-*.whl")) for name in names):
         manner.append("--no-index")
     if not sys.stderr.isatty():
-        manner.append("--quiet")  # nobody would see the progress bar move
+        manner.append("--quiet")  # without a terminal the progress bar is noise
     if subprocess.run([sys.executable, "-m", "pip", *arguments, *manner], stdout=sys.stderr).returncode:
         raise Unavailable(failure)
 
@@ -331,7 +192,7 @@ def unpack(wheels: Path, part: Path) -> None:
 
 
 def built_once(folder: Path, build: Callable[[Path], None]) -> Path:
-    """`folder`, which appears whole or not at all, however many runs want it and wherever one is cut off."""
+    """Builds `folder` unless it exists. It appears whole or not at all, also if several runs build it or one is killed."""
     if folder.is_dir():
         return folder
     import fcntl
@@ -360,14 +221,18 @@ def say(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
-if __name__ == "__main__":
-    commands = [onnxruntime, onnxruntime_gpu, libtorch, python, peers, haproxy, prometheus, promtool, cpp, chromium]
+def main(name: str, doc: str, commands: List[Callable[[], Path]]) -> None:
+    """Runs the command that the command line names."""
     subcommands = {command.__name__.replace("_", "-"): command for command in commands}
-    if sys.argv[1:] not in [[name] for name in subcommands]:
-        sys.exit(__doc__)
+    if sys.argv[1:] not in [[subcommand] for subcommand in subcommands]:
+        sys.exit(doc)
     try:
         print(subcommands[sys.argv[1]]())
     except Unavailable as missing:
-        sys.exit(f"native.py: {missing}")
+        sys.exit(f"{name}: {missing}")
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+if __name__ == "__main__":
+    main("native.py", __doc__, [onnxruntime, onnxruntime_gpu, libtorch])

@@ -1,4 +1,4 @@
-//! Compiles the .proto files without protoc.
+//! Compiles the .proto files without needing protoc.
 
 use std::env;
 use std::error::Error;
@@ -12,7 +12,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let descriptors = protox::compile(["grasp/v1/grasp.proto", "inference/inference.proto"], ["proto"])?;
     let out = PathBuf::from(env::var("OUT_DIR")?);
     fs::write(out.join("descriptors.bin"), descriptors.encode_to_vec())?;
-    // `Bytes` shares the buffer that the message arrived in instead of copying the volume out of it.
+    // `Bytes` shares the buffer of the received message instead of copying the volume.
     let mut config = tonic_prost_build::configure();
     for field in [
         ".grasp.v1.Volume.data",

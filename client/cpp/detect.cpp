@@ -1,4 +1,4 @@
-// Asks graspd for grasps in a depth image. A robot needs `connect`, `request` and what `main` does with them.
+// Detects grasps in a depth image with graspd. Robot code needs `connect`, `request` and the call in `main`.
 
 #include <grpcpp/grpcpp.h>
 
@@ -20,19 +20,19 @@
 namespace pb = grasp::v1;
 using Numbers = std::vector<double>;
 
-// Asking twice does no harm. A server that is full also says when to come back, and gRPC obeys. Calls have deadlines of
-// their own: a "timeout" in here passes up to 2 s early (github.com/grpc/grpc/issues/40633).
+// Detection is idempotent, so that it can be retried. gRPC obeys the retry hint of a busy server. Deadlines are set per
+// call: a "timeout" in this configuration can expire up to 2 s early (github.com/grpc/grpc/issues/40633).
 constexpr char SERVICE_CONFIG[] = R"(
 {"methodConfig": [{"name": [{"service": "grasp.v1.GraspService"}], "retryPolicy": {
   "maxAttempts": 5, "initialBackoff": "0.02s", "maxBackoff": "0.5s", "backoffMultiplier": 2,
   "retryableStatusCodes": ["UNAVAILABLE", "RESOURCE_EXHAUSTED"]}}]}
 )";
 
-// Once: the connection is kept for all calls, and made anew when it is lost.
+// Call this once: the stub keeps the connection for all calls and reconnects when it is lost.
 std::unique_ptr<pb::GraspService::Stub> connect(const std::string &server) {
     grpc::ChannelArguments arguments;
     arguments.SetServiceConfigJSON(SERVICE_CONFIG);
-    // gRPC retries what it has kept: by itself at most 256 KiB, less than most images.
+    // gRPC retries only requests that fit its retry buffer. The default of 256 KiB is smaller than most images.
     arguments.SetInt(GRPC_ARG_PER_RPC_RETRY_BUFFER_SIZE, 16 << 20);
     return pb::GraspService::NewStub(grpc::CreateCustomChannel(server, grpc::InsecureChannelCredentials(), arguments));
 }
@@ -47,8 +47,8 @@ pb::Vector3 vector(double x, double y, double z) {
 pb::Pose pose(const Numbers &numbers) {
     pb::Pose pose;
     *pose.mutable_position() = vector(numbers[0], numbers[1], numbers[2]);
-    auto &turned = *pose.mutable_orientation();
-    turned.set_x(numbers[3]), turned.set_y(numbers[4]), turned.set_z(numbers[5]), turned.set_w(numbers[6]);
+    auto &rotation = *pose.mutable_orientation();
+    rotation.set_x(numbers[3]), rotation.set_y(numbers[4]), rotation.set_z(numbers[5]), rotation.set_w(numbers[6]);
     return pose;
 }
 
@@ -57,19 +57,19 @@ pb::DetectGraspsFromDepthRequest request(Depth depth, const Numbers &k, const Nu
     auto &view = *request.add_views();
     view.mutable_camera()->set_width(depth.width);
     view.mutable_camera()->set_height(depth.height);
-    // Row by row. Eigen keeps columns: of a matrix of its, send the transpose.
+    // Row-major order. Eigen's default is column-major: transpose its matrices.
     view.mutable_camera()->mutable_k()->Assign(k.begin(), k.end());
     view.set_unit(depth.metres ? pb::DEPTH_UNIT_F32_METRES : pb::DEPTH_UNIT_U16_MILLIMETRES);
     view.set_data(std::move(depth.data));
     *view.mutable_frame_from_camera() = pose(camera);
 
-    // Where to look: a cube of 0.3 m whose axes are the base's.
+    // The workspace: a cube of 0.3 m with the axes of the robot's base.
     request.mutable_workspace()->set_frame_id("base");
     *request.mutable_workspace()->mutable_pose() = pose({corner[0], corner[1], corner[2], 0, 0, 0, 1});
 
     auto &options = *request.mutable_options();
     options.set_max_grasps(5);
-    // From above, at most 1 rad off the vertical, and only where the open hand meets nothing.
+    // Grasps from above, at most 1 rad from the vertical, without collision of the open hand.
     *options.mutable_approach()->mutable_axis() = vector(0, 0, -1);
     options.mutable_approach()->set_angle(1);
     options.mutable_collision()->set_mode(pb::CollisionCheck::MODE_FILTER);
@@ -81,12 +81,12 @@ void print(const pb::DetectGraspsResponse &reply, double round_trip) {
                 reply.grasps_size());
     for (const auto &grasp : reply.grasps()) {
         const auto &at = grasp.pose().position(), &before = grasp.pregrasp().position();
-        const auto &turned = grasp.pose().orientation();
+        const auto &rotation = grasp.pose().orientation();
         std::printf("quality %.3f width %.3f at %.3f %.3f %.3f turned %.3f %.3f %.3f %.3f from %.3f %.3f %.3f\n",
-                    grasp.quality(), grasp.width(), at.x(), at.y(), at.z(), turned.x(), turned.y(), turned.z(),
-                    turned.w(), before.x(), before.y(), before.z());
+                    grasp.quality(), grasp.width(), at.x(), at.y(), at.z(), rotation.x(), rotation.y(), rotation.z(),
+                    rotation.w(), before.x(), before.y(), before.z());
     }
-    // An empty answer says why.
+    // Replies without grasps report the reasons.
     if (reply.has_dropped()) std::printf("voxels without a grasp: %s\n", reply.dropped().ShortDebugString().c_str());
     const auto &took = reply.latency();
     const std::pair<const char *, double> stages[] = {
@@ -98,7 +98,7 @@ void print(const pb::DetectGraspsResponse &reply, double round_trip) {
     std::printf("\n");
 }
 
-// The message begins with the field that is wrong, where one is. gRPC has no names for its codes in C++.
+// The server's message begins with the invalid field, if there is one. gRPC has no names for its codes in C++.
 std::string describe(const grpc::Status &status) {
     static const char *const NAMES[] = {
         "OK", "CANCELLED", "UNKNOWN", "INVALID_ARGUMENT", "DEADLINE_EXCEEDED", "NOT_FOUND", "ALREADY_EXISTS",
@@ -108,7 +108,7 @@ std::string describe(const grpc::Status &status) {
 }
 
 Numbers numbers(const std::string &flag, std::string text, std::size_t count) {
-    // As ROS prints them, too.
+    // Also accepts the brackets and commas of ROS's output.
     std::replace_if(text.begin(), text.end(), [](char c) { return std::strchr("[],", c); }, ' ');
     std::istringstream stream(text);
     Numbers numbers;
@@ -119,10 +119,11 @@ Numbers numbers(const std::string &flag, std::string text, std::size_t count) {
 }
 
 constexpr char USAGE[] = R"(detect [--server HOST:PORT] [--depth FILE --k K --camera POSE --corner POINT]
-  --depth   a .npy file, height × width, float32 metres or uint16 millimetres; without it, a made-up scene
-  --k       fx 0 cx 0 fy cy 0 0 1, pixels
-  --camera  where the camera stands in the robot's base: x y z qx qy qz qw
-  --corner  of the cube of 0.3 m in which to look, in the base: x y z. A table is 0.05 above it
+  --server  address of graspd. Default: 127.0.0.1:50051
+  --depth   .npy file, height × width, float32 metres or uint16 millimetres. Default: a synthetic scene
+  --k       intrinsic matrix, pixels: fx 0 cx 0 fy cy 0 0 1
+  --camera  pose of the camera in the robot's base, metres: x y z qx qy qz qw
+  --corner  corner of the workspace, a cube of 0.3 m, in the robot's base, metres: x y z. The table is 0.05 m above it
 )";
 
 int main(int argc, char **argv) try {
@@ -135,18 +136,18 @@ int main(int argc, char **argv) try {
         }
         flags[argv[i]] = argv[i + 1];
     }
-    const bool made_up = flags["--depth"].empty();
-    const auto given = [&](const char *flag, std::size_t count, const char *in_the_scene) {
-        return numbers(flag, made_up && flags[flag].empty() ? in_the_scene : flags[flag], count);
+    const bool synthetic = flags["--depth"].empty();
+    const auto given = [&](const char *flag, std::size_t count, const char *scene_value) {
+        return numbers(flag, synthetic && flags[flag].empty() ? scene_value : flags[flag], count);
     };
-    auto depth = made_up ? made_up_scene() : read_npy(flags["--depth"]);
+    auto depth = synthetic ? synthetic_scene() : read_npy(flags["--depth"]);
     const auto message = request(std::move(depth), given("--k", 9, SCENE_K), given("--camera", 7, SCENE_CAMERA),
                                  given("--corner", 3, SCENE_CORNER));
 
     const auto grasps = connect(flags["--server"]);
-    grpc::ClientContext context;  // of one call
+    grpc::ClientContext context;  // one per call
     const auto start = std::chrono::system_clock::now();
-    // Of all attempts together.
+    // Deadline for all attempts together.
     context.set_deadline(start + std::chrono::seconds(2));
     pb::DetectGraspsResponse reply;
     const auto status = grasps->DetectGraspsFromDepth(&context, message, &reply);

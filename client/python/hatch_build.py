@@ -1,4 +1,4 @@
-"""Has protoc make the modules of the .proto file when a wheel is built: they are nowhere in the repository."""
+"""Generates the Python modules of the .proto file with protoc when a wheel is built. They are not in the repository."""
 
 import shutil
 from pathlib import Path
@@ -15,12 +15,12 @@ class ProtoHook(BuildHookInterface):
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         root = Path(self.root)
         self.folder = TemporaryDirectory()
-        made = Path(self.folder.name)
+        out = Path(self.folder.name)
         [proto] = [folder for folder in (root / "proto", root / "../../proto/proto") if (folder / FILE).exists()]
         well_known = Path(protoc.__file__).with_name("_proto")
-        if protoc.main(["protoc", f"-I{proto}", f"-I{well_known}", f"--python_out={made}", f"--pyi_out={made}", FILE]):
-            raise RuntimeError(f"protoc refuses {proto / FILE}")
-        for module in (made / FILE).parent.iterdir():
+        if protoc.main(["protoc", f"-I{proto}", f"-I{well_known}", f"--python_out={out}", f"--pyi_out={out}", FILE]):
+            raise RuntimeError(f"protoc failed for {proto / FILE}; see its output above")
+        for module in (out / FILE).parent.iterdir():
             if version == "editable":
                 shutil.copy(module, root / "src/graspd")
             else:

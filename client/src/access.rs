@@ -8,36 +8,35 @@ use tonic::service::Interceptor;
 use tonic::transport::{Certificate, ClientTlsConfig, Identity};
 use tonic::{Code, Request, Status};
 
-/// How to get in where not everybody may, and what to do when nobody answers. The default is neither TLS nor a token,
-/// and a single attempt.
+/// TLS, authentication and retries of a connection. The default is no TLS, no token and a single attempt.
 ///
-/// TLS is spoken with addresses that begin with `https://`, or where a CA or an identity is given.
+/// TLS is used when the address begins with `https://`, or when a CA or an identity is set.
 #[derive(Clone, Default)]
 pub struct Access {
-    /// The CA that signed the server's certificate; without one, those that this machine trusts.
+    /// CA that signed the server's certificate. `None`: the CAs that the operating system trusts.
     pub ca: Option<Certificate>,
-    /// What this client shows of itself, where the server wants to see it.
+    /// Client certificate and private key, for servers that require mutual TLS.
     pub identity: Option<Identity>,
-    /// What the server wants to hear.
+    /// Bearer token, for servers that require one.
     pub token: Option<Token>,
-    /// When to ask again.
+    /// When failed calls are retried.
     pub retry: Retry,
 }
 
-/// A bearer's token. It shows itself to nobody but the server.
+/// A bearer token. `Debug` does not print it.
 #[derive(Clone)]
 pub struct Token(MetadataValue<Ascii>);
 
-/// When to ask again, where that can help: nobody was there, the connection broke, or the server was busy. Asking for
-/// grasps twice does no harm.
+/// When a call is retried. Only failures that can pass are retried: the server is unreachable, the connection breaks,
+/// or the server is busy. Detection is idempotent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Retry {
-    /// How often to ask, the first time included; once where this is 0.
+    /// Maximum number of attempts, including the first. 0 means 1.
     pub attempts: u32,
-    /// The first pause; each further one is twice as long. Half of it is left to chance, so that many who were refused
-    /// together do not come back together. Where the server says when to come back, it is not sooner.
+    /// First pause; it doubles with each further attempt. The actual pause is drawn uniformly from [0.5, 1] of this, so
+    /// that clients that were refused together do not retry together. It is never shorter than the server's retry hint.
     pub pause: Duration,
-    /// The longest pause.
+    /// Upper limit of the pause, before the server's retry hint.
     pub longest: Duration,
 }
 
@@ -45,17 +44,17 @@ impl Retry {
     /// A single attempt.
     pub const NONE: Self = Self { attempts: 1, pause: Duration::ZERO, longest: Duration::ZERO };
 
-    /// For a robot that wants its grasp: over a replica that is lost, or a queue that is full, in half a second or so.
+    /// For robots: bridges a lost replica or a full queue within about half a second.
     pub const RECOMMENDED: Self =
         Self { attempts: 6, pause: Duration::from_millis(20), longest: Duration::from_millis(500) };
 
-    /// How long to wait after so many attempts, if there is one more.
-    pub(crate) fn pause(&self, attempts: u32, told: Option<Duration>) -> Option<Duration> {
+    /// The pause after this many failed attempts; `None` when no attempts are left. `hint` is the server's retry hint.
+    pub(crate) fn pause(&self, attempts: u32, hint: Option<Duration>) -> Option<Duration> {
         if attempts >= self.attempts {
             return None;
         }
         let pause = self.pause.saturating_mul(1 << attempts.saturating_sub(1).min(20)).min(self.longest);
-        Some(pause.mul_f64(rand::rng().random_range(0.5..=1.0)).max(told.unwrap_or_default()))
+        Some(pause.mul_f64(rand::rng().random_range(0.5..=1.0)).max(hint.unwrap_or_default()))
     }
 }
 
@@ -65,14 +64,14 @@ impl Default for Retry {
     }
 }
 
-/// Whether the same request may fare better another time. What this end made of a connection that broke has a cause,
-/// which no status that a server sent has.
-pub(crate) fn may_pass(status: &Status) -> bool {
+/// Whether the same request may succeed later. A status with a source was created by this client because the connection
+/// broke; a status from the server has no source.
+pub(crate) fn is_transient(status: &Status) -> bool {
     matches!(status.code(), Code::Unavailable | Code::ResourceExhausted) || std::error::Error::source(status).is_some()
 }
 
 impl Access {
-    /// TLS, where these or the address want it.
+    /// The TLS configuration; `None` when neither these settings nor the address require TLS.
     pub(crate) fn tls(&self, address: &str) -> Option<ClientTlsConfig> {
         if self.ca.is_none() && self.identity.is_none() && !address.starts_with("https://") {
             return None;
@@ -109,16 +108,17 @@ impl FromStr for Token {
     fn from_str(token: &str) -> Result<Self, Self::Err> {
         let token = token.trim();
         if token.is_empty() {
-            return Err("the token is empty");
+            return Err("the token is empty; it must be on the first line of the file");
         }
-        let mut value: MetadataValue<Ascii> =
-            format!("Bearer {token}").parse().map_err(|_| "the token has characters that a header cannot carry")?;
+        let mut value: MetadataValue<Ascii> = format!("Bearer {token}")
+            .parse()
+            .map_err(|_| "the token contains characters that are not allowed in a header; use visible ASCII")?;
         value.set_sensitive(true);
         Ok(Self(value))
     }
 }
 
-/// Puts the token on every request.
+/// Adds the token to every request.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Bearer(pub Option<Token>);
 
@@ -136,7 +136,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pauses_grow_up_to_the_longest_and_end() {
+    fn pauses_grow_to_the_limit_and_end_with_the_attempts() {
         let retry = Retry { attempts: 6, pause: Duration::from_millis(100), longest: Duration::from_millis(400) };
         for (attempts, most) in [(1, 100), (2, 200), (3, 400), (4, 400), (5, 400)] {
             let pause = retry.pause(attempts, None).unwrap().as_millis();
@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn a_token_shows_itself_to_nobody() {
+    fn a_token_is_not_printed() {
         let token: Token = " secret\n".parse().unwrap();
         let access = Access { token: Some(token.clone()), ..Access::default() };
         let shown = format!("{access:?} {token:?} {:?}", token.0);

@@ -15,16 +15,16 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
-use crate::access::{Bearer, may_pass};
+use crate::access::{Bearer, is_transient};
 use crate::{Access, CloudView, DepthView, Detection, Error, Options, Retry, Workspace};
 
-/// Several replies in flight on one connection must not wait for HTTP/2's windows of 64 KiB.
+/// Flow-control window, bytes. HTTP/2's default of 64 KiB stalls concurrent large replies.
 const WINDOW: u32 = 4 << 20;
 
-/// How often a server that is not ready yet is asked again.
+/// Polling interval of `wait_ready`.
 const POLL: Duration = Duration::from_millis(50);
 
-/// A connection to graspd. Clones share it; calls may run at the same time.
+/// A connection to graspd. Clones share the connection; calls may run concurrently.
 #[derive(Clone, Debug)]
 pub struct Client {
     channel: Channel,
@@ -32,12 +32,12 @@ pub struct Client {
     retry: Retry,
 }
 
-/// What a server says of itself.
+/// The server's health status.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Health {
-    /// It answers.
+    /// Ready for requests.
     Serving,
-    /// It is warming up or shutting down.
+    /// Warming up or shutting down.
     NotServing,
 }
 
@@ -45,15 +45,15 @@ impl Client {
     /// Connects to `address`, such as `127.0.0.1:50051` or `http://robot:50051`.
     ///
     /// # Errors
-    /// [`Error::Connect`] when nobody listens there.
+    /// [`Error::Connect`] when the server cannot be reached.
     pub async fn connect(address: impl Into<String>) -> Result<Self, Error> {
         Self::connect_with(address, Access::default()).await
     }
 
-    /// Connects where more than the address is needed.
+    /// Connects with TLS, a token or retries.
     ///
     /// # Errors
-    /// [`Error::Connect`] when nobody listens there, or the two do not come to terms over TLS.
+    /// [`Error::Connect`] when the server cannot be reached or the TLS handshake fails.
     pub async fn connect_with(address: impl Into<String>, access: Access) -> Result<Self, Error> {
         let address = address.into();
         let tls = access.tls(&address);
@@ -70,23 +70,23 @@ impl Client {
         Ok(Self { channel, bearer: Bearer(access.token), retry: access.retry })
     }
 
-    /// Connects to a server that may still be starting, and returns once it is ready.
+    /// Connects to a server that may still be starting, and returns when it is ready.
     ///
     /// # Errors
-    /// [`Error::NotReady`] with what it said last, if that takes longer than `timeout`.
+    /// [`Error::NotReady`] with the last failure, if the server is not ready within `timeout`.
     pub async fn wait_ready(address: impl Into<String>, timeout: Duration) -> Result<Self, Error> {
         let address = address.into();
         let deadline = Instant::now() + timeout;
         loop {
-            let ask = async {
+            let attempt = async {
                 let client = Self::connect(address.clone()).await?;
                 Ok::<_, Error>((client.health().await?, client))
             };
-            let last = match timeout_at(deadline, ask).await {
+            let last = match timeout_at(deadline, attempt).await {
                 Ok(Ok((Health::Serving, client))) => return Ok(client),
-                Ok(Ok((Health::NotServing, _))) => "it says that it is not serving".to_owned(),
+                Ok(Ok((Health::NotServing, _))) => "its health status is NOT_SERVING".to_owned(),
                 Ok(Err(error)) => error.to_string(),
-                Err(_) => "it does not answer".to_owned(),
+                Err(_) => "no answer".to_owned(),
             };
             if Instant::now() >= deadline {
                 return Err(Error::NotReady { address, timeout, last });
@@ -95,14 +95,14 @@ impl Client {
         }
     }
 
-    /// Asks for the grasps in a volume, as often as [`Retry`] has it.
+    /// Detects grasps in a volume. Transient failures are retried according to [`Retry`].
     ///
     /// # Errors
-    /// [`Error::Refused`] with the last status.
+    /// [`Error::Refused`] with the status of the last attempt; [`Error::Reply`] for an invalid reply.
     pub async fn detect(&self, volume: &Volume, options: Options) -> Result<Detection, Error> {
         let timeout = options.timeout;
         let message = options.request(volume);
-        self.ask(
+        self.call(
             timeout,
             || (self.grasps(), message.clone()),
             async |(mut grasps, request)| grasps.detect_grasps(request).await,
@@ -110,10 +110,11 @@ impl Client {
         .await
     }
 
-    /// Asks for the grasps in what depth cameras see.
+    /// Detects grasps in depth images. The server fuses them into the cube `workspace`. Transient failures are retried
+    /// according to [`Retry`].
     ///
     /// # Errors
-    /// [`Error::Refused`] with the last status.
+    /// [`Error::Refused`] with the status of the last attempt; [`Error::Reply`] for an invalid reply.
     pub async fn detect_from_depth(
         &self,
         views: &[DepthView],
@@ -122,7 +123,7 @@ impl Client {
     ) -> Result<Detection, Error> {
         let timeout = options.timeout;
         let message = options.depth_request(views, workspace);
-        self.ask(
+        self.call(
             timeout,
             || (self.grasps(), message.clone()),
             async |(mut grasps, request)| grasps.detect_grasps_from_depth(request).await,
@@ -130,10 +131,11 @@ impl Client {
         .await
     }
 
-    /// Asks for the grasps in point clouds.
+    /// Detects grasps in point clouds, one per camera. The server fuses them into the cube `workspace`. Transient
+    /// failures are retried according to [`Retry`].
     ///
     /// # Errors
-    /// [`Error::Refused`] with the last status.
+    /// [`Error::Refused`] with the status of the last attempt; [`Error::Reply`] for an invalid reply.
     pub async fn detect_from_cloud(
         &self,
         views: &[CloudView],
@@ -142,7 +144,7 @@ impl Client {
     ) -> Result<Detection, Error> {
         let timeout = options.timeout;
         let message = options.cloud_request(views, workspace);
-        self.ask(
+        self.call(
             timeout,
             || (self.grasps(), message.clone()),
             async |(mut grasps, request)| grasps.detect_grasps_from_cloud(request).await,
@@ -150,18 +152,18 @@ impl Client {
         .await
     }
 
-    /// Has the server keep a volume for a camera that moves.
+    /// Opens a tracked volume: the server keeps it and adds the views of a moving camera to it.
     ///
     /// # Errors
-    /// [`Error::Refused`] when it keeps enough already.
+    /// [`Error::Refused`] when the server's limit of tracked volumes is reached.
     pub async fn track(&self, workspace: Workspace) -> Result<Tracking, Error> {
         let (requests, waiting) = mpsc::channel(1);
         let replies = self.grasps().track_grasps(ReceiverStream::new(waiting)).await?.into_inner();
         Ok(Tracking { requests, replies, workspace: Some(workspace) })
     }
 
-    /// Asks for the grasps in each of a stream of volumes; one answer comes for each, in their order. A volume that is
-    /// refused does not end the stream.
+    /// Detects grasps in each volume of a stream. The results come in the order of the volumes, one per volume. A
+    /// refused volume does not end the stream.
     ///
     /// # Errors
     /// [`Error::Refused`] when the stream cannot be opened.
@@ -177,7 +179,7 @@ impl Client {
         Ok(responses.map(|response| outcome(response?)))
     }
 
-    /// The models that the server has loaded, the default first.
+    /// The models that the server serves; the default model is first.
     ///
     /// # Errors
     /// [`Error::Refused`] with the server's status.
@@ -185,7 +187,7 @@ impl Client {
         Ok(self.grasps().list_models(pb::ListModelsRequest {}).await?.into_inner().models)
     }
 
-    /// Asks whether the server is ready.
+    /// The server's health.
     ///
     /// # Errors
     /// [`Error::Refused`] with the server's status.
@@ -197,8 +199,8 @@ impl Client {
         })
     }
 
-    /// Asks as often as [`Retry`] has it.
-    async fn ask<S, M>(
+    /// Calls the server and retries according to [`Retry`].
+    async fn call<S, M>(
         &self,
         timeout: Option<Duration>,
         message: impl Fn() -> (S, M),
@@ -216,44 +218,46 @@ impl Client {
                 Err(status) => status,
             };
             attempts += 1;
-            let may_pass = may_pass(&status);
+            let is_transient = is_transient(&status);
             let error = Error::from(status);
             match self.retry.pause(attempts, error.retry_after()) {
-                Some(pause) if may_pass => sleep(pause).await,
+                Some(pause) if is_transient => sleep(pause).await,
                 _ => return Err(error),
             }
         }
     }
 
     fn grasps(&self) -> GraspServiceClient<InterceptedService<Channel, Bearer>> {
-        // With a low threshold there may be tens of thousands of grasps.
+        // A low threshold can return tens of thousands of grasps.
         let service = GraspServiceClient::with_interceptor(self.channel.clone(), self.bearer.clone());
         service.max_decoding_message_size(usize::MAX)
     }
 }
 
-/// A volume that the server keeps for as long as this lives, and what it sees in it.
+/// A tracked volume. The server deletes the volume when this is dropped.
 #[derive(Debug)]
 pub struct Tracking {
     requests: mpsc::Sender<pb::TrackGraspsRequest>,
     replies: Streaming<pb::DetectGraspsStreamResponse>,
-    /// Until it has been sent.
+    /// `None` once the server has accepted it.
     workspace: Option<Workspace>,
 }
 
 impl Tracking {
-    /// Adds views to the volume, and asks for the grasps in all that was seen so far.
+    /// Adds views to the volume and detects grasps in everything observed so far. Calls are not retried.
     ///
     /// # Errors
-    /// [`Error::Refused`]: what is wrong with a view does not end the tracking. With [`Code::ResourceExhausted`] the views
-    /// have been added all the same: ask again without them.
+    /// [`Error::Refused`]. An invalid view does not end the tracking. With [`Code::ResourceExhausted`] the views have
+    /// been added nevertheless: retry without them.
     pub async fn add(&mut self, views: &[DepthView], options: Options) -> Result<Detection, Error> {
         let request = options.track_request(views, self.workspace.as_ref());
-        // A server that hung up says why in its last reply.
+        // If the server has closed the stream, its last reply holds the reason.
         let _ = self.requests.send(request).await;
         let reply = self.replies.message().await?;
-        let detection = outcome(reply.ok_or_else(|| Status::unavailable("the server has ended the stream"))?);
-        // These two are met only after the views were added: another workspace would start another volume.
+        let detection =
+            outcome(reply.ok_or_else(|| Status::unavailable("the server closed the stream; start tracking again"))?);
+        // The server returns these two codes only after it has added the views. Sending the workspace again would start
+        // another volume.
         let was_added = [Code::ResourceExhausted, Code::Internal];
         if detection.as_ref().map_or_else(|error| error.code().is_some_and(|code| was_added.contains(&code)), |_| true)
         {
@@ -269,7 +273,7 @@ fn outcome(response: pb::DetectGraspsStreamResponse) -> Result<Detection, Error>
         Some(Outcome::Error(error)) => Err(error.into()),
         None => Err(Error::Refused {
             code: Code::Internal,
-            message: "a reply with neither a response nor an error".to_owned(),
+            message: "the server's reply has neither `response` nor `error`".to_owned(),
             retry_after: None,
             field: None,
         }),

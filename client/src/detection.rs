@@ -6,111 +6,111 @@ use nalgebra::Isometry3;
 
 use crate::Error;
 
-/// What may be said along with what was seen. The default leaves everything to the server.
+/// Options of a request. The default uses the server's defaults.
 #[derive(Clone, Debug, Default)]
 pub struct Options {
-    /// Names the request in the reply and the server's log; generated there when empty.
+    /// Identifies the request in the reply and in the server's log. The server generates one when it is empty.
     pub request_id: String,
-    /// What is asked of the grasps: which planner, how good, where, for which hand.
+    /// Model, thresholds, filters and gripper.
     pub detect: pb::Options,
-    /// The frame of the volume's or the workspace's pose and of the grasps; echoed.
+    /// Name of the frame of the volume's or workspace's pose and of the grasps. The server returns it unchanged.
     pub frame_id: String,
-    /// When it was seen; echoed.
+    /// Time of the observation. The server returns it unchanged.
     pub stamp: Option<SystemTime>,
-    /// How a volume's values travel: F32 (also when unspecified), or half or a quarter of it.
+    /// Encoding of a volume's values on the wire: F32 (also when unspecified), F16 or U8.
     pub dtype: pb::DataType,
-    /// How long each attempt may take, as the server is told, too.
+    /// Time limit of each attempt. It is sent to the server as the deadline.
     pub timeout: Option<Duration>,
 }
 
-/// A depth image as a camera's driver gives it, and where the camera stood.
+/// A rectified depth image and the pose of its camera.
 #[derive(Clone, Debug)]
 pub struct DepthView {
-    /// The pixels.
+    /// The pixels, `width * height`.
     pub depth: Depth,
     /// Image width, pixels.
     pub width: u32,
     /// Image height, pixels.
     pub height: u32,
-    /// The intrinsic matrix, row by row (ROS: `CameraInfo.k`).
+    /// The 3×3 intrinsic matrix in row-major order, pixels (ROS: `CameraInfo.k`).
     pub k: [f64; 9],
-    /// Where the camera stood.
+    /// The camera's pose.
     pub extrinsics: Extrinsics,
 }
 
-/// Pixels of a depth image, row by row; 0 and NaN are no reading.
+/// Pixels of a depth image in row-major order: the distance along the optical axis. 0 and NaN mean no reading.
 #[derive(Clone, Debug)]
 pub enum Depth {
-    /// Along the optical axis.
+    /// Metres.
     Metres(Vec<f32>),
-    /// The same, in whole millimetres.
+    /// Whole millimetres.
     Millimetres(Vec<u16>),
 }
 
-/// A camera's pose, in one of its two directions. Optical axes: z forward, x right, y down.
+/// A camera's pose, in one of two directions. Camera axes: z forward, x right, y down.
 #[derive(Clone, Copy, Debug)]
 pub enum Extrinsics {
-    /// `T_camera_task`: maps points of the workspace's cube into the camera.
+    /// `T_camera_task`: maps points of the task frame into the camera frame.
     CameraFromTask(Isometry3<f64>),
-    /// `T_frame_camera`: where the camera stands in the workspace's frame, as hand-eye calibration gives it.
+    /// `T_frame_camera`: the camera's pose in the frame `frame_id`, as hand-eye calibration returns it.
     FrameFromCamera(Isometry3<f64>),
 }
 
-/// Points that one camera saw.
+/// A point cloud observed by one camera.
 #[derive(Clone, Debug)]
 pub struct CloudView {
     /// x, y, z, metres.
     pub points: Vec<[f32; 3]>,
-    /// `T_frame_cloud`: the points in the workspace's frame.
+    /// `T_frame_cloud`: maps the points into the frame `frame_id`.
     pub frame_from_cloud: Isometry3<f64>,
-    /// Where the camera stood, in the frame of the points.
+    /// Position of the camera in the frame of the points, metres.
     pub camera_position: [f64; 3],
 }
 
-/// The cube in which grasps are looked for.
+/// The cube that views are fused into and in which grasps are detected.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Workspace {
-    /// `T_frame_task`: the cube's corner, z up.
+    /// `T_frame_task`: pose of the task frame (origin at a corner of the cube, z up) in the frame `frame_id`.
     pub pose: Isometry3<f64>,
-    /// Edge, metres; the model's own where it is `None`.
+    /// Edge length, metres. `None`: the size that the model was trained with.
     pub size: Option<f64>,
 }
 
-/// The answer to what was seen.
+/// The result of a request.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Detection {
-    /// The request's id.
+    /// The id of the request.
     pub request_id: String,
-    /// The frame of the grasps.
+    /// Name of the frame of the grasps.
     pub frame_id: String,
-    /// When it was seen.
+    /// Time of the observation, as sent.
     pub stamp: Option<SystemTime>,
-    /// Best first.
+    /// The grasps, best first.
     pub grasps: Vec<Proposal>,
-    /// The planner that answered.
+    /// Name of the model that found them.
     pub model: String,
-    /// Its version.
+    /// Version of the model.
     pub version: String,
-    /// Where the time went in the server, seconds.
+    /// Duration of each stage in the server, seconds.
     pub latency: pb::Latency,
-    /// Why the other voxels hold no grasp, when that was asked for or there is none.
+    /// Number of voxels without a grasp, by reason. Set when `explain` is set or `grasps` is empty.
     pub dropped: Option<pb::Dropped>,
 }
 
-/// A grasp, and the way there and away.
+/// A grasp with its pre-grasp and retreat poses.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Proposal {
-    /// `T_frame_grasp`, by the convention that was asked for.
+    /// `T_frame_grasp`, in the convention of the request.
     pub pose: Isometry3<f64>,
     /// Opening between the fingers, metres.
     pub width: f64,
-    /// Predicted probability of success, [0, 1].
+    /// Predicted probability of success, in [0, 1].
     pub quality: f32,
-    /// Where the hand waits, open, before it approaches.
+    /// Pre-grasp pose: the open hand approaches from here along its z axis.
     pub pregrasp: Isometry3<f64>,
-    /// Where the hand goes with what it holds.
+    /// Pose to which the hand moves after it has closed.
     pub retreat: Isometry3<f64>,
-    /// Whether the open hand would meet something, where that was asked.
+    /// Whether the open hand would collide; `None` without a collision check.
     pub collides: Option<bool>,
 }
 
@@ -125,11 +125,11 @@ impl TryFrom<&pb::Grasp> for Proposal {
 
     fn try_from(message: &pb::Grasp) -> Result<Self, Error> {
         let Grasp { pose, width, quality } = message.try_into()?;
-        let way = |pose: &Option<pb::Pose>, field| {
+        let optional = |pose: &Option<pb::Pose>, field| {
             pose.as_ref().map(|pose| grasp_proto::pose(pose, field)).transpose().map(Option::unwrap_or_default)
         };
-        let pregrasp = way(&message.pregrasp, "grasps.pregrasp")?;
-        let retreat = way(&message.retreat, "grasps.retreat")?;
+        let pregrasp = optional(&message.pregrasp, "grasps.pregrasp")?;
+        let retreat = optional(&message.retreat, "grasps.retreat")?;
         Ok(Self { pose, width, quality, pregrasp, retreat, collides: message.collides })
     }
 }
@@ -159,7 +159,7 @@ impl Options {
         }
     }
 
-    /// With a workspace it starts a volume.
+    /// A request with a workspace starts a new volume.
     pub(crate) fn track_request(self, views: &[DepthView], workspace: Option<&Workspace>) -> pb::TrackGraspsRequest {
         pb::TrackGraspsRequest {
             views: views.iter().map(Into::into).collect(),
@@ -218,7 +218,7 @@ impl TryFrom<pb::DetectGraspsResponse> for Detection {
             grasps: response.grasps.iter().map(Proposal::try_from).collect::<Result<_, _>>()?,
             request_id: response.request_id,
             frame_id: response.frame_id,
-            // One that this machine's clock cannot hold was not sent from here.
+            // A stamp that `SystemTime` cannot represent was not sent by this client.
             stamp: response.stamp.and_then(|stamp| stamp.try_into().ok()),
             model: response.model,
             version: response.version,

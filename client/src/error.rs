@@ -5,46 +5,46 @@ use thiserror::Error;
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
 
-/// Why there is no answer.
+/// Why a call failed.
 #[derive(Debug, Error)]
 pub enum Error {
     /// The server cannot be reached.
-    #[error("cannot reach graspd at {address}: {}; is it running there?", root(source))]
+    #[error("cannot connect to graspd at {address}: {}; check the address and that graspd runs there", root(source))]
     Connect {
-        /// Where it was looked for.
+        /// The address as given.
         address: String,
-        /// What the network said.
+        /// The transport's error.
         source: tonic::transport::Error,
     },
     /// The server was not ready in time.
     #[error("graspd at {address} was not ready within {timeout:?}: {last}")]
     NotReady {
-        /// Where it was looked for.
+        /// The address as given.
         address: String,
-        /// How long was waited.
+        /// The time limit.
         timeout: Duration,
-        /// What it said last.
+        /// The last failure.
         last: String,
     },
-    /// The server, or the connection to it, refused.
+    /// The server refused the request, or the connection broke.
     #[error("{code:?}: {message}")]
     Refused {
         /// The gRPC status code.
         code: Code,
-        /// What is wrong, with the value, and what is needed.
+        /// What is wrong, with the value, and what to do.
         message: String,
-        /// When it is worth coming back, where the server says so.
+        /// The server's retry hint, if it sent one.
         retry_after: Option<Duration>,
-        /// Path of the request's field that is not what it must be, where it is one: `volume.voxel_size`.
+        /// Path of the invalid field of the request, such as `volume.voxel_size`, if the request is invalid.
         field: Option<String>,
     },
-    /// The reply breaks the interface's rules.
-    #[error("the server's reply is not valid: {0}")]
+    /// The server's reply violates the protocol.
+    #[error("invalid reply from the server: {0}; check that client and server have the same version")]
     Reply(#[from] FieldError),
 }
 
 impl Error {
-    /// The gRPC status code, where it comes from the server.
+    /// The gRPC status code; `None` unless the call was refused.
     #[must_use]
     pub fn code(&self) -> Option<Code> {
         match self {
@@ -53,7 +53,7 @@ impl Error {
         }
     }
 
-    /// When it is worth coming back, where the server says so.
+    /// The server's retry hint: the shortest useful pause before the next attempt.
     #[must_use]
     pub fn retry_after(&self) -> Option<Duration> {
         match self {
@@ -62,7 +62,7 @@ impl Error {
         }
     }
 
-    /// Path of the request's field that is not what it must be, where it is one.
+    /// Path of the invalid field of the request, if the request is invalid.
     #[must_use]
     pub fn field(&self) -> Option<&str> {
         match self {
@@ -98,7 +98,7 @@ impl From<pb::Error> for Error {
     }
 }
 
-/// The transport's own message is "transport error"; what happened lies below it.
+/// The innermost source. The transport's own message is only "transport error".
 fn root<'a>(error: &'a (dyn std::error::Error + 'static)) -> &'a (dyn std::error::Error + 'static) {
     error.source().map_or(error, root)
 }
@@ -110,13 +110,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_field_is_told_by_a_status_and_in_a_stream() {
+    fn the_invalid_field_is_read_from_a_status_and_from_a_stream_reply() {
         let details = ErrorDetails::with_bad_request_violation("volume.data", "volume.data is short");
         let status = Status::with_error_details(Code::InvalidArgument, "volume.data is short", details);
         assert_eq!(Error::from(status).field(), Some("volume.data"));
-        assert_eq!(Error::from(Status::unavailable("nobody is there")).field(), None);
-        let told = |field: &str| Error::from(pb::Error { field: field.to_owned(), ..pb::Error::default() });
-        assert_eq!(told("volume.data").field(), Some("volume.data"));
-        assert_eq!(told("").field(), None);
+        assert_eq!(Error::from(Status::unavailable("connection refused")).field(), None);
+        let from_stream = |field: &str| Error::from(pb::Error { field: field.to_owned(), ..pb::Error::default() });
+        assert_eq!(from_stream("volume.data").field(), Some("volume.data"));
+        assert_eq!(from_stream("").field(), None);
     }
 }

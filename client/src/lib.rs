@@ -1,8 +1,9 @@
-//! A client of graspd.
+//! Client library of graspd.
 //!
-//! [`Client`] speaks `grasp.v1` in the types of the domain: a [`grasp::Volume`], depth images or point clouds in, a
-//! [`Detection`] with [`Proposal`]s out. [`load`] makes many calls and says how they went.
-//! [`LocalServer`] runs a server of one's own for as long as it is needed.
+//! [`Client`] sends a [`grasp::Volume`], depth images or point clouds over `grasp.v1` and returns a [`Detection`] with
+//! [`Proposal`]s. [`load`] generates load and reports latencies. [`LocalServer`] runs a graspd as a child process.
+//!
+//! Units are metres, radians and seconds. A pose `T_a_b` maps points of frame b into frame a.
 //!
 //! ```no_run
 //! use grasp_client::{Access, Client, Depth, DepthView, DetectOptions, Extrinsics, Options, Retry, Workspace};

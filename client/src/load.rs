@@ -1,4 +1,4 @@
-//! Many calls, and how they went.
+//! A load generator and its report.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -11,52 +11,51 @@ use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until};
 use tonic::Code;
 
-/// When calls are made.
+/// When calls start.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Arrivals {
-    /// By so many callers, each of whom asks again as soon as there is an answer.
+    /// Closed loop: this many callers, each with one call in flight.
     Callers(usize),
-    /// At moments left to chance, so many a second, however long the answers take: what many robots that know nothing of
-    /// each other do (a Poisson process).
+    /// Open loop: Poisson arrivals at this rate, calls per second, independent of the response times.
     Rate(f64),
 }
 
-/// When no more calls are made; those that have begun are waited for.
+/// When the load ends. Calls in flight are completed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Until {
-    /// After so many.
+    /// After this many calls.
     Calls(usize),
-    /// After so long.
+    /// After this time.
     Elapsed(Duration),
 }
 
-/// How the calls went.
+/// Latencies and outcomes of the calls.
 #[derive(Clone, Debug, Default)]
 pub struct Report {
-    /// From the first call to the last answer.
+    /// Time from the first call to the last response.
     pub elapsed: Duration,
-    /// How long each call that was answered took, sorted. At a rate this is counted from the moment at which the call
-    /// was to be made, so that a server cannot hide its slowness by keeping callers busy.
+    /// Latencies of the successful calls, sorted. With [`Arrivals::Rate`] a latency counts from the scheduled start of
+    /// the call, so that a slow server cannot delay the clock (coordinated omission).
     pub answered: Vec<Duration>,
-    /// How long each of the others took, sorted, by the status that it ended with.
+    /// Latencies of the failed calls, sorted, by gRPC status code.
     pub refused: BTreeMap<i32, Vec<Duration>>,
 }
 
 impl Report {
-    /// Of these sorted times, that which the share `share` of them does not exceed; zero where there is none.
+    /// The quantile `share` (in [0, 1]) of sorted times, by the nearest-rank method; zero without times.
     #[must_use]
     pub fn quantile(times: &[Duration], share: f64) -> Duration {
         let rank = (times.len() as f64 * share).ceil() as usize;
         times.get(rank.clamp(1, times.len().max(1)) - 1).copied().unwrap_or_default()
     }
 
-    /// Answers a second.
+    /// Successful calls per second.
     #[must_use]
     pub fn throughput(&self) -> f64 {
         self.answered.len() as f64 / self.elapsed.as_secs_f64().max(f64::MIN_POSITIVE)
     }
 
-    /// Calls that were not answered.
+    /// Number of failed calls.
     #[must_use]
     pub fn refusals(&self) -> usize {
         self.refused.values().map(Vec::len).sum()
@@ -77,7 +76,10 @@ impl Report {
     }
 }
 
-/// Makes calls. Each gets its number, from 0 on.
+/// Runs `call` repeatedly and reports the latencies. Its argument is the index of the call, from 0.
+///
+/// # Panics
+/// If a call panics.
 pub async fn load<C, F>(arrivals: Arrivals, until: Until, call: C) -> Report
 where
     C: Fn(usize) -> F + Send + Sync + 'static,
@@ -85,13 +87,13 @@ where
 {
     let call = Arc::new(call);
     let started = Instant::now();
-    let goes_on = move |number: usize, now: Instant| match until {
+    let continues = move |number: usize, now: Instant| match until {
         Until::Calls(calls) => number < calls,
         Until::Elapsed(duration) => now < started + duration,
     };
     let mut report = match arrivals {
-        Arrivals::Callers(callers) => by_callers(callers, goes_on, &call).await,
-        Arrivals::Rate(rate) => at_rate(rate, goes_on, &call).await,
+        Arrivals::Callers(callers) => by_callers(callers, continues, &call).await,
+        Arrivals::Rate(rate) => at_rate(rate, continues, &call).await,
     };
     report.elapsed = started.elapsed();
     report.answered.sort_unstable();
@@ -101,7 +103,7 @@ where
 
 async fn by_callers<C, F>(
     callers: usize,
-    goes_on: impl Fn(usize, Instant) -> bool + Copy + Send + 'static,
+    continues: impl Fn(usize, Instant) -> bool + Copy + Send + 'static,
     call: &Arc<C>,
 ) -> Report
 where
@@ -115,12 +117,12 @@ where
         tasks.spawn(async move {
             let mut report = Report::default();
             loop {
-                let (number, begun) = (next.fetch_add(1, Ordering::Relaxed), Instant::now());
-                if !goes_on(number, begun) {
+                let (number, start) = (next.fetch_add(1, Ordering::Relaxed), Instant::now());
+                if !continues(number, start) {
                     return report;
                 }
                 let outcome = call(number).await;
-                report.add(begun.elapsed(), outcome);
+                report.add(start.elapsed(), outcome);
             }
         });
     }
@@ -131,21 +133,21 @@ where
     report
 }
 
-async fn at_rate<C, F>(rate: f64, goes_on: impl Fn(usize, Instant) -> bool, call: &Arc<C>) -> Report
+async fn at_rate<C, F>(rate: f64, continues: impl Fn(usize, Instant) -> bool, call: &Arc<C>) -> Report
 where
     C: Fn(usize) -> F + Send + Sync + 'static,
     F: Future<Output = Result<(), Code>> + Send,
 {
-    // The same moments in every run: comparisons are fair.
+    // A fixed seed gives the same arrival times in every run, so that runs are comparable.
     let mut random = SmallRng::seed_from_u64(1);
     let mut tasks = JoinSet::new();
     let mut due = Instant::now();
     let mut report = Report::default();
     let mut number = 0;
     loop {
-        // The time between two events of a Poisson process is exponential.
+        // The interarrival time of a Poisson process is exponential.
         due += Duration::from_secs_f64(-(1.0 - random.random::<f64>()).ln() / rate);
-        if !goes_on(number, due) {
+        if !continues(number, due) {
             break;
         }
         sleep_until(due).await;
@@ -165,7 +167,7 @@ where
     report
 }
 
-/// A call that panicked takes the whole load with it: its numbers would be wrong.
+/// Adds a finished call. A panic of the call is propagated, because the report would be incomplete.
 fn add(report: &mut Report, done: Result<(Duration, Result<(), Code>), tokio::task::JoinError>) {
     match done {
         Ok((took, outcome)) => report.add(took, outcome),
@@ -194,7 +196,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn time_ends_it_too() {
+    async fn the_load_ends_after_the_given_time() {
         for arrivals in [Arrivals::Callers(2), Arrivals::Rate(1000.0)] {
             let report = load(arrivals, Until::Elapsed(Duration::from_millis(100)), async |_| {
                 tokio::time::sleep(Duration::from_millis(1)).await;
@@ -207,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn quantiles_are_values_that_were_there() {
+    fn quantiles_are_measured_values() {
         let times: Vec<_> = (1..=10).map(Duration::from_millis).collect();
         let at = |share| Report::quantile(&times, share).as_millis();
         assert_eq!([at(0.0), at(0.5), at(0.9), at(0.91), at(1.0)], [1, 5, 9, 10, 10]);

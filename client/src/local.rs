@@ -7,8 +7,8 @@ use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
 use rustix::process::{Pid, Signal, kill_process};
 use thiserror::Error;
 
-/// A graspd of one's own, on free ports of the loopback interface. Dropping it kills it; [`stop`](Self::stop) lets it
-/// finish.
+/// A graspd child process on free ports of the loopback interface. Dropping it kills the process;
+/// [`stop`](Self::stop) shuts it down gracefully.
 #[derive(Debug)]
 pub struct LocalServer {
     process: Child,
@@ -17,43 +17,43 @@ pub struct LocalServer {
     http: SocketAddr,
 }
 
-/// Why there is no server.
+/// Why a local server could not be started.
 #[derive(Debug, Error)]
 pub enum LocalServerError {
-    /// The program cannot be run.
+    /// The program cannot be started.
     #[error("cannot run {}: {source}", binary.display())]
     Spawn {
         /// The program.
         binary: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// It ended before it was ready.
-    #[error("graspd ended before it was ready ({0}); its log, on stderr, says why")]
+    /// The process exited before it was ready.
+    #[error("graspd exited before it was ready ({0}); see its log on stderr")]
     Ended(ExitStatus),
-    /// It wrote something else than where it listens.
-    #[error("graspd wrote `{0}` to stdout, which is not what this client expects: are both of one version?")]
+    /// The process wrote an unexpected line to stdout.
+    #[error("unexpected output `{0}` of graspd; check that client and server have the same version")]
     Unexpected(String),
-    /// Its output cannot be read.
-    #[error("cannot read what graspd writes: {0}")]
+    /// The output of the process cannot be read.
+    #[error("cannot read the output of graspd: {0}")]
     Io(#[from] io::Error),
 }
 
 impl LocalServer {
-    /// Runs `binary` with `args`, and returns once it is ready. Its log goes to this process's stderr.
+    /// Runs `binary` with `args` and returns when the server is ready. The server logs to this process's stderr.
     ///
     /// # Errors
-    /// [`LocalServerError`] when it cannot be run or ends before it is ready.
+    /// [`LocalServerError`] when the program cannot be started or exits before it is ready.
     pub fn spawn<A: AsRef<OsStr>>(binary: &Path, args: impl IntoIterator<Item = A>) -> Result<Self, LocalServerError> {
         let mut server = Self::start(binary, args)?;
         server.wait_ready()?;
         Ok(server)
     }
 
-    /// Like [`spawn`](Self::spawn), but returns as soon as it listens, while it still warms up.
+    /// Like [`spawn`](Self::spawn), but returns as soon as the server listens, before its models are warm.
     ///
     /// # Errors
-    /// [`LocalServerError`] when it cannot be run or ends before it listens.
+    /// [`LocalServerError`] when the program cannot be started or exits before it listens.
     pub fn start<A: AsRef<OsStr>>(binary: &Path, args: impl IntoIterator<Item = A>) -> Result<Self, LocalServerError> {
         let mut process = Command::new(binary)
             .args(["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"])
@@ -62,18 +62,18 @@ impl LocalServer {
             .stdout(Stdio::piped())
             .spawn()
             .map_err(|source| LocalServerError::Spawn { binary: binary.to_owned(), source })?;
-        let stdout = process.stdout.take().expect("it was asked for two lines above");
-        let nowhere = SocketAddr::from(([0, 0, 0, 0], 0));
-        let mut server = Self { process, stdout: BufReader::new(stdout), grpc: nowhere, http: nowhere };
+        let stdout = process.stdout.take().expect("stdout is piped, see above");
+        let unset = SocketAddr::from(([0, 0, 0, 0], 0));
+        let mut server = Self { process, stdout: BufReader::new(stdout), grpc: unset, http: unset };
         server.grpc = server.read_address("grpc listening on ")?;
         server.http = server.read_address("http listening on ")?;
         Ok(server)
     }
 
-    /// Waits until it has warmed up.
+    /// Blocks until the server is ready.
     ///
     /// # Errors
-    /// [`LocalServerError`] when it ends before.
+    /// [`LocalServerError`] when the process exits before.
     pub fn wait_ready(&mut self) -> Result<(), LocalServerError> {
         match self.read_line()? {
             line if line == "ready" => Ok(()),
@@ -81,52 +81,52 @@ impl LocalServer {
         }
     }
 
-    /// Where it speaks gRPC.
+    /// Address of the gRPC service.
     #[must_use]
     pub fn grpc(&self) -> SocketAddr {
         self.grpc
     }
 
-    /// Where it has its metrics.
+    /// Address of the HTTP server with the metrics.
     #[must_use]
     pub fn http(&self) -> SocketAddr {
         self.http
     }
 
-    /// Its process id.
+    /// Process id.
     #[must_use]
     pub fn id(&self) -> u32 {
         self.process.id()
     }
 
-    /// Tells it to finish what it has taken and to end: SIGTERM.
+    /// Requests a graceful shutdown (SIGTERM): the server completes accepted requests and exits.
     ///
     /// # Errors
-    /// What the system says, which is nothing as long as the process has not been waited for.
+    /// The system's error if the signal cannot be sent.
     pub fn terminate(&self) -> io::Result<()> {
         Ok(kill_process(Pid::from_child(&self.process), Signal::TERM)?)
     }
 
-    /// Tells it to read its models anew: SIGHUP.
+    /// Makes the server reload its models (SIGHUP).
     ///
     /// # Errors
-    /// What the system says, which is nothing as long as the process has not been waited for.
+    /// The system's error if the signal cannot be sent.
     pub fn reload(&self) -> io::Result<()> {
         Ok(kill_process(Pid::from_child(&self.process), Signal::HUP)?)
     }
 
-    /// Waits for it to end.
+    /// Blocks until the process exits.
     ///
     /// # Errors
-    /// What the system says.
+    /// The system's error.
     pub fn wait(&mut self) -> io::Result<ExitStatus> {
         self.process.wait()
     }
 
-    /// Tells it to end, and waits until it has.
+    /// Shuts the server down gracefully and blocks until the process exits.
     ///
     /// # Errors
-    /// What the system says.
+    /// The system's error.
     pub fn stop(mut self) -> io::Result<ExitStatus> {
         self.terminate()?;
         self.wait()
@@ -149,7 +149,7 @@ impl LocalServer {
 
 impl Drop for LocalServer {
     fn drop(&mut self) {
-        // It may have ended by itself, which is as good.
+        // Both fail harmlessly if the process has already exited.
         let _ = self.process.kill();
         let _ = self.process.wait();
     }

@@ -1,4 +1,4 @@
-//! How long the domain's two stages take on one core: `cargo run --release -p grasp --example fuse_and_decode`.
+//! Measures fusion and decoding on one core: `cargo run --release -p grasp --example fuse_and_decode`.
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -9,23 +9,23 @@ use nalgebra::Isometry3;
 const RUNS: usize = 500;
 
 fn main() {
-    // A bumpy wall across the cube, 0.6 m away: every voxel is in view.
+    // A bumpy wall across the workspace, 0.6 m away. Every voxel is in view.
     let camera = Intrinsics::BENCHMARK;
     let wave =
         |pixel: usize| ((pixel % camera.width) as f32 / 40.0).sin() + ((pixel / camera.width) as f32 / 30.0).cos();
     let depth: Vec<f32> = (0..camera.width * camera.height).map(|pixel| 0.65 + 0.03 * wave(pixel)).collect();
-    let image = DepthImage::new(camera, &depth).expect("the image is the camera's");
+    let image = DepthImage::new(camera, &depth).expect("the image has the size of the camera");
     let camera_from_task = Isometry3::translation(-0.15, -0.15, 0.5);
 
     let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
     report("fuse one 640×480 view into 40³", || {
         fusion.integrate(black_box(&image), &camera_from_task);
     });
-    report("read the 40³ values out", || drop(black_box(fusion.values())));
+    report("read out the 40³ values", || drop(black_box(fusion.values())));
 
-    let volume = fusion.volume(Isometry3::identity()).expect("the wall is in the cube");
+    let volume = fusion.volume(Isometry3::identity()).expect("the wall is in the workspace");
     let voxels = RESOLUTION.pow(3);
-    // Hills of quality all over the volume, of which those near the wall become some dozen grasps.
+    // Peaks of quality all over the volume. Those near the wall give a few dozen grasps.
     let hill = |c: usize| (c as f32 * std::f32::consts::TAU / 8.0).cos();
     let height =
         |i: usize| hill(i / (RESOLUTION * RESOLUTION)) * hill(i / RESOLUTION % RESOLUTION) * hill(i % RESOLUTION);

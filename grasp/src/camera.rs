@@ -3,7 +3,8 @@ use thiserror::Error;
 
 use crate::{DEPTH_MAX, SurfacePoint};
 
-/// A pinhole camera: pixels, with pixel centres at whole numbers. Optical axes: z forward, x right, y down.
+/// Intrinsics of a pinhole camera, in pixels; pixel centres are at whole numbers. Optical axes: z forward, x right, y
+/// down.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Intrinsics {
     /// Image width, pixels.
@@ -21,37 +22,37 @@ pub struct Intrinsics {
 }
 
 impl Intrinsics {
-    /// The camera of the benchmark: 640×480, f = 540.
+    /// The camera of the benchmark: 640×480 pixels, focal length 540 pixels.
     pub const BENCHMARK: Self = Self { width: 640, height: 480, fx: 540.0, fy: 540.0, cx: 320.0, cy: 240.0 };
 }
 
-/// A depth image: metres along the optical axis, row by row; 0, negative or NaN where there is no reading.
+/// A depth image: metres along the optical axis, row by row; 0, negative or NaN where there is no measurement.
 #[derive(Clone, Debug)]
 pub struct DepthImage<'a> {
     intrinsics: Intrinsics,
     depth: &'a [f32],
 }
 
-/// The unit that a depth image is in, as far as its values tell.
+/// The probable unit of a depth image, judged by its median.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Unit {
-    /// Metres, or nothing speaks against them.
+    /// Metres, or no valid pixel.
     Metres,
-    /// Its median is above 20: no such sensor looks so far.
+    /// The median is above 20: beyond the range of depth cameras, so probably millimetres.
     Millimetres,
-    /// Its median is below 2 cm, nearer than any such sensor sees: metres, taken for millimetres.
+    /// The median is below 0.02: closer than depth cameras measure, so probably metres divided by 1000.
     Thousandths,
 }
 
-/// Why a depth image was refused.
+/// Why a depth image is invalid.
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum CameraError {
     /// The number of pixels does not fit the intrinsics.
-    #[error("depth holds {got} pixels, {width}×{height} needs {expected}")]
+    #[error("depth has {got} pixels, {width}×{height} needs {expected}")]
     Length {
-        /// Pixels that came.
+        /// Number of pixels received.
         got: usize,
-        /// Pixels needed.
+        /// Number of pixels required.
         expected: usize,
         /// Image width.
         width: usize,
@@ -61,7 +62,7 @@ pub enum CameraError {
     /// A focal length is not positive or a number is not finite.
     #[error("{name} is {value}, must be a finite number of pixels{bound}", bound = if *.positive { " above 0" } else { "" })]
     Intrinsics {
-        /// Which number.
+        /// Name of the intrinsic.
         name: &'static str,
         /// Its value.
         value: f64,
@@ -71,10 +72,10 @@ pub enum CameraError {
 }
 
 impl<'a> DepthImage<'a> {
-    /// Checks that the image and the intrinsics fit each other.
+    /// Checks that the image fits the intrinsics.
     ///
     /// # Errors
-    /// [`CameraError`] names what does not fit.
+    /// [`CameraError`] names the invalid value.
     pub fn new(intrinsics: Intrinsics, depth: &'a [f32]) -> Result<Self, CameraError> {
         let Intrinsics { width, height, fx, fy, cx, cy } = intrinsics;
         for (name, value, positive) in [("fx", fx, true), ("fy", fy, true), ("cx", cx, false), ("cy", cy, false)] {
@@ -101,10 +102,10 @@ impl<'a> DepthImage<'a> {
         self.depth
     }
 
-    /// In which unit it seems to be, by the median of what it measures.
+    /// The probable unit of the image, from the median of the valid pixels.
     #[must_use]
     pub fn unit(&self) -> Unit {
-        /// Every pixel would tell no more.
+        /// Step between sampled pixels. More samples would not change the result.
         const EVERY: usize = 61;
         let mut sample: Vec<f32> =
             self.depth.iter().step_by(EVERY).copied().filter(|depth| depth.is_finite() && *depth > 0.0).collect();
@@ -119,8 +120,8 @@ impl<'a> DepthImage<'a> {
         }
     }
 
-    /// Every pixel with a reading up to [`DEPTH_MAX`], back-projected: its point in the task frame, with the direction
-    /// towards the camera for a normal. `camera_from_task` is `T_camera_task`.
+    /// Back-projects every pixel with a depth of at most [`DEPTH_MAX`] to a point of the task frame. The normal is the
+    /// direction towards the camera. `camera_from_task` is `T_camera_task`.
     pub fn points(&self, camera_from_task: &Isometry3<f64>) -> impl Iterator<Item = SurfacePoint> {
         let Intrinsics { width, fx, fy, cx, cy, .. } = self.intrinsics;
         let task_from_camera = camera_from_task.inverse();
@@ -142,7 +143,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_wrong_unit_is_noticed() {
+    fn the_unit_is_judged_by_the_median() {
         let intrinsics = Intrinsics::BENCHMARK;
         let unit = |depth: f32| {
             let pixels: Vec<f32> = (0..640 * 480).map(|i| if i % 3 == 0 { f32::NAN } else { depth }).collect();
@@ -151,14 +152,14 @@ mod tests {
         assert_eq!([0.3, 2.0, 0.05].map(unit), [Unit::Metres; 3]);
         assert_eq!([350.0, 1800.0].map(unit), [Unit::Millimetres; 2]);
         assert_eq!([0.0006, 0.002].map(unit), [Unit::Thousandths; 2]);
-        assert_eq!(unit(0.0), Unit::Metres, "nothing measured, nothing said");
+        assert_eq!(unit(0.0), Unit::Metres, "an image without measurements counts as metres");
     }
 
     #[test]
-    fn a_pixel_is_projected_back_to_where_it_was_seen() {
+    fn pixels_are_back_projected() {
         let intrinsics = Intrinsics { width: 3, height: 2, fx: 2.0, fy: 2.0, cx: 1.0, cy: 0.0 };
         let depth = [0.0, f32::NAN, 0.5, -1.0, 1.0, 2.5];
-        // The camera stands at (1, 0, 0) of the task frame, its axes along the task frame's.
+        // The camera is at (1, 0, 0) of the task frame, with parallel axes.
         let camera_from_task = Isometry3::translation(-1.0, 0.0, 0.0);
         let image = DepthImage::new(intrinsics, &depth).unwrap();
         let points: Vec<SurfacePoint> = image.points(&camera_from_task).collect();
@@ -166,8 +167,11 @@ mod tests {
         assert_eq!(
             positions,
             [Point3::new(1.25, 0.0, 0.5), Point3::new(1.0, 0.5, 1.0)],
-            "what has no depth is left out"
+            "pixels without depth are skipped"
         );
-        assert!((points[1].normal - Vector3::new(0.0, -0.5, -1.0).normalize()).norm() < 1e-12, "towards the camera");
+        assert!(
+            (points[1].normal - Vector3::new(0.0, -0.5, -1.0).normalize()).norm() < 1e-12,
+            "the normal points to the camera"
+        );
     }
 }

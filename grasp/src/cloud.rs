@@ -2,10 +2,10 @@ use nalgebra::{Isometry3, Point3, Rotation3, Vector3};
 
 use crate::Intrinsics;
 
-/// A depth image with its camera's pose: what a point cloud would have looked like.
+/// A depth image with its camera's pose, rendered from a point cloud.
 #[derive(Clone, Debug)]
 pub struct View {
-    /// The camera.
+    /// Intrinsics of the camera.
     pub intrinsics: Intrinsics,
     /// Metres along the optical axis, row by row; 0 where there is no point.
     pub depth: Vec<f32>,
@@ -13,20 +13,21 @@ pub struct View {
     pub camera_from_task: Isometry3<f64>,
 }
 
-/// Pixels along the edge of the image, of the fewest and the most points.
+/// Smallest and largest edge of the image, pixels.
 const SIZES: [usize; 2] = [48, 320];
 
-/// Points of one pixel whose depths differ by more than this, metres, are of different surfaces.
+/// Points of one pixel whose depths differ by more than this belong to different surfaces, metres.
 const LAYER: f32 = 0.01;
 
-/// Neighbours, of eight, that fill a pixel without a point.
+/// Number of neighbours with depth, of eight, from which an empty pixel is filled.
 const FILLED_BY: usize = 5;
 
-/// What a camera at `eye` sees of the cube with an edge of `size` metres at the origin of the task frame, if what there is
-/// to see are these points of the task frame.
+/// Renders a depth image of points as a camera at `eye` sees them. Points and eye are in the task frame; the image
+/// covers the workspace, a cube with an edge of `size` metres at the origin of this frame.
 ///
-/// The image is as fine as the points are dense; the nearest points of a pixel make its depth, and pixels between points
-/// are filled. `None` if the eye is inside of the cube, or no point is in sight.
+/// The image resolution follows the number of points. The depth of a pixel is the mean of its nearest points; single
+/// empty pixels are filled. Returns `None` if the eye is inside the bounding sphere of the workspace or no point is in
+/// view.
 #[must_use]
 pub fn seen_from(points: &[Point3<f64>], eye: &Point3<f64>, size: f64) -> Option<View> {
     let centre = Point3::from([size / 2.0; 3]);
@@ -36,7 +37,7 @@ pub fn seen_from(points: &[Point3<f64>], eye: &Point3<f64>, size: f64) -> Option
         return None;
     }
     let camera_from_task = look_at(eye, &centre);
-    // A frustum about the ball around the cube; a sphere is seen under a larger angle than its radius suggests.
+    // The frustum encloses the bounding sphere of the cube: its half angle has sine radius / distance.
     let tangent = radius / (distance * distance - radius * radius).sqrt();
 
     let projected = points.iter().filter_map(|point| {
@@ -48,10 +49,10 @@ pub fn seen_from(points: &[Point3<f64>], eye: &Point3<f64>, size: f64) -> Option
     if projected.is_empty() {
         return None;
     }
-    // About one point a pixel, if they cover the image.
+    // About one point per pixel if the points cover the image.
     let edge = ((projected.len() as f64).sqrt() as usize).clamp(SIZES[0], SIZES[1]);
     let half = edge as f64 / 2.0;
-    // Pixel centres are at whole numbers: the image reaches from -0.5 to edge - 0.5.
+    // Pixel centres are at whole numbers: the image spans -0.5 to edge - 0.5.
     let middle = half - 0.5;
     let intrinsics =
         Intrinsics { width: edge, height: edge, fx: half / tangent, fy: half / tangent, cx: middle, cy: middle };
@@ -63,7 +64,7 @@ pub fn seen_from(points: &[Point3<f64>], eye: &Point3<f64>, size: f64) -> Option
         let nearest = &mut nearest[index(x, y)];
         *nearest = nearest.min(z);
     }
-    // Of a slanted surface the nearest point alone would stand half a pixel before it.
+    // On a slanted surface the nearest point alone is biased by half a pixel towards the camera.
     let mut sums = vec![(0.0_f32, 0.0_f32); edge * edge];
     for &(x, y, z) in &projected {
         let index = index(x, y);
@@ -76,7 +77,7 @@ pub fn seen_from(points: &[Point3<f64>], eye: &Point3<f64>, size: f64) -> Option
     Some(View { intrinsics, depth: filled(&depth, edge), camera_from_task })
 }
 
-/// Gives pixels without depth the median of their neighbours, where enough of those have one.
+/// Fills pixels without depth with the median of their neighbours, if enough of these have depth.
 fn filled(depth: &[f32], edge: usize) -> Vec<f32> {
     let fill = |index: usize| {
         if depth[index] > 0.0 {
@@ -97,11 +98,11 @@ fn filled(depth: &[f32], edge: usize) -> Vec<f32> {
     (0..depth.len()).map(fill).collect()
 }
 
-/// `T_camera_task` of a camera at `eye` that looks at `target`; optical axes: z forward, x right, y down.
+/// `T_camera_task` of a camera at `eye` that looks at `target`. Optical axes: z forward, x right, y down.
 fn look_at(eye: &Point3<f64>, target: &Point3<f64>) -> Isometry3<f64> {
     let forward = target - eye;
     let up = if forward.normalize().z.abs() > 0.99 { Vector3::x() } else { Vector3::z() };
-    // Its rows are the camera's axes in the task frame.
+    // The rows of the rotation are the camera axes in the task frame.
     let rotation = Rotation3::look_at_lh(&forward, &-up);
     let rotation = nalgebra::UnitQuaternion::from_rotation_matrix(&rotation);
     Isometry3::from_parts((rotation * -eye.coords).into(), rotation)
@@ -112,7 +113,7 @@ mod tests {
     use super::*;
     use crate::{DepthImage, Fusion, RESOLUTION, WORKSPACE_SIZE};
 
-    /// A plane at z = 0.1 and a block of 0.1 m on it, a point every `step` metres, as seen from above.
+    /// A plane at z = 0.1 with a block of 0.1 m on it, seen from above, one point every `step` metres.
     fn scene(step: f64) -> Vec<Point3<f64>> {
         let n = (0.3 / step) as usize;
         let height = |x: f64, y: f64| if (0.1..0.2).contains(&x) && (0.1..0.2).contains(&y) { 0.2 } else { 0.1 };
@@ -125,19 +126,19 @@ mod tests {
     }
 
     #[test]
-    fn the_camera_looks_where_it_should() {
+    fn the_camera_looks_at_its_target() {
         for eye in [Point3::new(0.15, -0.5, 0.4), Point3::new(0.15, 0.15, 0.9), Point3::new(-0.4, 0.6, 0.15)] {
             let pose = look_at(&eye, &Point3::new(0.15, 0.15, 0.15));
             assert!((pose * eye).coords.norm() < 1e-12);
             let target = pose * Point3::new(0.15, 0.15, 0.15);
             assert!(target.x.abs() < 1e-9 && target.y.abs() < 1e-9 && target.z > 0.4, "{target}");
             let above = pose * Point3::new(0.15, 0.15, 0.2);
-            assert!(above.y <= 1e-9, "what is higher is higher in the image, whose y points down");
+            assert!(above.y <= 1e-9, "higher points have smaller image y");
         }
     }
 
     #[test]
-    fn a_cloud_gives_the_volume_of_its_surface() {
+    fn a_cloud_is_fused_into_the_volume_of_its_surface() {
         for step in [0.001, 0.004] {
             let view = seen_from(&scene(step), &Point3::new(0.15, -0.2, 0.7), WORKSPACE_SIZE).unwrap();
             let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
@@ -145,7 +146,7 @@ mod tests {
             let surface = fusion.surface();
             let on = |height: f64| surface.iter().filter(|point| (point.position.z - height).abs() < 0.002).count();
             assert!(on(0.1) > 500 && on(0.2) > 80, "{} and {} points with {step} m between", on(0.1), on(0.2));
-            // Between the two heights there are the sides of the block, seen or not, and nothing else.
+            // Between the two heights the surface may only be at the sides of the block.
             let astray = surface.iter().filter(|point| {
                 let (p, side) = (point.position, |c: f64| (c - 0.1).abs() < 0.012 || (c - 0.2).abs() < 0.012);
                 (0.104..0.196).contains(&p.z) && !side(p.x) && !side(p.y)
@@ -155,11 +156,11 @@ mod tests {
     }
 
     #[test]
-    fn there_may_be_nothing_to_see() {
+    fn without_points_in_view_there_is_no_image() {
         let eye = Point3::new(0.15, -0.5, 0.4);
         assert!(seen_from(&[], &eye, WORKSPACE_SIZE).is_none());
         assert!(seen_from(&[Point3::new(0.15, -5.0, 0.4)], &eye, WORKSPACE_SIZE).is_none(), "behind the camera");
-        assert!(seen_from(&scene(0.01), &Point3::new(0.15, 0.15, 0.25), WORKSPACE_SIZE).is_none(), "too near");
+        assert!(seen_from(&scene(0.01), &Point3::new(0.15, 0.15, 0.25), WORKSPACE_SIZE).is_none(), "too close");
         assert!(seen_from(&scene(0.01), &Point3::new(f64::NAN, 0.0, 0.0), WORKSPACE_SIZE).is_none());
     }
 }

@@ -2,23 +2,23 @@ use nalgebra::{Isometry3, Point3, Unit, Vector3};
 
 use crate::Hand;
 
-/// What is asked of a grasp besides its quality, in the frame of the volume's pose. By default nothing.
+/// Constraints on a grasp besides its quality, in the frame of the volume's pose. The default has none.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Constraints {
-    /// The cube that was asked about, where the volume reaches beyond it.
+    /// The requested workspace, if the volume is larger.
     pub workspace: Option<Region>,
-    /// Where the point between the fingertips must lie.
+    /// Region in which the point between the fingertips must lie.
     pub region: Option<Region>,
-    /// Where the hand must come from.
+    /// Allowed approach directions.
     pub approach: Option<Cone>,
-    /// How low the lowest corner of the open hand may be, metres above the frame's z = 0.
+    /// Smallest allowed height of the lowest corner of the open hand, metres along z of the frame.
     pub min_height: Option<f64>,
 }
 
-/// A box, its edges along the axes of a frame of its own.
+/// A box aligned with the axes of its own frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Region {
-    /// The box's frame in that of the volume's pose.
+    /// Pose of the box's frame in the frame of the volume's pose.
     pub frame: Isometry3<f64>,
     /// Smallest coordinates, metres.
     pub lower: [f64; 3],
@@ -26,28 +26,28 @@ pub struct Region {
     pub upper: [f64; 3],
 }
 
-/// Directions about an axis.
+/// A cone of directions.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cone {
-    /// The direction in its middle.
+    /// Centre direction.
     pub axis: Unit<Vector3<f64>>,
-    /// The largest angle to it, radians.
+    /// Largest angle to the axis, radians.
     pub angle: f64,
 }
 
-/// What a grasp violates.
+/// The constraint that a grasp violates.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Violation {
-    /// It is outside of the workspace or the region.
+    /// The grasp is outside the workspace or the region.
     Region,
-    /// It comes from elsewhere.
+    /// The approach direction is outside the cone.
     Approach,
-    /// The hand would be too low.
+    /// The hand is too low.
     Height,
 }
 
 impl Constraints {
-    /// The first thing that a grasp violates, if it does, executed by `hand`.
+    /// The first constraint that a grasp at `pose` with `hand` violates, if any.
     #[must_use]
     pub fn violation(&self, pose: &Isometry3<f64>, hand: &Hand) -> Option<Violation> {
         let Self { workspace, region, approach, min_height } = self;
@@ -86,14 +86,14 @@ mod tests {
 
     use super::*;
 
-    /// Straight down but for `tilt`, its fingertips 5 cm below (0.1, 0.2, 0.3).
+    /// Points straight down, tilted by `tilt`; the fingertips are 5 cm below (0.1, 0.2, 0.3).
     fn down(tilt: f64) -> Isometry3<f64> {
         let rotation = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI - tilt);
         Isometry3::from_parts(Translation3::new(0.1, 0.2, 0.3), rotation)
     }
 
     #[test]
-    fn each_constraint_is_kept() {
+    fn each_constraint_is_enforced() {
         let hand = Hand::GPD;
         let violation = |constraints: Constraints| constraints.violation(&down(0.0), &hand);
         assert_eq!(violation(Constraints::default()), None);
@@ -101,7 +101,7 @@ mod tests {
         let frame = Isometry3::translation(0.0, 0.2, 0.0);
         let around = |z: f64| Region { frame, lower: [0.0, -0.01, z], upper: [0.2, 0.01, z + 0.02] };
         assert_eq!(violation(Constraints { region: Some(around(0.24)), ..Default::default() }), None);
-        // It is the fingertips that count, not where the hand begins.
+        // The region applies to the fingertips, not to the finger base.
         let (region, workspace) = (Some(around(0.29)), Some(around(0.29)));
         assert_eq!(violation(Constraints { region, ..Default::default() }), Some(Violation::Region));
         assert_eq!(violation(Constraints { workspace, ..Default::default() }), Some(Violation::Region));

@@ -2,40 +2,40 @@ use std::f64::consts::FRAC_PI_2;
 
 use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 
-/// Which frame of the hand a grasp is told by.
+/// The frame of the hand in which grasp poses are reported.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Convention {
-    /// Where the frame has its origin.
+    /// Origin of the frame.
     pub origin: Origin,
-    /// Along which of its axes the fingers close.
+    /// Axis of the frame along which the fingers close.
     pub closing: ClosingAxis,
 }
 
-/// Where on the hand a grasp's frame stands.
+/// Position of the frame's origin on the hand.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Origin {
-    /// Between the fingers, where they begin.
+    /// Between the fingers at their base.
     #[default]
     FingerBase,
     /// Between the fingertips: the tool centre point.
     Fingertips,
-    /// At the link that carries the hand, in which the finger base's frame has this pose (`T_parent_grasp`): what MoveIt
-    /// calls an end effector's parent.
+    /// The link that carries the hand (MoveIt: the parent link of the end effector). The value is the pose of the
+    /// finger base in this link (`T_parent_grasp`).
     Parent(Isometry3<f64>),
 }
 
-/// Along which axis of a grasp's frame the fingers close; z is the approach in any case.
+/// Axis of the grasp frame along which the fingers close. z is always the approach.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ClosingAxis {
-    /// ±y, as in VGN's code and here.
+    /// ±y, as in VGN's code and in this crate.
     #[default]
     Y,
-    /// ±x, as in GraspNet's and Isaac's.
+    /// ±x, as in GraspNet and Isaac.
     X,
 }
 
 impl Convention {
-    /// The pose of this convention's frame for a hand with fingers of `depth` metres at a grasp's `pose`.
+    /// The pose of this convention's frame for a grasp at `pose`, executed by a hand with fingers of `depth` metres.
     #[must_use]
     pub fn pose(&self, pose: &Isometry3<f64>, depth: f64) -> Isometry3<f64> {
         let turned = match self.closing {
@@ -50,17 +50,17 @@ impl Convention {
     }
 }
 
-/// Where the hand goes with what it holds.
+/// The motion of the hand after it has closed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Retreat {
-    /// Metres.
+    /// Length of the motion, metres.
     pub distance: f64,
-    /// In the grasp's frame of reference; back along the approach, where it is `None`.
+    /// Direction in the frame of the grasp poses; `None` means back along the approach.
     pub direction: Option<Unit<Vector3<f64>>>,
 }
 
 impl Retreat {
-    /// Where a hand ends that held something at `pose`.
+    /// The pose of the hand after the retreat from a grasp at `pose`.
     #[must_use]
     pub fn from(&self, pose: &Isometry3<f64>) -> Isometry3<f64> {
         match self.direction {
@@ -70,7 +70,7 @@ impl Retreat {
     }
 }
 
-/// The grasp's pose moved back along its approach by `distance` metres: the pre-grasp.
+/// The pre-grasp: `pose` moved back along its approach by `distance` metres.
 #[must_use]
 pub fn before(pose: &Isometry3<f64>, distance: f64) -> Isometry3<f64> {
     pose * Translation3::new(0.0, 0.0, -distance)
@@ -83,19 +83,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_convention_is_the_same_hand() {
+    fn every_convention_describes_the_same_hand() {
         let pose = Isometry3::new(Vector3::new(0.1, 0.2, 0.3), Vector3::new(2.0, -1.0, 0.5));
-        let told = |origin, closing| Convention { origin, closing }.pose(&pose, 0.05);
-        assert_eq!(told(Origin::FingerBase, ClosingAxis::Y), pose);
+        let converted = |origin, closing| Convention { origin, closing }.pose(&pose, 0.05);
+        assert_eq!(converted(Origin::FingerBase, ClosingAxis::Y), pose);
 
-        // A finger stands at ±0.04 along the closing axis; its tip 0.05 further along the approach.
+        // The fingers are at ±0.04 along the closing axis, their tips 0.05 further along the approach.
         let tip = pose * Point3::new(0.0, 0.04, 0.05);
         let same = |pose: Isometry3<f64>, point: Point3<f64>| assert!((pose * point - tip).norm() < 1e-12);
-        same(told(Origin::FingerBase, ClosingAxis::X), Point3::new(0.04, 0.0, 0.05));
-        same(told(Origin::Fingertips, ClosingAxis::Y), Point3::new(0.0, 0.04, 0.0));
-        same(told(Origin::Fingertips, ClosingAxis::X), Point3::new(0.04, 0.0, 0.0));
+        same(converted(Origin::FingerBase, ClosingAxis::X), Point3::new(0.04, 0.0, 0.05));
+        same(converted(Origin::Fingertips, ClosingAxis::Y), Point3::new(0.0, 0.04, 0.0));
+        same(converted(Origin::Fingertips, ClosingAxis::X), Point3::new(0.04, 0.0, 0.0));
         let parent_from_grasp = Isometry3::new(Vector3::new(0.0, 0.0, 0.0584), Vector3::new(0.0, 0.0, 0.785));
-        same(told(Origin::Parent(parent_from_grasp), ClosingAxis::Y), parent_from_grasp * Point3::new(0.0, 0.04, 0.05));
+        same(
+            converted(Origin::Parent(parent_from_grasp), ClosingAxis::Y),
+            parent_from_grasp * Point3::new(0.0, 0.04, 0.05),
+        );
         same(before(&pose, 0.1), Point3::new(0.0, 0.04, 0.15));
     }
 }

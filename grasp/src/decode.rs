@@ -5,51 +5,51 @@ use crate::maps::PROBABLE;
 use crate::selection::{Decoded, Dropped, Selection};
 use crate::{Clearance, Constraints, DecodeError, FINGER_DEPTH, Grasp, Hand, Maps, Volume, VoxelOrigin, before};
 
-/// Every step and constant between a network's maps and a list of grasps.
+/// Parameters of the decoding of a network's maps into grasps.
 ///
-/// The defaults are those of VGN's released code; [`DecodeParams::benchmark`] gives those of GIGA's evaluation, under
-/// which the paper's numbers were measured. Lengths in voxels.
+/// The defaults are those of VGN's released code. [`DecodeParams::benchmark`] gives those of GIGA's evaluation, with
+/// which the paper's results were measured. Lengths are in voxels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DecodeParams {
-    /// σ of the Gaussian that smooths the quality (VGN `process`: 1). 0 switches it off.
+    /// σ of the Gaussian that smooths the quality (VGN `process`: 1). 0 disables it.
     pub sigma: f32,
-    /// Where that Gaussian is cut off (scipy: 4 σ).
+    /// Radius at which the Gaussian is cut off (scipy: 4 σ).
     pub radius: usize,
     /// Values above this are in front of a surface (`out_th`: VGN 0.5, GIGA's evaluation 0.1).
     pub outside_above: f32,
     /// Values above this and below `outside_above` are inside an object (VGN: 1e-3).
     pub inside_above: f32,
-    /// How many voxels the space in front of surfaces is grown, never into an object (VGN: 2).
+    /// Number of dilations of the free space in front of surfaces, never into an object (VGN: 2).
     pub dilations: usize,
-    /// Narrowest width that is believed (VGN: 1.33).
+    /// Smallest valid width (VGN: 1.33).
     pub min_width: f32,
-    /// Widest width that is believed (VGN: 9.33).
+    /// Largest valid width (VGN: 9.33).
     pub max_width: f32,
-    /// Voxels at the border where nothing is believed (GIGA), if any.
+    /// Border of the volume without grasps (GIGA), if any.
     pub border: Option<Border>,
-    /// ε: smallest smoothed quality of a grasp (0.9 in all three papers).
+    /// ε: the smallest smoothed quality of a grasp (0.9 in all three papers).
     pub threshold: f32,
-    /// GIGA's `force`: when nothing reaches `threshold`, the single best voxel, if it reaches this.
+    /// GIGA's `force`: if no voxel reaches `threshold`, the single best grasp of at least this quality is returned.
     pub force: Option<f32>,
-    /// Edge of the cube in which only the best voxel is kept (VGN: 4).
+    /// Edge of the window of the non-maximum suppression (VGN: 4).
     pub nms_size: usize,
-    /// How the hand must keep clear of what was observed, if it must: none of the papers asks.
+    /// Collision check of the hand against the observed surfaces, if any. None of the papers uses one.
     pub clearance: Option<Clearance>,
-    /// What is asked of a grasp besides.
+    /// Further constraints on grasps.
     pub constraints: Constraints,
-    /// The hand, if it is another than the one that the network was trained with. It grasps where that one would: with its
-    /// fingertips in the same place, and no wider than it opens.
+    /// The hand, if it is not the one that the network was trained with. Grasps keep the position of the fingertips,
+    /// and wider grasps than this hand's opening are dropped.
     pub hand: Option<Hand>,
-    /// Where in its voxel a grasp stands.
+    /// Position of a grasp in its voxel.
     pub origin: VoxelOrigin,
 }
 
-/// Voxels at the faces of the cube whose grasps are dropped.
+/// Width of the border of the volume in which grasps are dropped, voxels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Border {
-    /// At each of the four vertical faces.
+    /// Width at each of the four vertical faces.
     pub sides: usize,
-    /// At the bottom.
+    /// Width at the bottom.
     pub bottom: usize,
 }
 
@@ -76,22 +76,23 @@ impl Default for DecodeParams {
 }
 
 impl DecodeParams {
-    /// The parameters of GIGA's evaluation: `out_th` 0.1, borders cut, `force` down to 0.5.
+    /// The parameters of GIGA's evaluation: `out_th` 0.1, a border, and `force` 0.5.
     #[must_use]
     pub fn benchmark() -> Self {
         Self { outside_above: 0.1, border: Some(Border { sides: 2, bottom: 7 }), force: Some(0.5), ..Self::default() }
     }
 
-    /// What is asked when nothing reaches the threshold, if anything is.
+    /// The smallest quality if no voxel reaches the threshold, with `force`.
     pub(crate) fn floor(&self) -> Option<f32> {
         self.force.map(|force| force.min(self.threshold))
     }
 }
 
-/// Turns a network's maps over `volume` into grasps, best first (VGN's `process` and `select`, with GIGA's additions).
+/// Decodes a network's maps over `volume` into grasps, best first (VGN's `process` and `select`, with GIGA's
+/// additions). The grasps are in the frame of the volume's pose.
 ///
 /// # Errors
-/// [`DecodeError`] when a map has the wrong size, or is not finite where it is used.
+/// [`DecodeError`] if a map has the wrong size, or an invalid value where it is used.
 pub fn decode(volume: &Volume, maps: &Maps, params: &DecodeParams) -> Result<Decoded, DecodeError> {
     let n = volume.resolution();
     maps.check_quality(n)?;
@@ -109,7 +110,7 @@ pub fn decode(volume: &Volume, maps: &Maps, params: &DecodeParams) -> Result<Dec
     }
 }
 
-/// The grasps of at least `threshold`, best first, and why the other voxels hold none.
+/// The grasps of at least `threshold`, best first, and the reasons why the other voxels hold none.
 fn candidates(
     volume: &Volume,
     maps: &Maps,
@@ -120,12 +121,12 @@ fn candidates(
     params: &DecodeParams,
 ) -> Result<Decoded, DecodeError> {
     let n = volume.resolution();
-    // Of the hand's own opening; the width that was learnt from is narrower than the hand by a margin of its own.
+    // Only for a custom hand: `max_width` already keeps a margin to the opening of the training hand.
     let opening = params.hand.map_or(f64::INFINITY, |hand| 2.0 * hand.half_opening());
     let mut dropped = Dropped::default();
     let mut quality = vec![0.0; smooth.len()];
     let mut passed = Vec::new();
-    // Few rows of z hold any.
+    // Few rows along z contain a voxel above the threshold.
     let rows = smooth.chunks_exact(n).enumerate().filter(|(_, row)| reaches(row, threshold));
     let mut reached = 0;
     for (index, &q) in rows.flat_map(|(row, values)| (row * n..).zip(values)) {
@@ -160,7 +161,7 @@ fn candidates(
     Ok(Decoded { grasps: passed.into_iter().map(|(_, grasp)| grasp).collect(), dropped })
 }
 
-/// The voxels in front of surfaces, grown a little, but not into objects.
+/// Mask of the voxels in front of surfaces, dilated, but not into objects.
 fn near_surface(volume: &Volume, params: &DecodeParams) -> Vec<bool> {
     let values = volume.values();
     let outside: Vec<bool> = values.iter().map(|&v| v > params.outside_above).collect();
@@ -189,7 +190,7 @@ fn grasp_at(
     let position = cell.map(|c| c as f64 + params.origin.offset()) * volume.voxel_size();
     let pose = volume.pose() * Isometry3::from_parts(Translation3::from(position), rotation);
     Ok(Grasp {
-        // The fingertips stay where they are.
+        // A custom hand keeps the position of the fingertips.
         pose: params.hand.map_or(pose, |hand| before(&pose, hand.depth - FINGER_DEPTH)),
         width: f64::from(maps.width[index]) * volume.voxel_size(),
         quality,
@@ -203,7 +204,7 @@ mod tests {
 
     const N: usize = 16;
 
-    /// A slab whose surface lies at z = 8: free above, inside below, observed over ±4 voxels.
+    /// A slab with its surface at z = 8: free above, inside below, observed over ±4 voxels.
     fn slab() -> Volume {
         let values = (0..N.pow(3)).map(|i| ((i % N) as f32 - 4.0).clamp(0.0, 8.0) / 8.0 * f32::from(i % N <= 12));
         Volume::new(N, 0.0075, Isometry3::translation(1.0, 2.0, 3.0), values.collect()).unwrap()
@@ -229,7 +230,7 @@ mod tests {
             let d = decoded.dropped;
             let constrained = d.region + d.approach + d.height;
             let all = d.below_threshold + d.mask + d.width + d.border + constrained + d.suppressed + d.collision;
-            assert_eq!(all + decoded.grasps.len(), N.pow(3), "every voxel is accounted for once");
+            assert_eq!(all + decoded.grasps.len(), N.pow(3), "every voxel is counted once");
             decoded
         }
     }
@@ -257,10 +258,10 @@ mod tests {
     }
 
     #[test]
-    fn each_reason_drops_what_it_should() {
+    fn each_voxel_is_counted_under_the_first_reason() {
         let mut arrays = Arrays::new();
-        arrays.quality[index(8, 8, 9)] = 0.99; // stays
-        arrays.quality[index(8, 8, 10)] = 0.95; // suppressed by it
+        arrays.quality[index(8, 8, 9)] = 0.99; // kept
+        arrays.quality[index(8, 8, 10)] = 0.95; // suppressed by the first
         arrays.quality[index(8, 3, 9)] = 0.89; // below the threshold
         arrays.quality[index(3, 3, 6)] = 0.99; // inside the slab
         arrays.quality[index(3, 12, 9)] = 0.99; // width
@@ -280,12 +281,12 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_asked_for_makes_way_for_its_neighbour() {
+    fn a_grasp_dropped_by_a_constraint_does_not_suppress_its_neighbour() {
         let mut arrays = Arrays::new();
         arrays.quality[index(8, 8, 9)] = 0.99;
         arrays.quality[index(9, 8, 9)] = 0.95;
         assert_eq!(arrays.decode(&sharp()).dropped.suppressed, 1);
-        // The fingers point up: their tips are 0.05 m above the voxel, the volume's corner is at (1, 2, 3).
+        // The fingers point up: the tips are 0.05 m above the voxel. The volume's corner is at (1, 2, 3).
         let region = Region {
             frame: Isometry3::translation(1.0, 2.0, 3.0),
             lower: [8.5 * 0.0075, 0.0, 9.0 * 0.0075 + 0.05],
@@ -303,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn another_hand_grasps_with_its_fingertips_in_the_same_place() {
+    fn a_custom_hand_keeps_the_fingertip_position() {
         let mut arrays = Arrays::new();
         arrays.quality[index(8, 8, 9)] = 0.99;
         let [own] = arrays.decode(&sharp()).grasps[..] else { panic!() };
@@ -317,28 +318,28 @@ mod tests {
     }
 
     #[test]
-    fn a_hand_that_would_meet_what_was_observed_is_no_answer() {
+    fn grasps_in_collision_are_dropped() {
         let mut arrays = Arrays::new();
         arrays.quality[index(8, 8, 9)] = 0.99;
         arrays.quality[index(3, 3, 9)] = 0.95;
-        // The identity points up, from inside the slab; half a turn about x points down, onto it.
+        // The identity rotation points up, from inside the slab; half a turn about x points down, onto the slab.
         let down = |arrays: &mut Arrays, index: usize| {
             arrays.rotation[index] = 1.0;
             arrays.rotation[3 * N.pow(3) + index] = 0.0;
         };
         down(&mut arrays, index(3, 3, 9));
-        // Too short to reach the slab from where the grasp stands.
+        // Fingers too short to reach the slab from the grasp.
         let hand = Hand { depth: 0.005, ..Hand::PANDA };
         let clearance = Some(Clearance { hand, ..Clearance::default() });
         let grasps = |params: &DecodeParams| arrays.decode(params).grasps.iter().map(|g| g.quality).collect::<Vec<_>>();
         assert_eq!(grasps(&sharp()), [0.99, 0.95]);
         assert_eq!(grasps(&DecodeParams { clearance, ..sharp() }), [0.95]);
         assert_eq!(arrays.decode(&DecodeParams { clearance, ..sharp() }).dropped.collision, 1);
-        // The best of those that are free, when nothing reaches the threshold.
+        // `force` chooses among the collision-free grasps.
         let forced = DecodeParams { clearance, threshold: 1.0, force: Some(0.5), ..sharp() };
         assert_eq!(grasps(&forced), [0.95]);
 
-        // Nor does it stand in the way of its neighbour.
+        // A dropped grasp does not suppress its neighbour.
         arrays.quality[index(9, 8, 9)] = 0.93;
         down(&mut arrays, index(9, 8, 9));
         let free = arrays.decode(&DecodeParams { clearance, ..sharp() });
@@ -363,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn a_broken_network_is_told_and_not_hidden() {
+    fn invalid_maps_are_errors() {
         let mut arrays = Arrays::new();
         arrays.quality[7] = f32::NAN;
         let maps = Maps { quality: &arrays.quality, rotation: &arrays.rotation, width: &arrays.width };
@@ -373,12 +374,14 @@ mod tests {
             Maps { quality: &fine.quality, rotation, width }.check(N).map_err(|error| error.to_string())
         };
         assert_eq!(check(&fine.rotation, &fine.width), Ok(()));
-        assert!(check(&vec![0.0; 4 * N.pow(3)], &fine.width).unwrap_err().contains("has no length here"));
-        assert!(check(&fine.rotation, &vec![f32::INFINITY; N.pow(3)]).unwrap_err().contains("width` holds inf at 0"));
+        assert!(check(&vec![0.0; 4 * N.pow(3)], &fine.width).unwrap_err().contains("has no finite length above 0"));
+        assert!(
+            check(&fine.rotation, &vec![f32::INFINITY; N.pow(3)]).unwrap_err().contains("width` is inf at index 0")
+        );
         assert!(matches!(decode(&slab(), &maps, &sharp()), Err(DecodeError::Value { map: "quality", index: 7, .. })));
         let logits = vec![37.2; N.pow(3)];
         let error = decode(&slab(), &Maps { quality: &logits, ..maps }, &sharp()).unwrap_err().to_string();
-        assert!(error.starts_with("the map `quality` holds 37.2 at 0, must be a probability"), "{error}");
+        assert!(error.starts_with("map `quality` is 37.2 at index 0, must be a probability"), "{error}");
         let short = Maps { width: &arrays.width[1..], ..maps };
         assert!(matches!(decode(&slab(), &short, &sharp()), Err(DecodeError::Length { map: "width", .. })));
     }

@@ -1,4 +1,4 @@
-//! Filters over cubic arrays `[x][y][z]`, z fastest, with scipy's border rules.
+//! Filters over cubic arrays `[x][y][z]`, z fastest, with the border rules of scipy.
 
 /// Gaussian weights for −radius…radius, normalised as `scipy.ndimage.gaussian_filter` does.
 fn gaussian_kernel(sigma: f32, radius: usize) -> Vec<f32> {
@@ -11,16 +11,17 @@ fn gaussian_kernel(sigma: f32, radius: usize) -> Vec<f32> {
     (0..=2 * radius).map(|i| (weight(i) / sum) as f32).collect()
 }
 
-/// Separable Gaussian filter with the nearest voxel repeated past the border. `sigma` and `radius` in voxels.
+/// Separable Gaussian filter; the nearest voxel is repeated past the border. `sigma` and `radius` in voxels.
 ///
-/// Of `values` of at most `ceiling`, it is exact wherever it is at least `floor`, above 0, and less than that elsewhere:
-/// an average is no higher than its centre lets it be, so that most rows need not be computed to the end.
+/// For `values` of at most `ceiling`: results of at least `floor` (above 0) are exact, all other results are below
+/// `floor`. A result is bounded by its centre value, so most rows are skipped.
 pub(crate) fn gaussian(values: &[f32], n: usize, sigma: f32, radius: usize, floor: f32, ceiling: f32) -> Vec<f32> {
     if sigma <= 0.0 || radius == 0 {
         return values.to_vec();
     }
     let kernel = gaussian_kernel(sigma, radius);
-    // What a centre must be for its average to be `average` when all around it are at the ceiling, but for rounding.
+    // Smallest centre value that can give `average` when all its neighbours are at the ceiling, less a margin for
+    // rounding.
     let center = |average: f32| ceiling - (ceiling - average) / kernel[radius] - 1e-4;
     let after_y = center(floor);
     let after_x = center(after_y);
@@ -51,12 +52,12 @@ pub(crate) fn gaussian(values: &[f32], n: usize, sigma: f32, radius: usize, floo
     along_z
 }
 
-/// Whether any value is at least `floor`. All are looked at, which vectorises; stopping at the first does not.
+/// Whether any value is at least `floor`. The fold reads all values, which vectorises; an early exit does not.
 pub(crate) fn reaches(values: &[f32], floor: f32) -> bool {
     values.iter().fold(false, |any, &value| any | (value >= floor))
 }
 
-/// `target` becomes the sum of `source(k)`, each as long as it is, weighted by a kernel that is the same from both ends.
+/// Sets `target` to the sum of `source(k)` weighted by a symmetric kernel. All slices have the same length.
 fn weigh<'a>(target: &mut [f32], kernel: &[f32], source: impl Fn(usize) -> &'a [f32]) {
     let radius = kernel.len() / 2;
     for (sum, center) in target.iter_mut().zip(source(radius)) {
@@ -67,7 +68,7 @@ fn weigh<'a>(target: &mut [f32], kernel: &[f32], source: impl Fn(usize) -> &'a [
     }
 }
 
-/// A function of its own, where the compiler knows that the slices are apart: it vectorises short rows, too.
+/// A separate function: with non-aliasing slices the compiler vectorises short rows too.
 #[inline(never)]
 fn add_weighed(sums: &mut [f32], weight: f32, before: &[f32], after: &[f32]) {
     for ((sum, before), after) in sums.iter_mut().zip(before).zip(after) {
@@ -75,10 +76,10 @@ fn add_weighed(sums: &mut [f32], weight: f32, before: &[f32], after: &[f32]) {
     }
 }
 
-/// Binary dilation by the 6-neighbourhood, `iterations` times, growing only where `allowed`.
+/// Binary dilation with the 6-neighbourhood, `iterations` times, only where `allowed`.
 pub(crate) fn dilate(seed: &[bool], allowed: &[bool], n: usize, iterations: usize) -> Vec<bool> {
-    // With a voxel more at the end of each row and a row more at the end of each plane, which nothing grows into, every
-    // neighbour is the whole array shifted, which vectorises.
+    // With one padding voxel per row and one padding row per plane, none of them `allowed`, each neighbour is the whole
+    // array shifted by a constant, which vectorises.
     let (row, plane) = (n + 1, (n + 1) * (n + 1));
     let voxels = plane..(n + 1) * plane;
     let rows = |x: usize| (0..n).map(move |y| ((x + 1) * plane + y * row, (x * n + y) * n));
@@ -110,7 +111,7 @@ pub(crate) fn dilate(seed: &[bool], allowed: &[bool], n: usize, iterations: usiz
     dilated
 }
 
-/// Whether a voxel is the largest of its `size`³ window, `-size/2 … size - size/2 - 1` as in
+/// Whether a voxel is a maximum of its `size`³ window, `-size/2 … size - size/2 - 1` as in
 /// `scipy.ndimage.maximum_filter`.
 pub(crate) fn is_window_maximum(values: &[f32], n: usize, index: usize, size: usize) -> bool {
     let window = |c: usize| c.saturating_sub(size / 2)..(c + size - size / 2).min(n);
@@ -131,8 +132,8 @@ mod tests {
     const N: usize = 20;
 
     #[test]
-    fn what_is_left_out_of_the_smoothing_is_below_the_floor() {
-        // Plateaus of certainty of several sizes, one at a corner, in a sea of doubt.
+    fn values_skipped_by_the_smoothing_are_below_the_floor() {
+        // Plateaus of high values in several sizes, one at a corner, on low values.
         let ceiling = 1.001;
         let mut values: Vec<f32> = (0..N.pow(3)).map(|i| (i * 7919 % 1000) as f32 / 2500.0).collect();
         for (corner, size) in [([0, 0, 0], 3), ([8, 8, 8], 5), ([14, 3, 10], 4), ([4, 15, 2], 2)] {
@@ -154,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn a_dilation_stays_in_its_cube_and_out_of_what_is_forbidden() {
+    fn dilation_stays_in_the_cube_and_in_allowed_voxels() {
         let at = |x: usize, y: usize, z: usize| (x * N + y) * N + z;
         let mut seed = vec![false; N.pow(3)];
         seed[at(0, 0, 0)] = true;
@@ -165,7 +166,7 @@ mod tests {
         let steps = |a: [usize; 3], b: [usize; 3]| a.iter().zip(b).map(|(a, b)| a.abs_diff(b)).sum::<usize>();
         for (i, grown) in dilated.into_iter().enumerate() {
             let here = [i / (N * N), i / N % N, i % N];
-            // (2, 0, 0) is two steps away only through what is forbidden.
+            // (2, 0, 0) is two steps away, but only through the voxel that is not allowed.
             let near = steps(here, [0, 0, 0]) <= 2 && !matches!(here, [1 | 2, 0, 0]);
             assert_eq!(grown, near || steps(here, [5, 5, N - 1]) <= 2, "{here:?}");
         }

@@ -3,22 +3,22 @@ use thiserror::Error;
 
 use crate::{DepthImage, Volume, VolumeError};
 
-/// Depth beyond this many metres is ignored, as in VGN's perception code.
+/// Largest valid depth, metres, as in VGN's perception code.
 pub const DEPTH_MAX: f32 = 2.0;
 
-/// The truncation distance in voxels (VGN: 4 voxels = 0.03 m at 40³).
+/// Truncation distance in voxels (VGN: 4 voxels = 0.03 m at 40³).
 pub const TRUNCATION_VOXELS: f64 = 4.0;
 
-/// Truncated values at or beyond this count as free or unobserved when a volume is read out (Open3D's constant).
+/// Voxels whose |truncated distance| reaches this are read out as 0, like unobserved voxels (constant from Open3D).
 const NEAR_SURFACE: f32 = 0.98;
 
-/// Voxels projected together.
+/// Voxels projected per step.
 const LANES: usize = 8;
 
-/// Fuses depth images into a truncated signed distance field over a cube, one weight per view.
+/// Fuses depth images into a truncated signed distance field over a cube. Every view has the same weight.
 ///
-/// The convention is that of Open3D's `UniformTSDFVolume`, with which VGN's and GIGA's data were made: a voxel is
-/// sampled at its centre, its pixel is `floor(u + 0.5)`, and the distance is taken along that pixel's ray.
+/// Follows Open3D's `UniformTSDFVolume`, which produced the data of VGN and GIGA: a voxel is sampled at its centre, its
+/// pixel is `floor(u + 0.5)`, and the distance is measured along the ray of that pixel.
 #[derive(Clone, Debug)]
 pub struct Fusion {
     resolution: usize,
@@ -27,44 +27,51 @@ pub struct Fusion {
     voxels: Vec<Voxel>,
 }
 
-/// Distance in truncations, in [-1, 1], and the number of views that saw it.
+/// Signed distance as a fraction of the truncation distance, in [-1, 1], and the number of views that measured it.
 #[derive(Clone, Copy, Debug, Default)]
 struct Voxel {
     distance: f32,
     weight: f32,
 }
 
-/// Why a view measures nothing of a cube.
+/// Why a view measures no voxel of the workspace.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 pub enum Blind {
-    /// All of the cube has negative depth.
-    #[error("the workspace lies behind the camera; is the pose inverted, or of a frame that does not look along z?")]
-    Behind,
-    /// None of it is projected onto the image.
+    /// The whole workspace has negative depth.
     #[error(
-        "the workspace is outside of the image: its centre would be at pixel ({u:.0}, {v:.0}); is the pose inverted, in \
-         millimetres, or of a frame that does not look along z?"
+        "the workspace is behind the camera; check that the pose is not inverted and is that of the optical frame \
+         (z forward)"
+    )]
+    Behind,
+    /// No point of the workspace projects into the image.
+    #[error(
+        "the workspace is outside the image: its centre projects to pixel ({u:.0}, {v:.0}); check that the pose is not \
+         inverted, is in metres, and is that of the optical frame (z forward)"
     )]
     Outside {
-        /// Column of its centre.
+        /// Column of the projected workspace centre.
         u: f64,
-        /// Row of its centre.
+        /// Row of the projected workspace centre.
         v: f64,
     },
-    /// There is no valid depth where the cube is.
-    #[error("no pixel on the workspace has a depth from 0 to {DEPTH_MAX} m; it is {distance:.3} m away")]
+    /// No pixel on the workspace has a valid depth.
+    #[error(
+        "no pixel on the workspace has a depth between 0 and {DEPTH_MAX} m; the workspace centre is at a depth of \
+         {distance:.3} m; check the depth image and the camera pose"
+    )]
     NoReading {
-        /// Depth of the cube's centre, metres.
+        /// Depth of the workspace centre, metres.
         distance: f64,
     },
-    /// Something stands before all of it.
+    /// All measured surfaces are in front of the workspace.
     #[error(
-        "all that is seen is before the workspace, at most {depth:.4} m away; the workspace's centre is {distance:.3} m away"
+        "all measured depths are in front of the workspace: at most {depth:.4} m, its centre is at {distance:.3} m; \
+         check the depth unit, the camera pose and the view for occlusion"
     )]
     Hidden {
-        /// Largest depth that was measured on the cube, metres.
+        /// Largest depth measured on the workspace, metres.
         depth: f32,
-        /// Depth of the cube's centre, metres.
+        /// Depth of the workspace centre, metres.
         distance: f64,
     },
 }
@@ -82,7 +89,7 @@ impl Fusion {
         }
     }
 
-    /// The field that a volume was read from, seen once.
+    /// Restores the field from a volume: each voxel above 0 counts as measured by one view.
     #[must_use]
     pub fn of(volume: &Volume) -> Self {
         let seen = |&value: &f32| {
@@ -96,14 +103,14 @@ impl Fusion {
         }
     }
 
-    /// Adds one view. `camera_from_task` (`T_camera_task`) maps points of the cube's frame into the camera.
+    /// Adds one view. `camera_from_task` (`T_camera_task`) maps points of the cube's frame into the camera frame.
     ///
-    /// Returns how many voxels it measured; [`blind`](Self::blind) says why if there are none.
+    /// Returns the number of measured voxels. If it is 0, [`blind`](Self::blind) gives the reason.
     pub fn integrate(&mut self, image: &DepthImage, camera_from_task: &Isometry3<f64>) -> usize {
         let mut measured = 0;
         let camera = image.intrinsics();
         let (fx, fy) = (camera.fx as f32, camera.fy as f32);
-        // The half pixel turns truncation into rounding.
+        // Adding half a pixel turns truncation into rounding.
         let (cx, cy) = (camera.cx as f32 + 0.5, camera.cy as f32 + 0.5);
         let (width, height) = (camera.width, camera.height);
         let (u_end, v_end) = (width as f32 - 1e-4, height as f32 - 1e-4);
@@ -119,7 +126,7 @@ impl Fusion {
             let centre = Point3::new(x as f64 + 0.5, y as f64 + 0.5, 0.5) * self.voxel_size;
             let start = (camera_from_task * centre).cast::<f32>();
             for (chunk, voxels) in voxels.chunks_mut(LANES).enumerate() {
-                // Projected a chunk at a time, which the compiler turns into vector instructions.
+                // One chunk per iteration: the compiler turns these loops into vector instructions.
                 let (mut us, mut vs, mut zs) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
                 for lane in 0..LANES {
                     let point = start + step * (chunk * LANES + lane) as f32;
@@ -133,14 +140,14 @@ impl Fusion {
                     if !(z > 0.0 && u >= 1e-4 && u < u_end && v >= 1e-4 && v < v_end) {
                         continue;
                     }
-                    // Both fit: they were just seen to lie inside the image.
+                    // No overflow: the bounds check above passed.
                     let (u, v) = (u as u32, v as u32);
                     let d = depth[v as usize * width + u as usize];
                     // Written so that NaN fails.
                     if !(d > 0.0 && d <= DEPTH_MAX) {
                         continue;
                     }
-                    // A ray is never shorter than its depth: most voxels need no square root.
+                    // A ray is never shorter than its depth, so most voxels need no square root.
                     let behind = d - z;
                     if behind <= -self.truncation {
                         continue;
@@ -164,7 +171,7 @@ impl Fusion {
         measured
     }
 
-    /// Why a view that [measured](Self::integrate) no voxel did not.
+    /// The reason why a view [measures](Self::integrate) no voxel.
     #[must_use]
     pub fn blind(&self, image: &DepthImage, camera_from_task: &Isometry3<f64>) -> Blind {
         const STEPS: usize = 16;
@@ -196,7 +203,8 @@ impl Fusion {
         if depth > 0.0 { Blind::Hidden { depth, distance } } else { Blind::NoReading { distance } }
     }
 
-    /// The values a network reads: `(tsdf + 1) / 2` near a surface that was seen, else 0. Indexed `[x][y][z]`.
+    /// The input values of a network, `[N, N, N]`, indexed `[x][y][z]`: `(tsdf + 1) / 2` near an observed surface, else
+    /// 0.
     #[must_use]
     pub fn values(&self) -> Vec<f32> {
         self.voxels
@@ -205,10 +213,10 @@ impl Fusion {
             .collect()
     }
 
-    /// The fused field as a checked volume at `pose` (`T_frame_task`).
+    /// The fused field as a validated volume at `pose` (`T_frame_task`).
     ///
     /// # Errors
-    /// [`VolumeError::Empty`] when no surface was seen.
+    /// [`VolumeError::Empty`] if no surface was observed.
     pub fn volume(&self, pose: Isometry3<f64>) -> Result<Volume, VolumeError> {
         Volume::new(self.resolution, self.voxel_size, pose, self.values())
     }
@@ -225,13 +233,14 @@ impl Fusion {
         self.voxel_size
     }
 
-    /// The distance at a voxel in truncations, if a surface near it was seen.
+    /// Distance at a voxel as a fraction of the truncation distance; `None` if no surface near the voxel was observed.
     pub(crate) fn near_surface(&self, index: usize) -> Option<f32> {
         let voxel = self.voxels[index];
         voxel.is_near_surface().then_some(voxel.distance)
     }
 
-    /// Distance in truncations by trilinear interpolation at `point` (cube frame), unseen voxels counting as 0.
+    /// Distance at `point` (cube frame) as a fraction of the truncation distance, by trilinear interpolation.
+    /// Unobserved voxels count as 0.
     pub(crate) fn interpolate(&self, point: &Point3<f64>) -> f64 {
         let n = self.resolution;
         let p = point.coords / self.voxel_size - Vector3::repeat(0.5);
@@ -265,22 +274,23 @@ mod tests {
     }
 
     #[test]
-    fn a_wall_is_found_where_it_stands() {
+    fn a_wall_is_reconstructed_at_its_position() {
         let camera = Intrinsics::BENCHMARK;
         let depth = vec![0.65; camera.width * camera.height];
         let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
         fusion.integrate(&DepthImage::new(camera, &depth).unwrap(), &facing());
         let values = fusion.values();
-        // The wall is at z = 0.15 = voxel boundary 20: centre 19 lies half a voxel in front, centre 20 behind.
+        // The wall is at z = 0.15, the boundary between voxels 19 and 20: centre 19 lies half a voxel in front, centre
+        // 20 half a voxel behind.
         let at = |z: usize| values[(20 * 40 + 20) * 40 + z];
         assert!((at(19) - (0.5 + 0.5 / 8.0)).abs() < 1e-3, "{}", at(19));
         assert!((at(20) - (0.5 - 0.5 / 8.0)).abs() < 1e-3, "{}", at(20));
-        assert_eq!(at(5), 0.0, "free space past the truncation reads 0");
-        assert_eq!(at(35), 0.0, "what is hidden reads 0");
+        assert_eq!(at(5), 0.0, "free space beyond the truncation distance is 0");
+        assert_eq!(at(35), 0.0, "occluded space is 0");
     }
 
     #[test]
-    fn a_view_that_sees_nothing_says_why() {
+    fn a_view_without_measurements_gives_the_reason() {
         let camera = Intrinsics::BENCHMARK;
         let blind = |depth: f32, pose: Isometry3<f64>| {
             let depth = vec![depth; camera.width * camera.height];
@@ -290,18 +300,22 @@ mod tests {
         };
         let measured = blind(0.65, facing()).0;
         assert!((20_000..=64_000).contains(&measured), "{measured}");
-        let nothing = |depth, pose, says: &str| {
+        let nothing = |depth, pose, expected: &str| {
             let (measured, reason) = blind(depth, pose);
-            assert!(measured == 0 && reason.contains(says), "{measured}: {reason}");
+            assert!(measured == 0 && reason.contains(expected), "{measured}: {reason}");
         };
-        nothing(0.65, facing().inverse(), "behind the camera; is the pose inverted");
-        nothing(0.65, Isometry3::translation(2.0, -0.15, 0.5), "its centre would be at pixel (2106, 240)");
-        nothing(f32::NAN, facing(), "no pixel on the workspace has a depth from 0 to 2 m; it is 0.650 m away");
-        nothing(0.000_65, facing(), "before the workspace, at most 0.0007 m away");
+        nothing(0.65, facing().inverse(), "behind the camera; check that the pose is not inverted");
+        nothing(0.65, Isometry3::translation(2.0, -0.15, 0.5), "its centre projects to pixel (2106, 240)");
+        nothing(
+            f32::NAN,
+            facing(),
+            "no pixel on the workspace has a depth between 0 and 2 m; the workspace centre is at a depth of 0.650 m",
+        );
+        nothing(0.000_65, facing(), "in front of the workspace: at most 0.0007 m, its centre is at 0.650 m");
     }
 
     #[test]
-    fn a_volume_is_a_field_again() {
+    fn a_volume_restores_the_field_and_its_surface() {
         let camera = Intrinsics::BENCHMARK;
         let depth = vec![0.65; camera.width * camera.height];
         let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
@@ -315,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn invalid_depth_is_no_reading() {
+    fn invalid_depth_is_ignored() {
         let camera = Intrinsics::BENCHMARK;
         for invalid in [0.0, -1.0, f32::NAN, f32::INFINITY, 2.5] {
             let depth = vec![invalid; camera.width * camera.height];

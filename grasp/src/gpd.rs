@@ -1,8 +1,9 @@
 //! Grasp pose detection on a point cloud: ten Pas, Gualtieri, Saenko, Platt, "Grasp Pose Detection in Point Clouds",
-//! IJRR 2017 (GPD), its constants as in the authors' code; and the highest-point heuristic, SHAF.
+//! IJRR 2017 (GPD), with the constants of the authors' code; and the highest-point heuristic, SHAF.
 //!
-//! [`Cloud`] (voxels, normals) → [`candidates`] (where the hand fits around a surface) → [`Image`]s (what lies between
-//! its fingers), which a classifier scores; or [`highest_first`], which needs none.
+//! GPD: [`Cloud`] (downsampled points, normals) → [`candidates`] (poses where the hand fits around a surface) →
+//! [`Image`]s (the surface between the fingers) → a classifier that scores them. SHAF orders the candidates with
+//! [`highest_first`] and needs no classifier.
 
 mod candidates;
 mod cloud;
@@ -18,22 +19,22 @@ use nalgebra::Point3;
 
 use crate::Grasp;
 
-/// Metres at the borders of the workspace where nothing is looked at: half of an object may lie outside.
+/// Width of the border of the workspace that is ignored, metres: an object there may lie half outside.
 const MARGIN: f64 = 0.02;
 
-/// Metres above the table that still belong to it, for the noise of a camera.
+/// Height above the table that still counts as the table, metres, because of camera noise.
 const SKIN: f64 = 0.005;
 
-/// Whether a point of the task frame is one of the objects on a table at the height `table`, in a cube with an edge of
-/// `size` metres.
+/// Whether a point of the task frame belongs to an object on the table. `size` is the edge of the workspace and `table`
+/// the height of the table, both in metres.
 #[must_use]
 pub fn is_on_an_object(position: &Point3<f64>, size: f64, table: f64) -> bool {
     let inner = MARGIN..=size - MARGIN;
     inner.contains(&position.x) && inner.contains(&position.y) && (table + SKIN..=size).contains(&position.z)
 }
 
-/// Candidates as a classifier scores them, the best first. A score is the logit of a success less that of a
-/// failure, so that the quality is the probability of a success.
+/// The candidates as grasps, best first. A score is the logit of success minus the logit of failure; the quality is its
+/// sigmoid, the probability of success.
 #[must_use]
 pub fn scored(candidates: &[Candidate], scores: &[f32]) -> Vec<Grasp> {
     let grasp = |(candidate, &score): (&Candidate, &f32)| Grasp {
@@ -46,8 +47,8 @@ pub fn scored(candidates: &[Candidate], scores: &[f32]) -> Vec<Grasp> {
     grasps
 }
 
-/// The candidates in [SHAF's order](highest_first). Nothing says how probable a success is: the quality falls evenly from
-/// 1 for the first.
+/// The candidates as grasps in [SHAF's order](highest_first). SHAF predicts no probability: the quality decreases
+/// linearly from 1 for the first.
 #[must_use]
 pub fn ranked(mut candidates: Vec<Candidate>) -> Vec<Grasp> {
     highest_first(&mut candidates);

@@ -3,40 +3,41 @@ use thiserror::Error;
 
 use crate::{FINGER_DEPTH, MAX_OPENING};
 
-/// An open parallel-jaw hand as boxes: two fingers and a palm. Metres, in the grasp frame (z the approach, ±y the closing
-/// axis, origin at the finger base).
+/// An open parallel-jaw hand as boxes: two fingers and a palm. Metres, in the grasp frame (z the approach, ±y the
+/// closing axis, origin at the finger base).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hand {
     /// Thickness of a finger along the closing axis (GPD: `finger_width`).
     pub finger_width: f64,
-    /// From the outside of one finger to the outside of the other, open (GPD: `hand_outer_diameter`).
+    /// Distance between the outer sides of the open fingers (GPD: `hand_outer_diameter`).
     pub outer_diameter: f64,
     /// Length of the fingers (GPD: `hand_depth`).
     pub depth: f64,
-    /// Breadth of the fingers along x, half of it to each side (GPD: `hand_height`).
+    /// Breadth of the fingers along x, centred on 0 (GPD: `hand_height`).
     pub height: f64,
-    /// The palm's box, smallest and largest coordinates.
+    /// Box of the palm: smallest and largest coordinates.
     pub palm: [[f64; 3]; 2],
 }
 
-/// A measure that no hand has.
+/// A dimension of a hand is invalid.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[error("{field} is {value} m, must be {needed}")]
 pub struct HandError {
-    /// Which: `max_opening`, `finger_depth`, `finger_width`, `finger_breadth` or `palm`.
+    /// Name of the dimension: `max_opening`, `finger_depth`, `finger_width`, `finger_breadth` or `palm`.
     pub field: &'static str,
     /// Its value, metres.
     pub value: f64,
-    /// What it must be.
+    /// Requirement on the value.
     pub needed: &'static str,
 }
 
 impl Hand {
     /// A hand whose fingers open to `max_opening`, are `depth` long, `width` thick along the closing axis and `breadth`
-    /// broad across it; `palm` is the box behind them, smallest and largest coordinates in the grasp frame.
+    /// broad across it. `palm` is the box behind the fingers: smallest and largest coordinates in the grasp frame.
+    /// Metres.
     ///
     /// # Errors
-    /// [`HandError`] names the first measure that cannot be.
+    /// [`HandError`] names the first invalid dimension.
     pub fn new(max_opening: f64, depth: f64, width: f64, breadth: f64, palm: [[f64; 3]; 2]) -> Result<Self, HandError> {
         const LENGTH: &str = "above 0 and at most 0.5";
         let named = [
@@ -54,10 +55,14 @@ impl Hand {
         for (lower, upper) in palm[0].into_iter().zip(palm[1]) {
             if !(lower.abs() <= 1.0 && upper.abs() <= 1.0) {
                 let value = if lower.abs() <= 1.0 { upper } else { lower };
-                return Err(HandError { field: "palm", value, needed: "within 1 of the finger base" });
+                return Err(HandError { field: "palm", value, needed: "within 1 m of the finger base" });
             }
             if lower > upper {
-                return Err(HandError { field: "palm", value: lower, needed: "no larger than its other corner" });
+                return Err(HandError {
+                    field: "palm",
+                    value: lower,
+                    needed: "at most the same coordinate of the upper corner",
+                });
             }
         }
         if palm[1][2] >= depth {
@@ -66,7 +71,7 @@ impl Hand {
         Ok(Self { finger_width: width, outer_diameter: max_opening + 2.0 * width, depth, height: breadth, palm })
     }
 
-    /// The Panda hand, its boxes those of VGN's URDF.
+    /// The Panda hand, with the boxes of VGN's URDF.
     pub const PANDA: Self = Self {
         finger_width: 0.0264,
         outer_diameter: MAX_OPENING + 2.0 * 0.0264,
@@ -75,18 +80,18 @@ impl Hand {
         palm: [[-0.0316, -0.10, -0.088], [0.0316, 0.10, 0.004]],
     };
 
-    /// The Panda hand with GPD's fingers, which open to [`MAX_OPENING`] too. GPD's own has no palm; one that approaches
-    /// from the side would rest it on the table.
+    /// The Panda hand with the fingers of GPD, which also open to [`MAX_OPENING`]. GPD's hand has no palm, so its
+    /// candidates from the side would put the palm into the table.
     pub const GPD: Self =
         Self { finger_width: 0.015, outer_diameter: 0.11, depth: FINGER_DEPTH, height: 0.02, ..Self::PANDA };
 
-    /// Half of the opening between the fingers.
+    /// Half of the opening between the fingers, metres.
     #[must_use]
     pub fn half_opening(&self) -> f64 {
         self.outer_diameter / 2.0 - self.finger_width
     }
 
-    /// Whether a point of the grasp frame is in the way of a finger that comes along the approach.
+    /// Whether a finger hits a point of the grasp frame on an approach from any distance.
     #[must_use]
     pub fn finger_meets(&self, point: &Point3<f64>) -> bool {
         point.x.abs() <= self.height / 2.0
@@ -94,8 +99,7 @@ impl Hand {
             && point.z <= self.depth
     }
 
-    /// Whether a point of the grasp frame is in the way of the open hand that comes `from` metres back along the
-    /// approach.
+    /// Whether the open hand hits a point of the grasp frame on an approach from `from` metres back.
     #[must_use]
     pub fn meets(&self, point: &Point3<f64>, from: f64) -> bool {
         let at_fingers = point.x.abs() <= self.height / 2.0
@@ -107,7 +111,7 @@ impl Hand {
                 && (lower[2] - from..=upper[2]).contains(&point.z)
     }
 
-    /// Whether a ball around a point of the grasp frame may hold something that the hand [meets](Self::meets).
+    /// Whether a sphere around a point of the grasp frame may contain a point that the hand [meets](Self::meets).
     pub(crate) fn comes_near(&self, centre: &Point3<f64>, from: f64, radius: f64) -> bool {
         let [lower, upper] = self.palm;
         let (x, y) = (self.height / 2.0, self.outer_diameter / 2.0);
@@ -134,7 +138,7 @@ impl Hand {
             && (0.0..=self.depth).contains(&point.z)
     }
 
-    /// Height of the lowest corner of the open hand at `pose`.
+    /// Height of the lowest corner of the open hand at `pose`, metres along z of the frame of `pose`.
     #[must_use]
     pub fn lowest_point(&self, pose: &Isometry3<f64>) -> f64 {
         let (x, y) = (self.height / 2.0, self.outer_diameter / 2.0);
@@ -156,14 +160,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_parts_of_the_hand_are_where_they_should_be() {
+    fn points_are_assigned_to_fingers_palm_and_opening() {
         let hand = Hand::GPD;
         assert!((2.0 * hand.half_opening() - MAX_OPENING).abs() < 1e-12);
         let between = Point3::new(0.0, 0.0, 0.03);
         assert!(hand.holds(&between) && !hand.finger_meets(&between) && !hand.palm_meets(&between));
         for y in [-0.045, 0.045] {
             assert!(hand.finger_meets(&Point3::new(0.005, y, 0.03)));
-            assert!(hand.finger_meets(&Point3::new(0.005, y, -0.1)), "on its way");
+            assert!(hand.finger_meets(&Point3::new(0.005, y, -0.1)), "during the approach");
             assert!(!hand.finger_meets(&Point3::new(0.02, y, 0.03)) && !hand.finger_meets(&Point3::new(0.0, y, 0.06)));
         }
         assert!(hand.palm_meets(&Point3::new(0.03, 0.09, -0.05)));
@@ -172,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn a_hand_has_measures_that_can_be() {
+    fn dimensions_of_a_hand_are_checked() {
         let Hand { finger_width, depth, height, palm, .. } = Hand::PANDA;
         assert_eq!(Hand::new(MAX_OPENING, depth, finger_width, height, palm), Ok(Hand::PANDA));
         let message = |hand: Result<Hand, HandError>| hand.unwrap_err().to_string();
@@ -189,14 +193,14 @@ mod tests {
     }
 
     #[test]
-    fn its_lowest_point_is_a_fingertip_or_the_palm() {
+    fn the_lowest_point_is_a_fingertip_or_the_palm() {
         let hand = Hand::GPD;
         let at = |angle| {
             let rotation = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), angle);
             hand.lowest_point(&Isometry3::from_parts(Translation3::new(0.1, 0.1, 0.5), rotation))
         };
         assert!((at(PI) - 0.45).abs() < 1e-12, "straight down: the fingertips");
-        assert!((at(FRAC_PI_2) - 0.40).abs() < 1e-12, "from the side, closing up and down: the palm");
-        assert!((at(0.0) - (0.5 - 0.088)).abs() < 1e-12, "straight up: the palm's back");
+        assert!((at(FRAC_PI_2) - 0.40).abs() < 1e-12, "from the side, closing vertically: the palm");
+        assert!((at(0.0) - (0.5 - 0.088)).abs() < 1e-12, "straight up: the back of the palm");
     }
 }

@@ -1,11 +1,12 @@
-//! The domain of graspd: volumes, depth fusion, grasps, and the decoding of a network's output into grasps.
+//! The domain types of graspd: volumes, depth fusion, grasps, and decoding of network outputs into grasps.
 //!
-//! Data flows one way: [`DepthImage`] + [`Intrinsics`] → [`Fusion`] → [`Volume`] → a network → [`Maps`] → [`decode`] →
-//! [`Grasp`]s. The classical planners go another way: depth → [`gpd::Cloud`] → [`gpd::Candidate`]s. Nothing here does
-//! I/O, spawns a thread or knows where a volume came from.
+//! Data flow with a network: [`DepthImage`] + [`Intrinsics`] → [`Fusion`] → [`Volume`] → network → [`Maps`] →
+//! [`decode`] → [`Grasp`]s. Data flow of the classical planners: depth → [`gpd::Cloud`] → [`gpd::Candidate`]s →
+//! [`Grasp`]s. This crate does no I/O and starts no threads.
 //!
-//! Conventions, unless a name says otherwise: metres, radians, unit quaternions as x, y, z, w; a pose or transform
-//! `T_a_b` maps points of frame b into frame a; voxel arrays are indexed `[x][y][z]` with z running fastest.
+//! Conventions, unless stated otherwise: lengths in metres, angles in radians, unit quaternions as x, y, z, w; a pose
+//! or transform `T_a_b` maps points of frame b into frame a; voxel arrays are indexed `[x][y][z]` with z varying
+//! fastest.
 
 mod camera;
 mod cloud;
@@ -40,5 +41,5 @@ pub use volume::{Volume, VolumeError};
 /// Edge of the workspace cube, metres (the paper, section "Problem formulation").
 pub const WORKSPACE_SIZE: f64 = 0.3;
 
-/// Voxels along one edge of the volume the paper's networks read.
+/// Voxels along one edge of the volume that the networks of the papers read.
 pub const RESOLUTION: usize = 40;

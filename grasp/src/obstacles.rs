@@ -4,51 +4,51 @@ use nalgebra::{Isometry3, Point3};
 
 use crate::{Hand, Volume, before};
 
-/// How a hand must keep clear of what was observed.
+/// Parameters of the collision check between the open hand and the observed surfaces.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Clearance {
-    /// Open, on its way.
+    /// The open hand.
     pub hand: Hand,
-    /// From so far back along the approach, metres: the pre-grasp.
+    /// Distance from the pre-grasp to the grasp along the approach, metres. The check covers this motion.
     pub from: f64,
-    /// How far behind a surface something is in the way, as a share of the distance at which the field is truncated: a
-    /// noisy surface is not everywhere where it was seen.
+    /// Depth behind a surface at which a voxel becomes an obstacle, as a fraction of the truncation distance. It
+    /// tolerates noise of the observed surface.
     pub behind: f32,
-    /// Height of a table that the hand must not touch either, metres above the volume's bottom.
+    /// Height of the table, metres above the volume's bottom; `None` without a table.
     pub table: Option<f64>,
 }
 
 impl Default for Clearance {
-    /// The Panda hand from the benchmark's pre-grasp on.
+    /// The Panda hand and the pre-grasp distance of the benchmark.
     fn default() -> Self {
         Self { hand: Hand::PANDA, from: 0.05, behind: 0.25, table: None }
     }
 }
 
-/// Voxels along the edge of a block, which is looked at before its points are.
+/// Edge of a block in voxels. Blocks are tested before their points.
 const BLOCK: usize = 4;
 
-/// Points that lie together.
+/// A group of neighbouring points.
 #[derive(Clone, Debug)]
 struct Block {
     centre: Point3<f64>,
-    /// Of a ball around the centre in which all of them lie, metres.
+    /// Radius of a sphere around the centre that contains all points, metres.
     radius: f64,
     points: Vec<Point3<f64>>,
 }
 
-/// What was observed and a hand must not touch: points at or behind the surfaces of a volume, and the table. Space that
-/// nothing observed is taken to be free.
+/// Obstacles for the hand: voxels at or behind the observed surfaces of a volume, and the table. Unobserved space
+/// counts as free.
 #[derive(Clone, Debug)]
 pub struct Obstacles {
     clearance: Clearance,
     blocks: Vec<Block>,
-    /// The volume's.
+    /// Pose of the volume.
     pose: Isometry3<f64>,
 }
 
 impl Obstacles {
-    /// The voxels of `volume` that are in the way.
+    /// The obstacles in `volume`.
     #[must_use]
     pub fn observed(volume: &Volume, clearance: Clearance) -> Self {
         let (n, size) = (volume.resolution(), volume.voxel_size());
@@ -69,17 +69,17 @@ impl Obstacles {
         Self { clearance, blocks: blocks.into_iter().map(block).collect(), pose: *volume.pose() }
     }
 
-    /// Whether the hand meets one of them on its way to `pose`.
+    /// Whether the open hand collides on its way from the pre-grasp to `pose` (frame of the volume's pose).
     #[must_use]
     pub fn meet(&self, pose: &Isometry3<f64>) -> bool {
         let Clearance { hand, from, table, .. } = self.clearance;
-        // It moves straight: nowhere on its way is it lower than at both ends.
+        // The motion is straight, so the lowest point is at one of its ends.
         let low =
             |pose: &Isometry3<f64>| table.is_some_and(|table| hand.lowest_point(&(self.pose.inverse() * pose)) < table);
         if low(pose) || low(&before(pose, from)) {
             return true;
         }
-        // As a matrix: there are thousands of points.
+        // A matrix rotates the thousands of points faster than a quaternion.
         let turn = pose.rotation.inverse().to_rotation_matrix();
         let in_hand = |point: &Point3<f64>| Point3::from(turn * (point.coords - pose.translation.vector));
         let near = |block: &&Block| hand.comes_near(&in_hand(&block.centre), from, block.radius);
@@ -98,8 +98,8 @@ mod tests {
     const N: usize = 40;
     const SIZE: f64 = 0.0075;
 
-    /// A wall whose face is the plane x = 0.15, seen from in front of it to 0.03 m behind, with the volume's corner at
-    /// (1, 2, 3).
+    /// A wall with its face in the plane x = 0.15, observed from in front of it to 0.03 m behind it. The volume's
+    /// corner is at (1, 2, 3).
     fn wall() -> Volume {
         let value = |index: usize| {
             let behind = (index / (N * N)) as f64 + 0.5 - 20.0;
@@ -108,7 +108,7 @@ mod tests {
         Volume::new(N, SIZE, Isometry3::translation(1.0, 2.0, 3.0), (0..N.pow(3)).map(value).collect()).unwrap()
     }
 
-    /// A hand straight down whose fingers close along x, its base at (x, 0.15, z) from the volume's corner.
+    /// A hand that points straight down and closes along x, its base at (x, 0.15, z) from the volume's corner.
     fn down(x: f64, z: f64) -> Isometry3<f64> {
         let turn = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI)
             * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), FRAC_PI_2);
@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn looking_at_blocks_first_changes_nothing() {
+    fn testing_blocks_first_does_not_change_the_result() {
         let obstacles = Obstacles::observed(&wall(), Clearance::default());
         let all = points(&obstacles);
         let Clearance { hand, from, .. } = obstacles.clearance;
@@ -134,42 +134,48 @@ mod tests {
             assert_eq!(obstacles.meet(&pose), meets, "{pose}");
             met += usize::from(meets);
         }
-        assert!((100..300).contains(&met), "some do and some do not: {met}");
+        assert!((100..300).contains(&met), "{met} of 400 poses collide");
     }
 
     #[test]
-    fn a_hand_meets_what_was_seen_and_nothing_else() {
+    fn a_hand_collides_with_observed_surfaces_only() {
         let meet = |clearance: Clearance, x, z| Obstacles::observed(&wall(), clearance).meet(&down(x, z));
         let clearance = Clearance { behind: 0.0, ..Clearance::default() };
-        // From the middle of the palm to its end are 0.1 m.
+        // The palm reaches 0.1 m to each side.
         assert!(!meet(clearance, 0.04, 0.15) && meet(clearance, 0.06, 0.15) && meet(clearance, 0.15, 0.15));
-        // Past the wall's top by the hand's height, but for the way.
+        // Above the wall the hand is free.
         assert!(!meet(clearance, 0.06, 0.36) && !meet(Clearance { from: 0.0, ..clearance }, 0.06, 0.31));
         assert!(meet(Clearance { from: 0.1, ..clearance }, 0.06, 0.15));
     }
 
     #[test]
-    fn a_hand_meets_the_table_at_the_grasp_and_before_it() {
+    fn a_hand_collides_with_the_table_at_the_grasp_and_at_the_pre_grasp() {
         let meet = |table, pose: &Isometry3<f64>| {
             Obstacles::observed(&wall(), Clearance { table, behind: 1.0, ..Clearance::default() }).meet(pose)
         };
-        // Fingertips at 0.1 - 0.0502 above the volume's bottom.
+        // The fingertips are 0.1 - 0.0502 m above the volume's bottom.
         let pose = down(0.04, 0.1);
         assert!(!meet(None, &pose) && !meet(Some(0.049), &pose) && meet(Some(0.051), &pose));
-        // From below: on its way it is lower than in the end.
+        // An approach from below: the pre-grasp is lower than the grasp.
         let up = Isometry3::translation(1.04, 2.15, 3.2);
-        assert!(!meet(Some(0.06), &up) && meet(Some(0.07), &up), "the palm's back, 0.088 below, and 0.05 further back");
+        assert!(
+            !meet(Some(0.06), &up) && meet(Some(0.07), &up),
+            "the back of the palm is 0.088 m below the base, and 0.05 m lower at the pre-grasp"
+        );
     }
 
     #[test]
-    fn what_lies_just_behind_the_surface_may_be_spared() {
+    fn voxels_just_behind_the_surface_can_be_ignored() {
         let count = |behind| {
             let clearance = Clearance { behind, ..Clearance::default() };
             points(&Obstacles::observed(&wall(), clearance)).len() / (N * N)
         };
-        // Voxels 0.5, 1.5, 2.5 and 3.5 behind, of a truncation of four.
+        // The voxels are 0.5, 1.5, 2.5 and 3.5 behind the surface; the truncation distance is 4.
         assert_eq!([0.0, 0.25, 0.5, 0.875, 0.9].map(count), [4, 3, 2, 1, 0]);
         let points = points(&Obstacles::observed(&wall(), Clearance { behind: 0.0, ..Clearance::default() }));
-        assert!(points.iter().all(|p| (1.15..1.18).contains(&p.x) && p.y > 2.0 && p.z > 3.0), "in the volume's frame");
+        assert!(
+            points.iter().all(|p| (1.15..1.18).contains(&p.x) && p.y > 2.0 && p.z > 3.0),
+            "points are in the frame of the volume's pose"
+        );
     }
 }

@@ -2,42 +2,42 @@ use nalgebra::Isometry3;
 
 use crate::{Constraints, DecodeParams, Grasp, Hand, Obstacles, Violation, Volume};
 
-/// How many voxels were dropped, each counted once, under the first reason that applied in this order.
+/// Numbers of dropped voxels, each counted once, under the first reason that applied in this order.
 ///
-/// Together with the grasps they make up every voxel of the volume.
+/// Together with the grasps they add up to all voxels of the volume.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Dropped {
     /// The smoothed quality is below the threshold.
     pub below_threshold: usize,
     /// Inside an object, or too far from any observed surface.
     pub mask: usize,
-    /// The width is not one that is believed.
+    /// The width is outside the valid range.
     pub width: usize,
-    /// At the border of the cube.
+    /// At the border of the volume.
     pub border: usize,
-    /// Outside of the region that was asked for.
+    /// Outside the requested workspace or region.
     pub region: usize,
-    /// From where the hand was not asked to come.
+    /// The approach direction is outside the requested cone.
     pub approach: usize,
-    /// The hand would be too low.
+    /// The hand is below the requested height.
     pub height: usize,
-    /// The open hand would meet what was observed.
+    /// The open hand collides with an observed surface or the table.
     pub collision: usize,
-    /// A better grasp is near.
+    /// Suppressed by a better grasp nearby.
     pub suppressed: usize,
 }
 
-/// What [`decode`](crate::decode) or [`select`] found.
+/// Result of [`decode`](crate::decode) or [`select`].
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Decoded {
-    /// In the volume's frame, best first.
+    /// Grasps in the frame of the volume's pose, best first.
     pub grasps: Vec<Grasp>,
-    /// Why the other voxels hold none.
+    /// Reasons why the other voxels hold no grasp.
     pub dropped: Dropped,
 }
 
 impl Decoded {
-    /// The best of them; the others it suppresses.
+    /// Keeps the best grasp and counts the others as suppressed.
     pub(crate) fn best_alone(mut self) -> Self {
         self.dropped.suppressed += self.grasps.len().saturating_sub(1);
         self.grasps.truncate(1);
@@ -45,7 +45,7 @@ impl Decoded {
     }
 }
 
-/// What is asked of each grasp besides its quality.
+/// Checks on grasps besides their quality.
 pub(crate) struct Selection {
     constraints: Constraints,
     hand: Hand,
@@ -61,7 +61,7 @@ impl Selection {
         }
     }
 
-    /// Whether a grasp is as it was asked for. One that is not is counted.
+    /// Whether a grasp passes all checks. Otherwise counts the reason in `dropped`.
     pub fn keeps(&self, pose: &Isometry3<f64>, dropped: &mut Dropped) -> bool {
         let count = match self.constraints.violation(pose, &self.hand) {
             Some(Violation::Region) => &mut dropped.region,
@@ -75,8 +75,8 @@ impl Selection {
     }
 }
 
-/// Of grasps that a planner without a network found in the frame of `volume`'s pose, best first, those that are asked
-/// for. The hand is theirs already.
+/// Filters the grasps of a planner without a network by threshold, constraints and clearance. `grasps` are in the frame
+/// of `volume`'s pose, best first, and already planned for the hand of `params`.
 #[must_use]
 pub fn select(grasps: &[Grasp], volume: &Volume, params: &DecodeParams) -> Decoded {
     let selection = Selection::new(volume, params);

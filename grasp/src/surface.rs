@@ -4,28 +4,28 @@ use std::collections::HashMap;
 
 use crate::Fusion;
 
-/// A point where the fused field crosses zero, with the outward normal. Cube frame, metres.
+/// A zero crossing of the fused field, with the outward normal. Cube frame, metres.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfacePoint {
-    /// Position.
+    /// Position of the zero crossing.
     pub position: Point3<f64>,
-    /// Unit normal, towards free space.
+    /// Unit normal that points to free space.
     pub normal: Vector3<f64>,
 }
 
-/// The observed surface as triangles, counter-clockwise seen from free space. Cube frame, metres.
+/// The observed surface as a triangle mesh, counter-clockwise as seen from free space. Cube frame, metres.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SurfaceMesh {
-    /// Corners.
+    /// Vertex positions.
     pub vertices: Vec<Point3<f64>>,
-    /// Three indices of corners for each triangle.
+    /// Three vertex indices per triangle.
     pub triangles: Vec<[u32; 3]>,
 }
 
 impl Fusion {
-    /// The observed surface, for people: a corner for each group of eight voxels that the field changes its sign within,
-    /// in the middle of where it does (surface nets: Gibson, "Constrained Elastic Surface Nets", MICCAI 1998). Only where
-    /// both ends of an edge were observed.
+    /// The observed surface as a mesh, for display. Each group of eight voxels with a sign change gets one vertex, at
+    /// the mean of the zero crossings on its edges (surface nets: Gibson, "Constrained Elastic Surface Nets", MICCAI
+    /// 1998). Only edges with two observed ends count.
     #[must_use]
     pub fn mesh(&self) -> SurfaceMesh {
         let n = self.resolution();
@@ -38,7 +38,7 @@ impl Fusion {
                 mesh.vertices.push(vertex);
             }
         }
-        // Each edge between voxels of different signs is surrounded by four groups.
+        // Each edge between voxels of different signs is shared by four groups.
         for at in (0..n.pow(3)).map(|i| [i / (n * n), i / n % n, i % n]) {
             for axis in 0..3 {
                 let [u, v] = [(axis + 1) % 3, (axis + 2) % 3];
@@ -60,7 +60,7 @@ impl Fusion {
                     corners.get(&cell).copied()
                 });
                 let [Some(a), Some(b), Some(c), Some(d)] = around else { continue };
-                // From inside to free space along the axis, or the other way.
+                // The winding depends on the direction of the sign change.
                 let [b, d] = if here < 0.0 { [b, d] } else { [d, b] };
                 mesh.triangles.extend([[a, b, c], [a, c, d]]);
             }
@@ -68,7 +68,7 @@ impl Fusion {
         mesh
     }
 
-    /// The middle of where the field changes its sign along the edges of a group of eight voxels.
+    /// The mean zero crossing on the edges of a group of eight voxels.
     fn corner(&self, cell: [usize; 3]) -> Option<Point3<f64>> {
         let n = self.resolution();
         let at = |corner: usize| [cell[0] + (corner >> 2), cell[1] + (corner >> 1 & 1), cell[2] + (corner & 1)];
@@ -90,7 +90,8 @@ impl Fusion {
         (count > 0.0).then(|| Point3::from(sum / count * self.voxel_size()))
     }
 
-    /// The observed surface: every zero crossing between neighbouring voxels, as in Open3D's `ExtractPointCloud`.
+    /// The observed surface as points: every zero crossing between neighbouring voxels, as in Open3D's
+    /// `ExtractPointCloud`.
     #[must_use]
     pub fn surface(&self) -> Vec<SurfacePoint> {
         let n = self.resolution();
@@ -99,7 +100,7 @@ impl Fusion {
         for index in 0..n.pow(3) {
             let Some(here) = self.near_surface(index) else { continue };
             let cell = [index / (n * n), index / n % n, index % n];
-            // At the faces of the cube there is nothing on one side to take a normal from.
+            // The normal needs neighbours on both sides, which voxels at the faces of the cube do not have.
             let inner = 1..n - 1;
             if !cell.iter().all(|c| inner.contains(c)) {
                 continue;
@@ -122,7 +123,7 @@ impl Fusion {
         points
     }
 
-    /// Central difference of the field over 0.99 of a voxel to each side, as Open3D takes it.
+    /// Central difference of the field over 0.99 voxels to each side, as in Open3D.
     fn normal_at(&self, point: &Point3<f64>) -> Option<Vector3<f64>> {
         let gap = 0.99 * self.voxel_size();
         let mut gradient = Vector3::zeros();
@@ -142,7 +143,7 @@ mod tests {
     use super::*;
     use crate::Volume;
 
-    /// The field of a ball of 0.05 m in the middle of the cube, seen from everywhere.
+    /// The field of a ball of radius 0.05 m in the middle of the cube, observed from all sides.
     fn ball() -> Fusion {
         let (n, size) = (40, 0.0075);
         let value = |i: usize| {
@@ -162,12 +163,12 @@ mod tests {
         let mut area = 0.0;
         for [a, b, c] in triangles.iter().map(corners) {
             let normal = (b - a).cross(&(c - a)) / 2.0;
-            assert!(normal.dot(&(a - centre)) > 0.0, "towards free space");
+            assert!(normal.dot(&(a - centre)) > 0.0, "the normal points to free space");
             area += normal.norm();
         }
         let wanted = 4.0 * std::f64::consts::PI * 0.05 * 0.05;
         assert!((area / wanted - 1.0).abs() < 0.03, "{area} m² of {wanted}");
-        // Closed: twice as many triangles as corners, but for four.
+        // Euler's formula for a closed surface.
         assert_eq!(triangles.len(), 2 * (vertices.len() - 2));
     }
 }

@@ -1,10 +1,11 @@
 use nalgebra::Isometry3;
 use thiserror::Error;
 
-/// A cubic truncated signed distance volume, checked: what a network reads.
+/// A validated truncated signed distance field over a cube: the input of a network.
 ///
-/// Values are in [0, 1]: 0.5 on the surface, above it in front, below it behind, and exactly 0 where nothing was
-/// observed or the surface is further than the truncation (`(tsdf + 1) / 2`, the convention of VGN's released code).
+/// Values are in [0, 1]: 0.5 on the surface, larger in front of it, smaller behind it, and exactly 0 where nothing was
+/// observed or no surface is within the truncation distance. This is `(tsdf + 1) / 2`, the convention of VGN's released
+/// code.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Volume {
     resolution: usize,
@@ -13,21 +14,21 @@ pub struct Volume {
     values: Vec<f32>,
 }
 
-/// Why an array is not a [`Volume`].
+/// Why an array is not a valid [`Volume`].
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum VolumeError {
-    /// The resolution is outside what is supported.
+    /// The resolution is out of range.
     #[error("resolution is {0}, must be from 1 to {max}", max = Volume::MAX_RESOLUTION)]
     Resolution(usize),
-    /// The voxel size is not a positive, finite length.
+    /// The voxel size is not positive or not finite.
     #[error("voxel_size is {0}, must be a positive number of metres")]
     VoxelSize(f64),
     /// The number of values does not fit the resolution.
-    #[error("data holds {got} values, a resolution of {resolution} needs {resolution}³ = {expected}")]
+    #[error("data has {got} values, a resolution of {resolution} needs {resolution}³ = {expected}")]
     Length {
-        /// Number of values that came.
+        /// Number of values received.
         got: usize,
-        /// Number of values needed.
+        /// Number of values required.
         expected: usize,
         /// Voxels along an edge.
         resolution: usize,
@@ -37,7 +38,7 @@ pub enum VolumeError {
     NotFinite {
         /// Flat index, z fastest.
         index: usize,
-        /// The offending value.
+        /// The invalid value.
         value: f32,
     },
     /// A value is outside [0, 1].
@@ -45,16 +46,16 @@ pub enum VolumeError {
     OutOfRange {
         /// Flat index, z fastest.
         index: usize,
-        /// The offending value.
+        /// The invalid value.
         value: f32,
     },
-    /// Nothing was observed.
+    /// All values are 0: no surface was observed.
     #[error("data is all zero: nothing was observed; check the camera's extrinsics and the workspace pose")]
     Empty,
 }
 
 impl VolumeError {
-    /// The field the error is about, as clients name it.
+    /// The name of the invalid field in requests.
     #[must_use]
     pub fn field(&self) -> &'static str {
         match self {
@@ -66,15 +67,15 @@ impl VolumeError {
 }
 
 impl Volume {
-    /// Largest resolution accepted: 256³ f32 values are 64 MiB.
+    /// Largest supported resolution: 256³ f32 values take 64 MiB.
     pub const MAX_RESOLUTION: usize = 256;
 
-    /// Checks and wraps an array of `resolution`³ values indexed `[x][y][z]`, z fastest.
+    /// Validates an array of `resolution`³ values indexed `[x][y][z]`, z fastest.
     ///
-    /// `voxel_size` is in metres; `pose` (`T_frame_volume`) places the volume's corner in the frame its user thinks in.
+    /// `voxel_size` is in metres; `pose` (`T_frame_volume`) places the volume's corner in the caller's frame.
     ///
     /// # Errors
-    /// [`VolumeError`] names the first thing that is wrong, with its value.
+    /// [`VolumeError`] names the first invalid field, with its value.
     pub fn new(
         resolution: usize,
         voxel_size: f64,
@@ -112,7 +113,7 @@ impl Volume {
         self.voxel_size
     }
 
-    /// `T_frame_volume`: the volume's corner in its frame.
+    /// `T_frame_volume`: pose of the volume's corner in the caller's frame.
     #[must_use]
     pub fn pose(&self) -> &Isometry3<f64> {
         &self.pose
@@ -125,7 +126,7 @@ impl Volume {
     }
 }
 
-/// The slow, exact search, run only once the fast check has failed.
+/// Finds the index of the error. Slower than the check, so it runs only after the check has failed.
 fn first_bad_value(values: &[f32]) -> VolumeError {
     for (index, &value) in values.iter().enumerate() {
         if !value.is_finite() {
@@ -147,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn each_fault_is_named_with_its_value() {
+    fn each_error_names_the_field_and_its_value() {
         assert_eq!(volume(0, 0.1, vec![]), Err(VolumeError::Resolution(0)));
         assert_eq!(volume(257, 0.1, vec![]), Err(VolumeError::Resolution(257)));
         assert_eq!(volume(2, -0.1, vec![0.5; 8]), Err(VolumeError::VoxelSize(-0.1)));

@@ -1,4 +1,4 @@
-//! Fusion against Open3D and decoding against SciPy, on stored values that `fixtures/generate.py` made.
+//! Compares fusion with Open3D and decoding with SciPy, on stored values from `fixtures/generate.py`.
 
 use std::fs::File;
 use std::io::BufReader;
@@ -37,7 +37,7 @@ fn fusion_agrees_with_open3d() {
     let (fusion, mut archive) = fused();
     let expected: Vec<f32> = load(&mut archive, "values");
     let differences: Vec<f32> = fusion.values().iter().zip(&expected).map(|(a, b)| (a - b).abs()).collect();
-    // A voxel that projects onto the very edge between two pixels may fall to either side: Open3D adds up steps.
+    // A voxel that projects onto the edge between two pixels may be assigned to either: Open3D accumulates steps.
     let on_an_edge = differences.iter().filter(|&&d| d > 1e-4).count();
     println!("{on_an_edge} of {} voxels differ by more than 1e-4", differences.len());
     assert!(on_an_edge <= differences.len() / 1000, "{on_an_edge} voxels differ");
@@ -50,7 +50,7 @@ fn the_surface_agrees_with_open3d() {
     let normals: Vec<f64> = load(&mut archive, "normals");
     let surface = fusion.surface();
     let count = points.len() / 3;
-    assert!(surface.len().abs_diff(count) <= count / 100, "{} points, Open3D finds {count}", surface.len());
+    assert!(surface.len().abs_diff(count) <= count / 100, "{} points instead of {count}", surface.len());
     let mut far = 0;
     for (p, n) in points.chunks(3).zip(normals.chunks(3)) {
         let (p, n) = (Point3::new(p[0], p[1], p[2]), Vector3::new(n[0], n[1], n[2]));

@@ -9,16 +9,17 @@ use crate::graph::{Builder, Conv};
 use crate::metadata::{PREFIX, PROVENANCE};
 use crate::onnx::{AttributeProto, ModelProto, StringStringEntryProto};
 
-/// The classifier's input: f32 `[batch, CHANNELS, IMAGE_SIZE, IMAGE_SIZE]` in [0, 1].
+/// Input of the classifier: f32 `[batch, CHANNELS, IMAGE_SIZE, IMAGE_SIZE]` in [0, 1].
 pub const INPUT: &str = "images";
 
-/// Its output: f32 `[batch, 2]`, the logits of a failure and of a success.
+/// Output of the classifier: f32 `[batch, 2]`, the logits of failure and of success.
 pub const OUTPUT: &str = "scores";
 
-/// Units of the dense layer. GPD has 500, a file of 14 MB.
+/// Units of the dense layer. GPD uses 500, which gives a file of 14 MB.
 const DENSE: usize = 64;
 
-/// Two convolutions of 20 and 50 channels with a kernel of 5, each halved by the maximum; a dense layer; two logits.
+/// Creates a classifier with random weights: two convolutions with 20 and 50 channels and kernels of 5, each followed
+/// by max pooling by 2; a dense layer; two logits.
 #[must_use]
 pub fn gpd(seed: u64) -> ModelProto {
     let mut builder = Builder::new("gpd", seed);
@@ -42,13 +43,13 @@ pub fn gpd(seed: u64) -> ModelProto {
     model
 }
 
-/// The greatest of every 2 × 2 pixels.
+/// Max pooling over 2 × 2 pixels.
 fn halve(b: &mut Builder, x: &str) -> String {
     let attributes = vec![AttributeProto::ints("kernel_shape", &[2; 2]), AttributeProto::ints("strides", &[2; 2])];
     b.node("MaxPool", &[x], attributes)
 }
 
-/// Replaces what the file says of itself: `graspd.name`, `graspd.version` and `graspd.provenance.…`.
+/// Replaces the metadata of the file: `graspd.name`, `graspd.version` and `graspd.provenance.…`.
 pub fn describe(model: &mut ModelProto, name: &str, version: &str, provenance: &BTreeMap<String, String>) {
     model.metadata_props.retain(|property| !property.key().starts_with(PREFIX));
     let mut put = |key: &str, value: &str| {

@@ -1,7 +1,7 @@
-//! A small builder of ONNX graphs.
+//! A builder of ONNX graphs.
 //!
-//! Every floating-point initialiser is a parameter, to be learnt; constants are `Constant` nodes. The trainer relies
-//! on that difference.
+//! Every floating-point initialiser is a trainable parameter; constants are `Constant` nodes. The trainer relies on
+//! this distinction.
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -11,15 +11,15 @@ use crate::onnx::{
     AttributeProto, Dimension, GraphProto, ModelProto, NodeProto, OperatorSetIdProto, TensorProto, ValueInfoProto,
 };
 
-/// Opset 17 is the oldest that has `LayerNormalization`; every ONNX Runtime and OpenVINO in use takes it.
+/// Opset 17 is the oldest with `LayerNormalization`. All current versions of ONNX Runtime and OpenVINO support it.
 const OPSET: i64 = 17;
-/// The file format that came with opset 17.
+/// The file format version of opset 17.
 const IR_VERSION: i64 = 8;
 
-/// How a parameter starts.
+/// Initialisation of a parameter.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Init {
-    /// All the same.
+    /// A constant value.
     Constant(f32),
     /// PyTorch's default for convolutions and linear layers: uniform in ±1/√`fan_in` (Kaiming-uniform with a = √5).
     FanIn(usize),
@@ -27,14 +27,14 @@ pub(crate) enum Init {
     Normal(f32),
 }
 
-/// A graph being built; values are known by their names.
+/// A graph under construction. Values are identified by their names.
 pub(crate) struct Builder {
     graph: GraphProto,
     rng: ChaCha8Rng,
 }
 
 impl Builder {
-    /// An empty graph; `seed` decides every random parameter.
+    /// An empty graph; `seed` determines all random parameters.
     pub fn new(name: &str, seed: u64) -> Self {
         let graph = GraphProto { name: Some(name.to_owned()), ..GraphProto::default() };
         Self { graph, rng: ChaCha8Rng::seed_from_u64(seed) }
@@ -46,16 +46,16 @@ impl Builder {
         name.to_owned()
     }
 
-    /// Declares an output of shape `[batch, dims…]`: `value` under that name.
+    /// Declares an output of shape `[batch, dims…]` and renames `value` to it.
     pub fn output(&mut self, name: &str, value: &str, dims: &[usize]) {
-        // The node that computes it takes the name, unless another node reads it too, which no network here does.
+        // Only the producing node is renamed: no network here reads an output in another node.
         for output in self.graph.node.iter_mut().flat_map(|node| &mut node.output).filter(|o| *o == value) {
             name.clone_into(output);
         }
         self.graph.output.push(batched(name, dims));
     }
 
-    /// A parameter.
+    /// Adds a trainable parameter.
     pub fn parameter(&mut self, name: &str, dims: &[usize], init: Init) -> String {
         let count = dims.iter().product();
         let values: Vec<f32> = match init {
@@ -76,7 +76,7 @@ impl Builder {
         from.sample_iter(&mut self.rng).take(count).collect()
     }
 
-    /// A constant list of whole numbers.
+    /// A constant list of integers.
     pub fn whole(&mut self, values: &[i64]) -> String {
         self.constant(TensorProto::from_i64("", &[values.len() as i64], values))
     }
@@ -123,12 +123,12 @@ impl Builder {
         output
     }
 
-    /// A convolution of volumes that keeps the size, divided by its stride.
+    /// A 3D convolution with padding: the size is divided by the stride.
     pub fn conv(&mut self, name: &str, x: &str, conv: Conv) -> String {
         self.convolution::<3>(name, x, conv, (conv.kernel as i64 - 1) / 2)
     }
 
-    /// A convolution of images without padding: the size falls by `kernel` - 1.
+    /// A 2D convolution without padding: the size decreases by `kernel` - 1.
     pub fn conv_2d(&mut self, name: &str, x: &str, conv: Conv) -> String {
         self.convolution::<2>(name, x, conv, 0)
     }
@@ -151,16 +151,16 @@ impl Builder {
         }
     }
 
-    /// Doubles the size: a transposed convolution with kernel 2, stride 2, no bias.
+    /// Doubles the size with a transposed convolution of kernel 2 and stride 2, without bias.
     pub fn conv_transpose(&mut self, name: &str, x: &str, inputs: usize, outputs: usize) -> String {
-        // PyTorch takes the fan-in of a transposed convolution from its output channels.
+        // PyTorch computes the fan-in of a transposed convolution from its output channels.
         let init = Init::FanIn(outputs * 8);
         let weight = self.parameter(&format!("{name}.weight"), &[inputs, outputs, 2, 2, 2], init);
         let attributes = vec![AttributeProto::ints("kernel_shape", &[2; 3]), AttributeProto::ints("strides", &[2; 3])];
         self.node("ConvTranspose", &[x, &weight], attributes)
     }
 
-    /// A linear layer over the last dimension; the weight is stored `[inputs, outputs]`.
+    /// A linear layer over the last dimension. The weight has the shape `[inputs, outputs]`.
     pub fn linear(&mut self, name: &str, x: &str, inputs: usize, outputs: usize, bias: bool) -> String {
         let weight = self.parameter(&format!("{name}.weight"), &[inputs, outputs], Init::FanIn(inputs));
         let product = self.node("MatMul", &[x, &weight], vec![]);
@@ -171,7 +171,7 @@ impl Builder {
         self.node("Add", &[&product, &bias], vec![])
     }
 
-    /// The finished file.
+    /// The finished model.
     pub fn finish(self) -> ModelProto {
         ModelProto {
             ir_version: Some(IR_VERSION),
@@ -184,14 +184,14 @@ impl Builder {
     }
 }
 
-/// The sizes of a convolution with a kernel of equal edges.
+/// Sizes of a convolution with a cubic or square kernel.
 #[derive(Clone, Copy)]
 pub(crate) struct Conv {
     /// Input channels.
     pub inputs: usize,
     /// Output channels.
     pub outputs: usize,
-    /// Edge of the kernel, odd, or equal to the stride.
+    /// Edge of the kernel: odd, or equal to the stride.
     pub kernel: usize,
     /// Stride along each axis.
     pub stride: usize,

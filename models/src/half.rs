@@ -1,6 +1,6 @@
-//! Weights stored as f16, half the file: what computes stays f32, for each is cast as the model is loaded.
+//! Weights stored as f16, which halves the file. Computation stays f32: each weight is cast when the model is loaded.
 //!
-//! ONNX Runtime folds the casts once, so that such a model runs as fast as the other.
+//! ONNX Runtime folds the casts when it loads the model, so the speed is the same.
 
 use std::collections::{HashMap, HashSet};
 
@@ -8,19 +8,19 @@ use half::f16;
 
 use crate::onnx::{AttributeProto, DataType, GraphProto, ModelProto, NodeProto, TensorError, TensorProto};
 
-/// What the name of a weight ends with where it is stored as f16.
+/// Suffix of the names of weights that are stored as f16.
 const SUFFIX: &str = ".f16";
 
-/// Smaller ones, such as biases and the scales of norms, are left as they are.
+/// Smallest number of elements to convert. Smaller tensors, such as biases and norm scales, stay f32.
 const SMALLEST: usize = 1024;
 
-/// The greatest of f16.
+/// Largest finite f16.
 const LARGEST: f32 = 65504.0;
 
-/// The model with its weights stored as f16. One with a value that f16 does not hold stays f32.
+/// The model with its weights stored as f16. Weights with values beyond the range of f16 stay f32.
 ///
 /// # Errors
-/// [`TensorError`] names a weight whose values cannot be read.
+/// [`TensorError`] names the weight that cannot be read.
 pub fn with_half_weights(model: &ModelProto) -> Result<ModelProto, TensorError> {
     let mut model = model.clone();
     let Some(graph) = &mut model.graph else { return Ok(model) };
@@ -51,10 +51,10 @@ pub fn with_half_weights(model: &ModelProto) -> Result<ModelProto, TensorError> 
     Ok(model)
 }
 
-/// The model with those weights as f32 again, as it was but for what f16 rounded.
+/// The inverse of [`with_half_weights`], except for the rounding to f16.
 ///
 /// # Errors
-/// [`TensorError`] names a weight whose values cannot be read.
+/// [`TensorError`] names the weight that cannot be read.
 pub fn with_full_weights(model: &ModelProto) -> Result<ModelProto, TensorError> {
     let mut model = model.clone();
     let Some(graph) = &mut model.graph else { return Ok(model) };
@@ -70,7 +70,7 @@ pub fn with_full_weights(model: &ModelProto) -> Result<ModelProto, TensorError> 
     Ok(model)
 }
 
-/// The casts of weights stored as f16: from the stored name to the other.
+/// The casts of f16 weights: stored name → name of the f32 weight.
 fn casts(graph: &GraphProto) -> HashMap<String, String> {
     let halves: HashSet<&str> = graph
         .initializer

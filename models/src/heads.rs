@@ -1,4 +1,4 @@
-//! What every network here ends in (the paper, section "Grasping Heads"; the layers are VGN's).
+//! The output heads of every network (the paper, section "Grasping Heads"; the layers are VGN's).
 
 use std::iter;
 
@@ -6,23 +6,24 @@ use crate::graph::{Builder, Conv};
 use crate::onnx::{AttributeProto, ModelProto, NodeProto, TensorProto};
 use crate::{INPUT, OUTPUTS};
 
-/// The name of the heads' convolution.
+/// Name of the heads' convolution.
 pub(crate) const HEADS: &str = "heads";
 
-/// What a network regresses of a grasp's orientation. Its output is a quaternion either way.
+/// The regressed representation of a grasp's orientation. The output is a quaternion with both.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Orientation {
-    /// The four numbers of a quaternion, as in VGN and in the paper. A hand turned by 180° is the same hand, and so are
-    /// q and −q; no continuous choice of q covers all orientations, and near every jump the network answers in between.
+    /// The four components of a quaternion, as in VGN and in the paper. q, −q and the hand rotated by 180° are
+    /// equivalent, so there is no continuous choice of q for all orientations, and predictions near a discontinuity are
+    /// interpolated.
     #[default]
     Quaternion,
-    /// The direction of the approach, and of the line along which the fingers close: six numbers that no turn of the hand
-    /// by 180° changes, and that nowhere jump, except for an approach from straight below.
+    /// The approach direction and the closing line of the fingers: six numbers that do not change when the hand is
+    /// rotated by 180°, and that are continuous except for an approach from straight below.
     Axes,
 }
 
 impl Orientation {
-    /// Its name.
+    /// Name in metadata and options.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -31,7 +32,7 @@ impl Orientation {
         }
     }
 
-    /// How many numbers are regressed.
+    /// Number of regressed values.
     fn channels(self) -> usize {
         match self {
             Self::Quaternion => 4,
@@ -39,22 +40,22 @@ impl Orientation {
         }
     }
 
-    /// How many numbers the heads regress for a voxel: with the quality before these, and the width after them.
+    /// Number of values per voxel: the quality, these values, and the width.
     pub(crate) fn outputs(self) -> usize {
         1 + self.channels() + 1
     }
 }
 
-/// Declares the network's input and returns it: the volume, `[batch, 1, N, N, N]`.
+/// Declares the input of a network and returns it: the volume, `[batch, 1, N, N, N]`.
 pub(crate) fn volume(b: &mut Builder, resolution: usize) -> String {
     b.input(INPUT, &[1, resolution, resolution, resolution])
 }
 
-/// Declares the three outputs over `features`, `[batch, channels, N, N, N]`:
-/// quality (sigmoid), rotation (a unit quaternion x y z w) and width (linear, in voxels).
+/// Declares the three outputs on `features`, `[batch, channels, N, N, N]`: quality (sigmoid), rotation (unit quaternion
+/// x, y, z, w) and width (linear, in voxels).
 ///
-/// The 5³ convolutions of all three read the same features, so they are one convolution: the mathematics is the same
-/// and it takes half the time of the whole of VGN.
+/// The 5³ convolutions of all three heads read the same features, so they are merged into one convolution. The result
+/// is the same, and it takes half the time of the whole of VGN.
 pub(crate) fn heads(b: &mut Builder, features: &str, channels: usize, resolution: usize, orientation: Orientation) {
     let outputs = orientation.outputs();
     let all = b.conv(HEADS, features, Conv { inputs: channels, outputs, kernel: 5, stride: 1, bias: true });
@@ -70,8 +71,9 @@ pub(crate) fn heads(b: &mut Builder, features: &str, channels: usize, resolution
     }
 }
 
-/// A network made here, with weights in f32, with a convolution for each of its heads, as VGN and the paper have it: the
-/// same mathematics at the published cost, to compare speeds with. `None` if it was made elsewhere.
+/// Splits the merged convolution of the heads into one convolution per head, as published by VGN and the paper, to
+/// compare speeds. The result is the same at the published cost. `None` if the network was not created by this crate
+/// with f32 weights.
 #[must_use]
 pub fn with_published_heads(model: &ModelProto) -> Option<ModelProto> {
     let mut model = model.clone();
@@ -106,19 +108,21 @@ pub fn with_published_heads(model: &ModelProto) -> Option<ModelProto> {
     Some(model)
 }
 
-/// The quaternion of an approach (−z, x, y), of 2ψ (its cosine, its sine), and of how level the fingers close, none of unit
-/// length yet: the hand points down with its axes along x, −y, −z, is tilted the shortest way until its z is the approach,
-/// and turns by −ψ about it.
+/// Converts three regressed values to a quaternion: the approach direction (−z, x, y); the direction (cos 2ψ, sin 2ψ);
+/// and a weight of level closing. They need not be normalised. The rotation starts with the hand pointing down, its
+/// axes along x, −y, −z. It tilts the hand by the smallest rotation that aligns its z with the approach, and then
+/// rotates it by −ψ about z.
 ///
-/// After an approach from the azimuth α the fingers close level when ψ = α, and upright when ψ = α + 90°. What is level
-/// thus winds twice around (cos 2ψ, sin 2ψ) as an object is walked around once, although it is the same grasp; the last
-/// number, times (x + iy)², which is the level direction as long as the approach is flat, says it once for all azimuths.
+/// For an approach from the azimuth α the fingers close horizontally if ψ = α, and vertically if ψ = α + 90°. A level
+/// grasp therefore winds twice around (cos 2ψ, sin 2ψ) while α makes one turn around an object. The third value,
+/// multiplied by (x + iy)², which is the level direction for a flat approach, represents a level grasp for all azimuths
+/// with one number.
 fn from_axes(b: &mut Builder, axes: &str) -> String {
     let sizes = b.whole(&[3, 2, 1]);
     let [approach, turn, level] = b.nodes("Split", &[axes, &sizes], vec![AttributeProto::int("axis", 1)]);
 
-    // The tilt takes (1, 0, 0) to the approach; half-way between them stands its rotation (1 + approach, normalised).
-    // Times the half turn about x that points the hand down it is the quaternion (a, 0, x, −y).
+    // The tilt maps (1, 0, 0) to the approach; its quaternion is 1 + approach, normalised. Multiplied by the half turn
+    // about x that points the hand down, it is (a, 0, x, −y).
     let approach = normalize(b, &approach);
     let tilt = half_way(b, &approach, 3);
     let [a, x, y] = split(b, &tilt);
@@ -126,7 +130,7 @@ fn from_axes(b: &mut Builder, axes: &str) -> String {
     let direction = level_direction(b, &approach);
     let level = b.node("Mul", &[&direction, &level], vec![]);
     let turn = b.node("Add", &[&turn, &level], vec![]);
-    // Half an angle, and again half of it: the quaternion (0, 0, −s, c) turns by −ψ.
+    // The angle is halved twice: the quaternion (0, 0, −s, c) rotates by −ψ.
     let turn = normalize(b, &turn);
     let turn = half_way(b, &turn, 2);
     let turn = half_way(b, &turn, 2);
@@ -139,7 +143,7 @@ fn from_axes(b: &mut Builder, axes: &str) -> String {
     b.node("Concat", &[&ac, &r#as, &z, &w], vec![AttributeProto::int("axis", 1)])
 }
 
-/// (x + iy)² of an approach (−z, x, y): its real and its imaginary part.
+/// (x + iy)² of an approach (−z, x, y): real and imaginary part.
 fn level_direction(b: &mut Builder, approach: &str) -> String {
     let [_, x, y] = split(b, approach);
     let [minus, plus] = ["Sub", "Add"].map(|op| b.node(op, &[&x, &y], vec![]));
@@ -149,7 +153,7 @@ fn level_direction(b: &mut Builder, approach: &str) -> String {
     b.node("Concat", &[&re, &im], vec![AttributeProto::int("axis", 1)])
 }
 
-/// The unit vector half-way between (1, 0, …) and a unit vector.
+/// The unit vector halfway between (1, 0, …) and a unit vector.
 fn half_way(b: &mut Builder, x: &str, channels: usize) -> String {
     let mut first = vec![0.0; channels];
     first[0] = 1.0;
@@ -158,13 +162,13 @@ fn half_way(b: &mut Builder, x: &str, channels: usize) -> String {
     normalize(b, &sum)
 }
 
-/// The channels one by one.
+/// Splits an array into its channels.
 fn split<const N: usize>(b: &mut Builder, x: &str) -> [String; N] {
     let sizes = b.whole(&[1; N]);
     b.nodes("Split", &[x, &sizes], vec![AttributeProto::int("axis", 1)])
 }
 
-/// Scales to length 1 over the channels; no length below 1e-12 is divided by (PyTorch's `normalize`).
+/// Normalises over the channels, with a smallest divisor of 1e-12 (PyTorch's `normalize`).
 fn normalize(b: &mut Builder, x: &str) -> String {
     let axes = AttributeProto::ints("axes", &[1]);
     let length = b.node("ReduceL2", &[x], vec![axes, AttributeProto::int("keepdims", 1)]);

@@ -1,8 +1,8 @@
-//! The networks of graspd: their definitions as ONNX graphs, the files they are kept in, and ONNX Runtime.
+//! The networks of graspd: their definitions as ONNX graphs, model files with metadata, and ONNX Runtime.
 //!
-//! [`build`] defines a network with random weights; its [`Metadata`] travels inside the file; a [`Store`] is a folder
-//! of such files; a [`Network`] runs one. [`gpd`] defines the classifier of grasp candidates, which a [`Classifier`]
-//! runs.
+//! [`build`] creates a network with random weights. A model file contains its [`Metadata`]. A [`Store`] is a folder of
+//! model files. A [`Network`] runs one of them. [`gpd`] defines the classifier of grasp candidates, which a
+//! [`Classifier`] runs.
 
 pub mod gpd;
 mod graph;
@@ -21,7 +21,7 @@ mod vgn;
 
 pub use half::{with_full_weights, with_half_weights};
 pub use heads::{Orientation, with_published_heads};
-pub use metadata::{Metadata, MetadataError, ValueConvention};
+pub use metadata::{Metadata, MetadataError};
 pub use networks::{Architecture, BuildError, build};
 pub use quantize::{QuantizeError, Range, quantized_activations, with_int8};
 pub use rotation_average::{RotationAverageError, averaged_over_rotations};

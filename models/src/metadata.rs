@@ -7,52 +7,42 @@ use thiserror::Error;
 
 use crate::onnx::{DimensionValue, ModelProto, StringStringEntryProto, ValueInfoProto};
 
-/// What a model file means, kept inside it as properties named `graspd.…`.
+/// Metadata of a model, stored in its file as properties named `graspd.…`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Metadata {
-    /// The name it is asked for by.
+    /// Name of the model in requests.
     pub name: String,
-    /// Its version: numbers separated by dots.
+    /// Version: numbers separated by dots.
     pub version: String,
-    /// Voxels along an edge of the volume it reads.
+    /// Voxels along an edge of its volumes.
     pub resolution: usize,
-    /// Edge of a voxel it was trained for, metres.
+    /// Edge of a voxel in training, metres.
     pub voxel_size: f64,
-    /// What a voxel's value means.
-    pub value_convention: ValueConvention,
-    /// Where in its voxel a grasp stands.
+    /// Position of a grasp in its voxel.
     pub voxel_origin: VoxelOrigin,
-    /// Where the camera stood in training, where it always stood on the same side: degrees about the vertical axis
-    /// through the middle of the volume, from x towards y. `None` for a network that takes any view.
+    /// Azimuth of the camera in training, if it was constant: degrees about the vertical axis through the middle of the
+    /// volume, from x towards y. `None` for a network that accepts any view.
     pub camera_azimuth: Option<f64>,
-    /// Where the weights come from: data, seeds, steps, date and whatever else was noted (`graspd.provenance.…`).
+    /// Origin of the weights: data, seeds, steps, date and other entries (`graspd.provenance.…`).
     pub provenance: BTreeMap<String, String>,
 }
 
-/// What a voxel's value means to a network.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum ValueConvention {
-    /// VGN's: (tsdf + 1) / 2 near an observed surface, 0 elsewhere. What [`grasp::Volume`] holds.
-    #[default]
-    Vgn,
-}
-
-/// Metadata that cannot be.
+/// Invalid metadata.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum MetadataError {
-    /// A property cannot be what it says.
-    #[error("the model's property `graspd.{key}` is `{value}`, it must be {expected}")]
+    /// A property has an invalid value.
+    #[error("the model's property `graspd.{key}` is `{value}`, must be {expected}")]
     Property {
-        /// Which property, without `graspd.`.
+        /// Name of the property without `graspd.`.
         key: &'static str,
         /// Its value.
         value: String,
-        /// What it may be.
+        /// Valid values.
         expected: &'static str,
     },
-    /// No volume has as many voxels as the network reads, by its property or by its input's shape.
+    /// The resolution, from the property or from the shape of the input, is out of range.
     #[error(
-        "the model's resolution is {0}, it must be from 1 to {max}; export it for a volume of at most {max}³ voxels",
+        "the model's resolution is {0}, must be from 1 to {max}; export it for a volume of at most {max}³ voxels",
         max = Volume::MAX_RESOLUTION
     )]
     Resolution(usize),
@@ -62,9 +52,9 @@ pub(crate) const PREFIX: &str = "graspd.";
 pub(crate) const PROVENANCE: &str = "provenance.";
 
 impl Metadata {
-    /// What a file without properties means: VGN's conventions, named after the file.
+    /// Metadata of a file without properties: VGN's conventions, and the file name as the name.
     ///
-    /// `resolution` is that of the input's shape, where it is fixed.
+    /// `resolution` is that of the input's shape, if it is fixed.
     #[must_use]
     pub fn defaults(path: &Path, resolution: Option<usize>) -> Self {
         let resolution = resolution.unwrap_or(RESOLUTION);
@@ -73,17 +63,16 @@ impl Metadata {
             version: "1".to_owned(),
             resolution,
             voxel_size: WORKSPACE_SIZE / resolution as f64,
-            value_convention: ValueConvention::Vgn,
             voxel_origin: VoxelOrigin::Corner,
             camera_azimuth: None,
             provenance: BTreeMap::new(),
         }
     }
 
-    /// The metadata of a model that was read from `path`; what the file does not say has its [default](Self::defaults).
+    /// The metadata of a model read from `path`. Missing properties have their [defaults](Self::defaults).
     ///
     /// # Errors
-    /// [`MetadataError`] names the property that cannot be.
+    /// [`MetadataError`] names the invalid property.
     pub fn of(model: &ModelProto, path: &Path) -> Result<Self, MetadataError> {
         let input = model.graph.as_ref().and_then(|graph| graph.input.first());
         let properties = model.metadata_props.iter().filter_map(|p| Some((p.key.clone()?, p.value.clone()?)));
@@ -109,11 +98,10 @@ impl Metadata {
                     let valid = |&size: &f64| size.is_finite() && size > 0.0;
                     metadata.voxel_size = parse("voxel_size", &value, "a number of metres above 0", valid)?;
                 }
+                // VGN's, the only one there is: (tsdf + 1) / 2 near an observed surface, 0 elsewhere, as in [`grasp::Volume`].
+                "value_convention" if value == "vgn" => {}
                 "value_convention" => {
-                    metadata.value_convention = match value.as_str() {
-                        "vgn" => ValueConvention::Vgn,
-                        _ => return Err(MetadataError::Property { key: "value_convention", value, expected: "`vgn`" }),
-                    }
+                    return Err(MetadataError::Property { key: "value_convention", value, expected: "`vgn`" });
                 }
                 "voxel_origin" => {
                     metadata.voxel_origin = match value.as_str() {
@@ -140,14 +128,13 @@ impl Metadata {
         Ok(metadata)
     }
 
-    /// Replaces the model's `graspd.…` properties by these, keeping the others.
+    /// Replaces the `graspd.…` properties of the model by these and keeps the others.
     pub fn write_to(&self, model: &mut ModelProto) {
         model.metadata_props.retain(|p| !p.key().starts_with(PREFIX));
         let mut put = |key: &str, value: String| {
             let key = Some(format!("{PREFIX}{key}"));
             model.metadata_props.push(StringStringEntryProto { key, value: Some(value) });
         };
-        let ValueConvention::Vgn = self.value_convention;
         put("name", self.name.clone());
         put("version", self.version.clone());
         put("resolution", self.resolution.to_string());
@@ -162,14 +149,14 @@ impl Metadata {
         }
     }
 
-    /// VGN's decoding for this network: its voxel origin, everything else as in [`DecodeParams::default`].
+    /// The decoding parameters of this network: its voxel origin, otherwise [`DecodeParams::default`].
     #[must_use]
     pub fn decode_params(&self) -> DecodeParams {
         DecodeParams { origin: self.voxel_origin, ..DecodeParams::default() }
     }
 }
 
-/// The resolution an input of shape `[batch, 1, N, N, N]` fixes.
+/// The resolution in the shape of an input `[batch, 1, N, N, N]`, if it is fixed.
 fn fixed_resolution(input: &ValueInfoProto) -> Option<usize> {
     let dims = &input.tensor_type()?.shape.as_ref()?.dim;
     match dims.last()?.value {
@@ -178,7 +165,7 @@ fn fixed_resolution(input: &ValueInfoProto) -> Option<usize> {
     }
 }
 
-/// Refused when the file is read, lest a server starts with a network that no request can fit.
+/// Checked when the file is read, so that a server does not start with a network that no request can use.
 fn check_resolution(resolution: usize) -> Result<usize, MetadataError> {
     if (1..=Volume::MAX_RESOLUTION).contains(&resolution) {
         Ok(resolution)

@@ -5,50 +5,50 @@ use std::str::FromStr;
 use grasp::{RESOLUTION, Volume, VoxelOrigin};
 use thiserror::Error;
 
+use crate::Metadata;
 use crate::heads::Orientation;
 use crate::onnx::ModelProto;
 use crate::transformer::{Config, transformer};
 use crate::vgn::vgn;
-use crate::{Metadata, ValueConvention};
 
-/// The networks that are defined here.
+/// The network architectures of this crate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Architecture {
-    /// VGN, convolutional, 0.3 M parameters.
+    /// VGN: convolutional, 0.3 M parameters.
     Vgn,
-    /// The paper's transformer, 87 M parameters.
+    /// The paper's transformer: 87 M parameters.
     Transformer,
     /// The paper's transformer with smaller sizes.
     TransformerSmall,
 }
 
-/// Why no network was built.
+/// Why a network cannot be built.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum BuildError {
-    /// The name is no network's.
-    #[error("there is no network `{0}`; there are vgn, transformer and transformer-small")]
+    /// The name is not an architecture.
+    #[error("network `{0}` not found; available: vgn, transformer, transformer-small")]
     Name(String),
-    /// The network cannot read volumes of this size.
+    /// The resolution is not supported.
     #[error(
-        "resolution is {0}, a network halves it three times, so it must be a multiple of 8, from 8 to {max}",
+        "resolution is {0}, must be a multiple of 8 from 8 to {max}, because networks halve it three times",
         max = Volume::MAX_RESOLUTION
     )]
     Resolution(usize),
 }
 
-/// The network of that name with random weights, reading the paper's 40³ volumes.
+/// The network `name` with random weights for volumes of 40³ voxels, as in the paper.
 ///
 /// # Errors
-/// [`BuildError::Name`] when there is none.
+/// [`BuildError::Name`] if the name is unknown.
 pub fn build(name: &str, seed: u64) -> Result<ModelProto, BuildError> {
     name.parse::<Architecture>()?.build(RESOLUTION, seed)
 }
 
 impl Architecture {
-    /// All of them.
+    /// All architectures.
     pub const ALL: [Self; 3] = [Self::Vgn, Self::Transformer, Self::TransformerSmall];
 
-    /// Its name.
+    /// Name in options and metadata.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -58,7 +58,7 @@ impl Architecture {
         }
     }
 
-    /// The network with random weights for volumes of `resolution`³ voxels, as published: it regresses quaternions. The
+    /// The network with random weights for volumes of `resolution`³ voxels, regressing quaternions as published. The
     /// same seed gives the same bytes.
     ///
     /// # Errors
@@ -67,10 +67,10 @@ impl Architecture {
         self.build_with(resolution, Orientation::Quaternion, seed)
     }
 
-    /// The same, with a choice of what it regresses.
+    /// Like [`build`](Self::build), with a choice of the regressed orientation.
     ///
     /// # Errors
-    /// [`BuildError::Resolution`] unless the resolution is a multiple of 8 that a [`Volume`] can have.
+    /// [`BuildError::Resolution`] if the resolution is not a multiple of 8 or too large for a [`Volume`].
     pub fn build_with(self, resolution: usize, orientation: Orientation, seed: u64) -> Result<ModelProto, BuildError> {
         if !(8..=Volume::MAX_RESOLUTION).contains(&resolution) || !resolution.is_multiple_of(8) {
             return Err(BuildError::Resolution(resolution));
@@ -90,7 +90,6 @@ impl Architecture {
             version: "1".to_owned(),
             resolution,
             voxel_size: grasp::WORKSPACE_SIZE / resolution as f64,
-            value_convention: ValueConvention::Vgn,
             voxel_origin: VoxelOrigin::Corner,
             camera_azimuth: None,
             provenance: BTreeMap::from(provenance.map(|(key, value)| (key.to_owned(), value))),

@@ -1,9 +1,9 @@
-//! Weights and activations as 8-bit integers, in ONNX's QDQ form: what an integer kernel is to read passes through a
-//! `QuantizeLinear` and a `DequantizeLinear`, which a runtime fuses with the operator between them, or executes as they
-//! stand where it has no such kernel.
+//! Quantises weights and activations to 8-bit integers in ONNX's QDQ form: the inputs of integer kernels pass through
+//! `QuantizeLinear` and `DequantizeLinear`. A runtime fuses these nodes with the operator, or executes them separately
+//! if it has no integer kernel.
 //!
-//! The scheme is that of ONNX Runtime's static quantisation: weights symmetric with a scale for each output channel,
-//! activations u8 with one scale and a zero point, taken from the range that was observed on real volumes.
+//! The scheme follows ONNX Runtime's static quantisation: weights are symmetric with one scale per output channel;
+//! activations are u8 with one scale and zero point, from the range observed on real volumes.
 
 use std::collections::{HashMap, HashSet};
 
@@ -11,27 +11,27 @@ use thiserror::Error;
 
 use crate::onnx::{AttributeProto, GraphProto, ModelProto, NodeProto, TensorError, TensorProto};
 
-/// The values that an activation takes.
+/// Range of the values of an activation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Range {
-    /// The least.
+    /// Smallest value.
     pub low: f32,
-    /// The greatest.
+    /// Largest value.
     pub high: f32,
 }
 
 /// Why a network cannot be quantised.
 #[derive(Debug, Error)]
 pub enum QuantizeError {
-    /// An activation was not observed.
-    #[error("the range of `{0}` is not known")]
+    /// The range of an activation is missing.
+    #[error("no range was observed for the activation `{0}`")]
     Range(String),
     /// A weight cannot be read.
     #[error(transparent)]
     Tensor(#[from] TensorError),
 }
 
-/// A product with a weight, which integers can compute.
+/// A product with a weight that can be computed with integers.
 struct Product<'a> {
     node: &'a NodeProto,
     weight: &'a TensorProto,
@@ -53,11 +53,11 @@ pub fn quantized_activations(model: &ModelProto) -> Vec<String> {
     names
 }
 
-/// The model with the products of its f32 weights computed in 8 bits. The last, from which the outputs come, stay f32:
-/// their rounding would reach the grasps directly.
+/// The model with its products with f32 weights computed in 8 bits. The last products before the outputs stay f32,
+/// because their rounding would directly affect the grasps.
 ///
 /// # Errors
-/// [`QuantizeError`] names the activation whose range is missing, or the weight that cannot be read.
+/// [`QuantizeError`] names the activation without a range, or the weight that cannot be read.
 pub fn with_int8(model: &ModelProto, ranges: &HashMap<String, Range>) -> Result<ModelProto, QuantizeError> {
     let Some(graph) = &model.graph else { return Ok(model.clone()) };
     let products = products(graph);
@@ -69,7 +69,7 @@ pub fn with_int8(model: &ModelProto, ranges: &HashMap<String, Range>) -> Result<
         activations.insert(name, range.scale());
     }
 
-    // Weights that only products read are no longer needed as f32.
+    // Weights and biases of products are replaced.
     let replaced: HashSet<&str> =
         products.iter().flat_map(|product| &product.node.input[1..]).map(String::as_str).collect();
     let kept = |tensor: &&TensorProto| !replaced.contains(tensor.name());
@@ -84,7 +84,7 @@ pub fn with_int8(model: &ModelProto, ranges: &HashMap<String, Range>) -> Result<
         let mut node = node.clone();
         let product = products.iter().find(|product| product.node.output == node.output);
         for input in &mut node.input {
-            // An integer kernel reads quantised values; whatever else reads them gets what that kernel would.
+            // Other readers of a quantised activation get the same rounded values as the integer kernels.
             if activations.contains_key(input.as_str()) {
                 *input = dequantized(input);
             }
@@ -124,7 +124,7 @@ fn products<'a>(graph: &'a GraphProto) -> Vec<Product<'a>> {
             ("ConvTranspose", _) | ("MatMul", 2) => 1,
             _ => return None,
         };
-        // Weight and bias are replaced: they must be stored, and no other node may read them.
+        // Weight and bias are replaced, so they must be stored and have no other reader.
         let stored = |name: &str| name.is_empty() || (weights.contains_key(name) && readers[name] == 1);
         let own = node.input[1..].iter().all(|name| stored(name));
         (own && weight.is_float() && !last.contains(node.output[0].as_str())).then_some(Product { node, weight, axis })
@@ -132,7 +132,7 @@ fn products<'a>(graph: &'a GraphProto) -> Vec<Product<'a>> {
     graph.node.iter().filter_map(product).collect()
 }
 
-/// The outputs of those products that no other product follows.
+/// The outputs of the products that no other product follows.
 fn last(graph: &GraphProto) -> HashSet<&str> {
     let (mut followed, mut last) = (HashSet::new(), HashSet::new());
     for node in graph.node.iter().rev() {
@@ -153,7 +153,8 @@ impl Product<'_> {
         &self.node.input[0]
     }
 
-    /// What it is quantised after: a ReLU, if that alone follows, which then costs nothing.
+    /// The value that is quantised as its output: that of a ReLU if it is the only reader, because quantisation then
+    /// includes the ReLU at no cost.
     fn output<'a>(&'a self, graph: &'a GraphProto) -> &'a str {
         let output = self.node.output[0].as_str();
         let mut readers = graph.node.iter().filter(|node| node.input.iter().any(|input| input == output));
@@ -165,7 +166,7 @@ impl Product<'_> {
 }
 
 impl Range {
-    /// The scale and zero point of u8 over this range and 0, which must be exact: it pads.
+    /// Scale and zero point of u8 for this range extended to 0. Padding needs an exact 0.
     fn scale(self) -> (f32, u8) {
         let (low, high) = (self.low.min(0.0), self.high.max(0.0));
         let scale = if high > low { (high - low) / 255.0 } else { 1.0 };
@@ -177,7 +178,7 @@ fn dequantized(name: &str) -> String {
     format!("{name}.dequantized")
 }
 
-/// An activation through u8 and back.
+/// Adds nodes that quantise an activation to u8 and dequantise it.
 fn quantize_activation(graph: &mut GraphProto, name: &str, (scale, zero): (f32, u8)) {
     let (scale_name, zero_name, quantized) =
         (format!("{name}.scale"), format!("{name}.zero"), format!("{name}.quantized"));
@@ -187,7 +188,7 @@ fn quantize_activation(graph: &mut GraphProto, name: &str, (scale, zero): (f32, 
     graph.node.push(node("DequantizeLinear", [&quantized, &scale_name, &zero_name], &dequantized(name), None));
 }
 
-/// The product's weight as i8; returns the scales of its output channels.
+/// Quantises the product's weight to i8 and returns the scales of its output channels.
 fn quantize_weight(graph: &mut GraphProto, product: &Product) -> Result<Vec<f32>, TensorError> {
     let Product { weight, axis, .. } = *product;
     let values = weight.to_f32()?;
@@ -216,7 +217,7 @@ fn quantize_weight(graph: &mut GraphProto, product: &Product) -> Result<Vec<f32>
     Ok(scales)
 }
 
-/// A bias as i32 in the units of the product's sums, as integer kernels take it.
+/// Quantises a bias to i32 in the units of the product's sums, as integer kernels require.
 fn quantize_bias(
     graph: &mut GraphProto,
     from: &GraphProto,

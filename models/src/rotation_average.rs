@@ -1,39 +1,40 @@
-//! A network asked four times about a volume, turned about the vertical by 0, 90, 180 and 270°, as one batch; the answers,
-//! turned back, are averaged. It is the same network, of which four times the work makes a better one, and whose answer
-//! turns exactly with the volume.
+//! Rotation averaging: the network runs on a volume rotated about the vertical by 0, 90, 180 and 270°, as one batch,
+//! and the results are rotated back and averaged. It uses the same weights, takes four times the computation and is
+//! more accurate, and its output rotates exactly with the volume.
 //!
-//! What is averaged is what the last convolution regresses, before it becomes probabilities and unit lengths: there a sum
-//! is a vote. Only networks that regress axes can be averaged so, a sum of quaternions means nothing.
+//! The average is taken over the output of the last convolution, before sigmoid and normalisation. Only networks that
+//! regress axes can be averaged, because a mean of quaternions is meaningless.
 
 use thiserror::Error;
 
 use crate::heads::{HEADS, Orientation};
 use crate::onnx::{AttributeProto, GraphProto, ModelProto, NodeProto, TensorProto};
 
-/// Why a network cannot be averaged over turns.
+/// Why a network cannot be averaged over rotations.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum RotationAverageError {
-    /// It was not made here, or regresses quaternions.
+    /// It was not created by this crate, or it regresses quaternions.
     #[error(
-        "only networks that regress axes can be averaged over turns: those of `grasp-train train --orientation axes`"
+        "only networks that regress axes can be averaged over rotations; train one with `grasp-train train \
+         --orientation axes`"
     )]
     NotAxes,
-    /// It is averaged already.
-    #[error("the network is averaged over turns already")]
+    /// It is already averaged.
+    #[error("the network is already averaged over rotations")]
     Already,
 }
 
-/// The axes of an array `[batch, channel, x, y, z]` that a turn about the vertical changes.
+/// The axes of an array `[batch, channel, x, y, z]` that a rotation about the vertical changes.
 const X: i64 = 2;
 const Y: i64 = 3;
 
-/// What the four turns of the volume are called, together.
+/// Name of the batch of the four rotated volumes.
 const TURNED: &str = "turns.all";
 
-/// The model, averaged over the four quarter turns of its volume.
+/// Returns the model averaged over the four quarter rotations of its volume.
 ///
 /// # Errors
-/// [`RotationAverageError`] when it is not one of those that can be.
+/// [`RotationAverageError`] if the network cannot be averaged.
 pub fn averaged_over_rotations(model: &ModelProto) -> Result<ModelProto, RotationAverageError> {
     let graph = model.graph.as_ref().ok_or(RotationAverageError::NotAxes)?;
     let input = graph.input.first().ok_or(RotationAverageError::NotAxes)?.name();
@@ -63,7 +64,7 @@ pub fn averaged_over_rotations(model: &ModelProto) -> Result<ModelProto, Rotatio
     Ok(ModelProto { graph: Some(graph), ..model.clone() })
 }
 
-/// The convolution of the heads, if it regresses axes.
+/// The convolution of the heads, if the network regresses axes.
 fn heads(graph: &GraphProto) -> Option<&NodeProto> {
     let name = format!("{HEADS}.weight");
     let weight = graph.initializer.iter().find(|tensor| tensor.name() == name)?;
@@ -71,7 +72,7 @@ fn heads(graph: &GraphProto) -> Option<&NodeProto> {
     graph.node.iter().find(|node| node.input.get(1) == Some(&name)).filter(|_| regresses_axes)
 }
 
-/// Nodes in the order in which they are executed.
+/// Nodes in execution order.
 #[derive(Default)]
 struct Nodes {
     list: Vec<NodeProto>,
@@ -99,7 +100,7 @@ impl Nodes {
         self.node("Constant", &[], vec![AttributeProto::tensor("value", value)])
     }
 
-    /// The array after so many quarter turns: what was at (x, y) is then at (−y, x), counted from the middle.
+    /// The array rotated by `turns` quarter turns: the value at (x, y), counted from the middle, moves to (−y, x).
     fn turn(&mut self, array: &str, turns: usize) -> String {
         match turns % 4 {
             0 => array.to_owned(),
@@ -109,7 +110,7 @@ impl Nodes {
         }
     }
 
-    /// x and y exchanged, then the order along one of them reversed.
+    /// Exchanges x and y, then reverses one of them.
     fn transposed(&mut self, array: &str, reversed: i64) -> String {
         let order = AttributeProto::ints("perm", &[0, 1, Y, X, 4]);
         let exchanged = self.node("Transpose", &[array.to_owned()], vec![order]);
@@ -124,7 +125,7 @@ impl Nodes {
         self.node("Slice", &inputs, vec![])
     }
 
-    /// The mean of the four answers, each turned back.
+    /// The mean of the four results, each rotated back.
     fn average(&mut self, answers: &str, mean: &str) {
         let parts: [String; 4] = std::array::from_fn(|turns| format!("turns.answer.{turns}"));
         let names = parts.each_ref().map(String::as_str);
@@ -133,10 +134,10 @@ impl Nodes {
         self.push("Sum", &back, &[mean], vec![]);
     }
 
-    /// A quarter of what was answered after so many turns, as seen without them.
+    /// A quarter of the result for the volume after `turns` quarter turns, rotated back.
     ///
-    /// The channels are the quality; the approach (−z, x, y), whose x and y turn with the volume; cosine and sine of 2ψ,
-    /// twice the angle of the volume; what is level, which does not turn; and the width.
+    /// The channels are the quality; the approach (−z, x, y), whose x and y rotate with the volume; cosine and sine of
+    /// 2ψ, which rotate by twice the angle; the weight of level closing, which does not change; and the width.
     fn turn_back(&mut self, answer: &str, turns: usize) -> String {
         let in_place = self.turn(answer, 4 - turns);
         let (order, [x, y], double) = match turns {

@@ -1,4 +1,4 @@
-//! ONNX Runtime: the only module that touches it.
+//! Binding to ONNX Runtime. No other module uses it.
 
 mod agreement;
 mod backend;
@@ -28,133 +28,133 @@ pub use plan::batch_sizes;
 use backend::Machine;
 use plan::{Model, Outputs, Plan};
 
-/// The input every network has: `[batch, 1, N, N, N]`.
+/// The input of every network: `[batch, 1, N, N, N]`.
 pub const INPUT: &str = "tsdf";
 
-/// The outputs every network has, with their channels: `[batch, channels, N, N, N]`.
+/// The outputs of every network with their channels: `[batch, channels, N, N, N]`.
 pub const OUTPUTS: [(&str, usize); 3] = [("quality", 1), ("rotation", 4), ("width", 1)];
 
-/// What was loaded.
+/// The loaded ONNX Runtime.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RuntimeInfo {
-    /// The shared library, as it was asked for.
+    /// Path of the shared library, as configured.
     pub library: PathBuf,
-    /// Its version, such as `1.24.1`.
+    /// Version, such as `1.24.1`.
     pub version: String,
 }
 
-/// Why ONNX Runtime is not there or did not compute.
+/// Why ONNX Runtime cannot be loaded or failed.
 #[derive(Clone, Debug, Error)]
 pub enum RuntimeError {
-    /// The shared library could not be loaded, or is too old.
+    /// The shared library cannot be loaded or is too old.
     #[error(
-        "ONNX Runtime (at least 1.{}): {reason}; get it with `python3 deploy/native.py onnxruntime` and set \
-         ORT_DYLIB_PATH to the path that prints",
+        "ONNX Runtime (at least 1.{}): {reason}; download it with `python3 deploy/native.py onnxruntime` and \
+         set ORT_DYLIB_PATH to the printed path",
         ort::MINOR_VERSION
     )]
     Library {
         /// What is wrong.
         reason: String,
     },
-    /// A batch without a volume.
+    /// The batch has no volume.
     #[error("the batch is empty")]
     EmptyBatch,
-    /// A batch with more volumes than was said when the network was loaded.
-    #[error("a batch of {got}, the network was loaded for batches of at most {largest}")]
+    /// The batch is larger than `max_batch` of the options.
+    #[error("the batch has {got} volumes, the network was loaded for at most {largest}")]
     Batch {
         /// Volumes in the batch.
         got: usize,
-        /// The most that are taken.
+        /// Largest batch.
         largest: usize,
     },
-    /// A volume is of another size than the network reads.
-    #[error("resolution is {got}, the model `{model}` reads {expected}")]
+    /// A volume has another resolution than the network reads.
+    #[error("resolution is {got}, the model `{model}` needs {expected}")]
     Resolution {
-        /// The volume's.
+        /// Resolution of the volume.
         got: usize,
-        /// The network's.
+        /// Resolution of the network.
         expected: usize,
-        /// The network.
+        /// Name of the model.
         model: String,
     },
     /// ONNX Runtime failed.
     #[error("the model `{model}`: {reason}")]
     Run {
-        /// The network.
+        /// Name of the model.
         model: String,
-        /// What it said.
+        /// The error of ONNX Runtime.
         reason: String,
     },
 }
 
-/// Why a file is not a network that can be served.
+/// Why a model file cannot be loaded.
 #[derive(Debug, Error)]
 #[error("{}: {reason}", path.display())]
 pub struct LoadError {
     /// The file.
     pub path: PathBuf,
-    /// What is wrong with it.
+    /// What is wrong with the file.
     pub reason: LoadReason,
 }
 
-/// What is wrong with a file.
+/// What is wrong with a model file.
 #[derive(Debug, Error)]
 pub enum LoadReason {
-    /// ONNX Runtime is not there.
+    /// ONNX Runtime cannot be loaded or failed.
     #[error(transparent)]
     Runtime(#[from] RuntimeError),
-    /// The file system refused.
+    /// The file cannot be read.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// Another file took its place since the folder was read.
-    #[error("has the SHA-256 {found} now, it had {expected} when the folder was read; load it anew")]
+    /// The file has changed since the folder was read.
+    #[error("SHA-256 is {found}, was {expected} when the folder was read; read the folder again")]
     Changed {
-        /// When the folder was read.
+        /// SHA-256 when the folder was read.
         expected: String,
-        /// Now.
+        /// Current SHA-256.
         found: String,
     },
-    /// ONNX Runtime refuses it.
-    #[error("ONNX Runtime refuses it: {0}; if the file was cut short, fetch or export it again")]
+    /// ONNX Runtime rejects the model.
+    #[error("ONNX Runtime rejects the model: {0}; if the file is truncated, download or export it again")]
     Model(String),
-    /// Its weights are elsewhere.
+    /// The weights are in another file.
     #[error(
-        "keeps its weights in a second file, `{0}`; save both as one, with `onnx.save_model(onnx.load(path), path, \
+        "the weights are in a second file, `{0}`; save both as one file with `onnx.save_model(onnx.load(path), path, \
          save_as_external_data=False)`"
     )]
     Split(String),
-    /// It cannot be run as was asked.
+    /// The requested backend cannot run it.
     #[error(transparent)]
     Backend(#[from] BackendError),
-    /// The way it was asked to be run gives other answers.
-    #[error("with {backend} it gives other answers: {what}")]
+    /// The requested backend computes other outputs than the reference.
+    #[error("with {backend} the outputs differ from the reference: {what}; use another provider or precision")]
     Disagrees {
-        /// Which way.
+        /// The backend.
         backend: Backend,
-        /// What differs.
+        /// The difference.
         what: String,
     },
-    /// Its metadata cannot be.
+    /// The metadata is invalid.
     #[error(transparent)]
     Metadata(#[from] MetadataError),
-    /// Its inputs or outputs are not those of a grasp network.
+    /// The inputs or outputs are not those of a grasp network.
     #[error(
-        "{what}; a grasp network reads `tsdf` f32 [batch, 1, N, N, N] and gives `quality`, `rotation` and `width`, \
-         f32 [batch, 1, 4 and 1, N, N, N]"
+        "{what}; a grasp network has the input `tsdf`, f32 [batch, 1, N, N, N], and the outputs `quality`, `rotation` \
+         and `width`, f32 [batch, 1, 4 and 1, N, N, N]"
     )]
     Signature {
-        /// What is different.
+        /// The difference.
         what: String,
     },
-    /// Its inputs or outputs are not those of a classifier of grasp candidates.
+    /// The inputs or outputs are not those of a classifier of grasp candidates.
     #[error(
-        "{what}; a classifier reads `images` f32 [batch, {c}, {n}, {n}] and gives `scores` f32 [batch, 2], as \
-         `grasp-train classify` writes it",
+        "{what}; a classifier has the input `images`, f32 [batch, {c}, {n}, {n}], and the output `scores`, \
+         f32 [batch, 2]; train one with `grasp-train classify`",
         c = grasp::gpd::CHANNELS,
         n = grasp::gpd::IMAGE_SIZE
     )]
     Classifier {
-        /// What is different.
+        /// The difference.
         what: String,
     },
 }
@@ -165,19 +165,19 @@ impl From<ort::Error> for LoadReason {
     }
 }
 
-/// Loads ONNX Runtime, once: the library that `ORT_DYLIB_PATH` names, or else the system's.
+/// Loads ONNX Runtime once: the library that `ORT_DYLIB_PATH` names, or else the system's library.
 ///
-/// Telemetry, which official builds switch on, is switched off; its log goes to `tracing`.
+/// Disables telemetry, which official builds enable. ONNX Runtime logs to `tracing`.
 ///
 /// # Errors
-/// [`RuntimeError::Library`] says what is wrong with the library and how to get one.
+/// [`RuntimeError::Library`] describes the problem and how to install the library.
 pub fn init() -> Result<&'static RuntimeInfo, RuntimeError> {
     Ok(&runtime()?.info)
 }
 
 struct Runtime {
     info: RuntimeInfo,
-    /// Never dropped: threads of ONNX Runtime may outlive `main`.
+    /// Never dropped, because threads of ONNX Runtime may outlive `main`.
     environment: Environment,
 }
 
@@ -197,50 +197,51 @@ fn load_library() -> Result<Runtime, RuntimeError> {
     Ok(Runtime { info, environment })
 }
 
-/// The version, from the branch it was built from; a build from elsewhere is known by its file name alone.
+/// The version, parsed from the release branch in the build info. Other builds are identified by the file name of the
+/// library.
 fn version(build: &str, library: &Path) -> String {
     let branch = build.split("git-branch=rel-").nth(1).and_then(|rest| rest.split(',').next());
     branch.map_or_else(|| library.file_name().unwrap_or_default().to_string_lossy().into_owned(), str::to_owned)
 }
 
-/// How a network is run.
+/// Options for running a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Options {
-    /// Threads one inference is spread over.
+    /// Number of threads of one inference.
     pub threads: usize,
-    /// By what; `None` takes the fastest that this machine and this library have, and that gives the network's answers.
+    /// Execution provider; `None` selects the fastest available one whose outputs match the reference.
     pub provider: Option<Provider>,
-    /// In which numbers; `None` takes the fastest.
+    /// Precision; `None` selects the fastest.
     pub precision: Option<Precision>,
-    /// The largest batch that it will be asked about. Some providers need to know.
+    /// Largest batch. Some providers prepare for each batch size.
     pub max_batch: usize,
 }
 
 impl Default for Options {
-    /// One thread of ONNX Runtime's own kernels, one volume at a time: the same numbers everywhere.
+    /// One thread of ONNX Runtime's CPU kernels, one volume at a time. The results are the same on every machine.
     fn default() -> Self {
         Self { threads: 1, provider: Some(Provider::Cpu), precision: None, max_batch: 1 }
     }
 }
 
 impl Options {
-    /// The fastest there is.
+    /// The fastest available provider and precision.
     #[must_use]
     pub fn auto(threads: usize) -> Self {
         Self { threads, provider: None, ..Self::default() }
     }
 }
 
-/// A network ready to run, with its buffers. A server thread owns one each: ONNX Runtime does not promise that one
-/// session can be run from several threads at a time.
+/// A loaded network with its buffers. Each session thread owns one, because ONNX Runtime does not guarantee that one
+/// session can run on several threads at the same time.
 pub struct Network {
     metadata: Metadata,
     backend: Backend,
-    /// The smallest batch first.
+    /// By batch size, smallest first.
     plans: Vec<Plan>,
 }
 
-/// The maps of a batch, in the network's buffers until it runs again.
+/// The output maps of a batch. They borrow the network's buffers, which the next run overwrites.
 pub struct Output<'a> {
     outputs: &'a Outputs,
     batch: usize,
@@ -248,20 +249,19 @@ pub struct Output<'a> {
 }
 
 impl Network {
-    /// Loads a file, and checks that its inputs and outputs are those of a grasp network, and that the way it is run
-    /// gives the answers that ONNX Runtime's own kernels give in f32.
+    /// Loads a file. Checks that its inputs and outputs are those of a grasp network, and that its outputs on this
+    /// backend match those of ONNX Runtime's CPU kernels in f32.
     ///
     /// # Errors
-    /// [`LoadError`] names the file and what is wrong with it.
+    /// [`LoadError`] names the file and the problem.
     pub fn load(path: &Path, options: &Options) -> Result<Self, LoadError> {
         Self::try_load(path, options).map_err(|reason| LoadError { path: path.to_owned(), reason })
     }
 
-    /// Loads an entry of a store several times, for as many threads that run it at the same time. What runs the first
-    /// runs the others.
+    /// Loads an entry of a store `count` times, once per thread. All copies use the same backend.
     ///
     /// # Errors
-    /// [`LoadError`] names the file and what is wrong with it, if it is not the one that the store read, too.
+    /// [`LoadError`] names the file and the problem, including a file that changed since the store read it.
     pub fn load_several(entry: &Entry, options: &Options, count: usize) -> Result<Vec<Self>, LoadError> {
         let load = || {
             runtime()?;
@@ -276,12 +276,12 @@ impl Network {
     }
 
     fn try_load(path: &Path, options: &Options) -> Result<Self, LoadReason> {
-        // Before anything is asked of it.
+        // Fails early if ONNX Runtime cannot be loaded.
         runtime()?;
         Self::choose(&Model::new(path, &fs::read(path)?, options), options)
     }
 
-    /// The first way to run it, of those that may, that gives its answers.
+    /// Loads with the first allowed backend whose outputs match the reference.
     fn choose(model: &Model, options: &Options) -> Result<Self, LoadReason> {
         if let Some(file) = &model.weights_elsewhere {
             return Err(LoadReason::Split(file.clone()));
@@ -291,13 +291,16 @@ impl Network {
         for &backend in others {
             match Self::checked(model, backend, options.max_batch) {
                 Ok(network) => return Ok(network),
-                Err(error) => warn!(model = %model.path.display(), %backend, %error, "passed over"),
+                Err(error) => {
+                    warn!(model = %model.path.display(), %backend, %error, "backend rejected, trying the next one")
+                }
             }
         }
         Self::checked(model, last, options.max_batch)
     }
 
-    /// Compared with the file as it is, run by ONNX Runtime's own kernels, unless this is just that.
+    /// Loads with one backend and compares the outputs with the reference: the unmodified file on the CPU kernels. No
+    /// comparison if this backend is the reference.
     fn checked(model: &Model, backend: Backend, max_batch: usize) -> Result<Self, LoadReason> {
         let mut network = Self::with(model, backend, max_batch)?;
         let original = model.original();
@@ -316,19 +319,19 @@ impl Network {
         let resolution = check_signature(session.inputs(), session.outputs(), plans[0].size().map(|size| size as i64))?;
         let metadata = read_metadata(session, Metadata::defaults(model.path, resolution))?;
         if let Some(resolution) = resolution.filter(|&resolution| resolution != metadata.resolution) {
-            let what = format!("its metadata says N = {}, its input has N = {resolution}", metadata.resolution);
+            let what = format!("N is {} in the metadata and {resolution} in the input", metadata.resolution);
             return Err(LoadReason::Signature { what });
         }
         Ok(Self { metadata, backend, plans })
     }
 
-    /// What runs it.
+    /// The backend in use.
     #[must_use]
     pub fn backend(&self) -> Backend {
         self.backend
     }
 
-    /// What the file says of itself.
+    /// The metadata of the file.
     #[must_use]
     pub fn metadata(&self) -> &Metadata {
         &self.metadata
@@ -337,16 +340,16 @@ impl Network {
     /// Runs the network over a batch of volumes of its resolution.
     ///
     /// # Errors
-    /// [`RuntimeError`] when the batch does not fit the network, or ONNX Runtime fails.
+    /// [`RuntimeError`] if the batch does not fit the network or ONNX Runtime fails.
     pub fn infer(&mut self, batch: &[&Volume]) -> Result<Output<'_>, RuntimeError> {
         self.fill(batch)?;
         self.run(batch.len())
     }
 
-    /// Copies a batch to where ONNX Runtime reads it.
+    /// Copies a batch into the input buffer.
     ///
     /// # Errors
-    /// [`RuntimeError`] when the batch does not fit the network.
+    /// [`RuntimeError`] if the batch does not fit the network.
     pub fn fill(&mut self, batch: &[&Volume]) -> Result<(), RuntimeError> {
         if batch.is_empty() {
             return Err(RuntimeError::EmptyBatch);
@@ -368,11 +371,11 @@ impl Network {
         Ok(())
     }
 
-    /// Runs the network over what [`fill`](Self::fill) last left for this batch size, zeros at first: inference
-    /// without the copy, which is what a bare `session.run` is measured by.
+    /// Runs the network on the content of the input buffer for this batch size, as left by [`fill`](Self::fill);
+    /// initially zeros. This is inference without the copy, comparable to a bare `session.run`.
     ///
     /// # Errors
-    /// [`RuntimeError`] when no batch of this size can be run, or ONNX Runtime fails.
+    /// [`RuntimeError`] if this batch size is not supported or ONNX Runtime fails.
     pub fn run(&mut self, batch: usize) -> Result<Output<'_>, RuntimeError> {
         let Self { metadata, plans, .. } = self;
         let resolution = metadata.resolution;
@@ -381,7 +384,7 @@ impl Network {
     }
 }
 
-/// The first that takes a batch of this size.
+/// The smallest plan for a batch of this size.
 fn plan(plans: &mut [Plan], batch: usize) -> Result<&mut Plan, RuntimeError> {
     if batch == 0 {
         return Err(RuntimeError::EmptyBatch);
@@ -391,13 +394,13 @@ fn plan(plans: &mut [Plan], batch: usize) -> Result<&mut Plan, RuntimeError> {
 }
 
 impl Output<'_> {
-    /// How many volumes the batch had.
+    /// Number of volumes in the batch.
     #[must_use]
     pub fn len(&self) -> usize {
         self.batch
     }
 
-    /// Never: an empty batch is refused.
+    /// Always false: empty batches are rejected.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.batch == 0
@@ -406,7 +409,7 @@ impl Output<'_> {
     /// The maps of one volume of the batch.
     ///
     /// # Panics
-    /// When `index` is not below [`len`](Self::len).
+    /// If `index` is not below [`len`](Self::len).
     #[must_use]
     pub fn maps(&self, index: usize) -> Maps<'_> {
         let [quality, rotation, width] = [0, 1, 2].map(|output: usize| {
@@ -421,10 +424,11 @@ fn refusal(model: &str, error: &ort::Error) -> RuntimeError {
     RuntimeError::Run { model: model.to_owned(), reason: error.to_string() }
 }
 
-/// The resolution, if the input's shape fixes it. The batch must be free, but for the size that it was fixed to here.
+/// Checks inputs and outputs. Returns the resolution if the shape of the input fixes it. The batch dimension must be
+/// dynamic, or `fixed` if this code has fixed it.
 fn check_signature(inputs: &[Outlet], outputs: &[Outlet], fixed: Option<i64>) -> Result<Option<usize>, LoadReason> {
     if let Some(extra) = inputs.iter().find(|input| input.name() != INPUT) {
-        return Err(LoadReason::Signature { what: format!("it has an input `{}`", extra.name()) });
+        return Err(LoadReason::Signature { what: format!("unexpected input `{}`", extra.name()) });
     }
     let resolution = check_tensor(inputs, INPUT, 1, fixed)?;
     for (name, channels) in OUTPUTS {
@@ -441,7 +445,7 @@ fn check_tensor(
 ) -> Result<Option<usize>, LoadReason> {
     let wrong = |what: String| Err(LoadReason::Signature { what });
     let outlet = outlets.iter().find(|outlet| outlet.name() == name);
-    let Some(dtype) = outlet.map(Outlet::dtype) else { return wrong(format!("it has no `{name}`")) };
+    let Some(dtype) = outlet.map(Outlet::dtype) else { return wrong(format!("`{name}` is missing")) };
     let fits = |dim: i64, size: usize| dim < 0 || dim == size as i64;
     match dtype.tensor_shape().map(|shape| &**shape) {
         Some(&[batch, c, x, y, z])
@@ -453,9 +457,9 @@ fn check_tensor(
             Ok([x, y, z].into_iter().find_map(|edge| usize::try_from(edge).ok()))
         }
         Some(&[batch, _, _, _, _]) if batch >= 0 && Some(batch) != fixed => {
-            wrong(format!("its `{name}` takes batches of {batch} alone; export it with a dynamic first axis"))
+            wrong(format!("`{name}` has a fixed batch size of {batch}, export it with a dynamic first axis"))
         }
-        _ => wrong(format!("its `{name}` is {dtype}")),
+        _ => wrong(format!("`{name}` is {dtype}")),
     }
 }
 

@@ -9,7 +9,7 @@ use crate::onnx::{FileError, ModelProto};
 use crate::runtime::LoadReason;
 use crate::{Metadata, MetadataError};
 
-/// The models in a folder, as their files describe themselves. Nothing is loaded into ONNX Runtime yet.
+/// The models in a folder with their metadata. Nothing is loaded into ONNX Runtime.
 #[derive(Clone, Debug)]
 pub struct Store {
     directory: PathBuf,
@@ -21,53 +21,53 @@ pub struct Store {
 pub struct Entry {
     /// The file.
     pub path: PathBuf,
-    /// What it says of itself.
+    /// Metadata of the file.
     pub metadata: Metadata,
     /// SHA-256 of the file, in hexadecimal.
     pub sha256: String,
 }
 
-/// Why a folder of models cannot be served.
+/// Why a folder of models cannot be used.
 #[derive(Debug, Error)]
 pub enum StoreError {
     /// The folder cannot be read.
     #[error("{}: {source}", path.display())]
     Io {
-        /// Which.
+        /// The folder.
         path: PathBuf,
-        /// What the file system said.
+        /// The error of the file system.
         source: io::Error,
     },
     /// The folder holds no model.
-    #[error("{}: holds no .onnx file; train one with `grasp-train` or put one there", .0.display())]
+    #[error("{}: holds no .onnx file; train one with `grasp-train` or copy one there", .0.display())]
     Empty(PathBuf),
-    /// Files in it cannot be used: all of them are listed, so that they are mended in one go.
+    /// Files in the folder are invalid. The error lists all of them.
     #[error("{}: these files cannot be served:{}", directory.display(), lines(files))]
     Files {
         /// The folder.
         directory: PathBuf,
-        /// What is wrong with which.
+        /// The errors of the files.
         files: Vec<EntryError>,
     },
     /// No model has that name and version.
-    #[error("{}: no model `{wanted}`; there are {available}", directory.display())]
+    #[error("{}: model `{wanted}` not found; available: {available}", directory.display())]
     Unknown {
         /// The folder.
         directory: PathBuf,
-        /// What was asked for, as `name` or `name version`.
+        /// The requested model, as `name` or `name version`.
         wanted: String,
-        /// What there is.
+        /// The available models.
         available: String,
     },
 }
 
-/// Why a file of a folder cannot be served.
+/// Why a model file is rejected.
 #[derive(Debug, Error)]
 pub enum EntryError {
-    /// It cannot be read, or is no ONNX model.
+    /// The file cannot be read or is not an ONNX model.
     #[error(transparent)]
     File(#[from] FileError),
-    /// Its metadata cannot be.
+    /// The metadata is invalid.
     #[error("{}: {source}", path.display())]
     Metadata {
         /// The file.
@@ -75,7 +75,7 @@ pub enum EntryError {
         /// What is wrong.
         source: MetadataError,
     },
-    /// It claims to be the same model as another.
+    /// Another file has the same name and version.
     #[error("{} and {} are both `{name}` version {version}; remove one", first.display(), second.display())]
     Duplicate {
         /// One file.
@@ -101,17 +101,17 @@ impl EntryError {
     }
 }
 
-/// A line each, indented below the heading.
+/// One indented line per error.
 fn lines(files: &[EntryError]) -> String {
     files.iter().map(|error| format!("\n    {error}")).collect()
 }
 
-/// What a folder holds: the models that its files describe, and the files that describe none.
+/// Result of reading a folder: valid and rejected files.
 #[derive(Debug)]
 pub struct Scan {
-    /// By name, the versions of a name from the oldest to the newest.
+    /// Models sorted by name, and the versions of a name from oldest to newest.
     pub entries: Vec<Entry>,
-    /// What is wrong with each other file.
+    /// Errors of the rejected files.
     pub rejected: Vec<EntryError>,
 }
 
@@ -119,7 +119,7 @@ impl Scan {
     /// Reads every `*.onnx` file of a folder.
     ///
     /// # Errors
-    /// [`StoreError`] when the folder cannot be read, or holds no such file.
+    /// [`StoreError`] if the folder cannot be read or holds no such file.
     pub fn read(directory: &Path) -> Result<Self, StoreError> {
         let files = fs::read_dir(directory).and_then(|files| files.map(|file| Ok(file?.path())).collect());
         let mut paths: Vec<PathBuf> = files.map_err(|source| StoreError::Io { path: directory.to_owned(), source })?;
@@ -127,7 +127,7 @@ impl Scan {
         if paths.is_empty() {
             return Err(StoreError::Empty(directory.to_owned()));
         }
-        // A folder has no order of its own.
+        // Directory listings have no defined order.
         paths.sort();
         let (mut entries, mut rejected) = (Vec::<Entry>::new(), Vec::new());
         for path in paths {
@@ -154,10 +154,10 @@ impl Scan {
 }
 
 impl Store {
-    /// Reads every `*.onnx` file of a folder, each of which must be a model.
+    /// Reads every `*.onnx` file of a folder. Each must be a valid model.
     ///
     /// # Errors
-    /// [`StoreError`] names every file that cannot be used, or the folder if there is none.
+    /// [`StoreError`] names every invalid file, or the folder if it cannot be read.
     pub fn open(directory: &Path) -> Result<Self, StoreError> {
         let Scan { entries, rejected } = Scan::read(directory)?;
         let directory = directory.to_owned();
@@ -174,16 +174,16 @@ impl Store {
         &self.directory
     }
 
-    /// All models, by name, the versions of a name from the oldest to the newest.
+    /// All models sorted by name, and the versions of a name from oldest to newest.
     #[must_use]
     pub fn entries(&self) -> &[Entry] {
         &self.entries
     }
 
-    /// The model of that name: the version asked for, or the newest.
+    /// The model with this name, in the given version or the newest.
     ///
     /// # Errors
-    /// [`StoreError::Unknown`] says what there is instead.
+    /// [`StoreError::Unknown`] lists the available models.
     pub fn get(&self, name: &str, version: Option<&str>) -> Result<&Entry, StoreError> {
         let fits = |metadata: &Metadata| {
             metadata.name == name && version.is_none_or(|version| compare_versions(&metadata.version, version).is_eq())
@@ -203,7 +203,7 @@ impl Store {
 
 impl Entry {
     fn read(path: PathBuf) -> Result<Self, EntryError> {
-        // Once for both, so that the hash is that of the model.
+        // Read once, so that hash and model belong to the same content.
         let bytes = fs::read(&path).map_err(|source| FileError::Io { path: path.clone(), source })?;
         let model =
             ModelProto::from_bytes(&bytes).map_err(|reason| FileError::Decode { path: path.clone(), reason })?;
@@ -214,7 +214,7 @@ impl Entry {
         Ok(Self { path, metadata, sha256: sha256(&bytes) })
     }
 
-    /// The file's bytes, unless they are others by now.
+    /// The content of the file. An error if it changed since the folder was read.
     pub(crate) fn bytes(&self) -> Result<Vec<u8>, LoadReason> {
         let bytes = fs::read(&self.path)?;
         let found = sha256(&bytes);
@@ -225,7 +225,7 @@ impl Entry {
         self.metadata.name.cmp(&other.metadata.name).then_with(|| self.by_version(other))
     }
 
-    /// Which of two versions is the older: 1.9 is older than 1.10, and what is no number older than any.
+    /// Orders two versions: 1.9 is older than 1.10, and non-numeric parts are older than numbers.
     #[must_use]
     pub fn by_version(&self, other: &Self) -> Ordering {
         compare_versions(&self.metadata.version, &other.metadata.version)
@@ -236,7 +236,8 @@ fn sha256(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// Part by part: numbers as numbers, so that 1.10 is newer than 1.9; anything else as text, older than any number.
+/// Compares versions part by part: numbers numerically, so that 1.10 is newer than 1.9; other parts as text, and older
+/// than any number.
 fn compare_versions(a: &str, b: &str) -> Ordering {
     let parts = |version: &str| -> Vec<(Option<u64>, String)> {
         version.split('.').map(|part| (part.parse().ok(), part.to_owned())).collect()

@@ -1,12 +1,12 @@
-//! The paper's network: UNETR (Hatamizadeh et al., WACV 2022) cut to a grasp volume, with VGN's heads.
+//! The paper's network: UNETR (Hatamizadeh et al., WACV 2022) sized for a grasp volume, with VGN's heads.
 //!
-//! Where the paper is silent, layers and initialisation are those of the UNETR code in MONAI.
+//! Where the paper gives no details, layers and initialisation follow MONAI's UNETR.
 
 use crate::graph::{Builder, Conv, Init};
 use crate::heads::{Orientation, heads, volume};
 use crate::onnx::{AttributeProto, ModelProto};
 
-/// Edge of a patch, voxels: the decoder doubles the size three times.
+/// Edge of a patch, voxels. The decoder doubles the size three times.
 const PATCH: usize = 8;
 
 /// ε of both normalisations.
@@ -15,30 +15,30 @@ const EPSILON: f32 = 1e-5;
 /// The sizes of a transformer.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Config {
-    /// K: dimension of a token.
+    /// K: dimension of tokens.
     pub hidden: usize,
-    /// L: transformer blocks.
+    /// L: number of transformer blocks.
     pub layers: usize,
-    /// H: attention heads; divides K.
+    /// H: number of attention heads; must divide K.
     pub heads: usize,
     /// Hidden units of the feed-forward block.
     pub mlp: usize,
-    /// D: dimension of a voxel's features.
+    /// D: number of features per voxel.
     pub features: usize,
-    /// The blocks (counted from 1) whose output is carried over to the decoder: the finer skip, the coarser skip.
+    /// The blocks, counted from 1, whose outputs are skip connections to the decoder: the finer and the coarser one.
     pub skips: [usize; 2],
 }
 
 impl Config {
-    /// The paper's network, 87 M parameters: ViT-B's encoder.
+    /// The paper's network with the encoder of ViT-B, 87 M parameters.
     pub const PAPER: Self = Self { hidden: 768, layers: 12, heads: 12, mlp: 3072, features: 16, skips: [4, 7] };
 
-    /// Small enough to train on a CPU. Most of the time is spent in the decoder's convolutions over all voxels, hence
-    /// half the features; the skips stand at the same fractions of the depth.
+    /// Small enough to train on a CPU. Most of the time goes into the decoder's convolutions at full resolution, so it
+    /// has half the features. The skips are at the same relative depth.
     pub const SMALL: Self = Self { hidden: 192, layers: 6, heads: 6, mlp: 768, features: 8, skips: [2, 4] };
 }
 
-/// The transformer over volumes of `resolution`³ voxels, a multiple of 8.
+/// The transformer for volumes of `resolution`³ voxels, a multiple of 8.
 pub(crate) fn transformer(config: &Config, resolution: usize, orientation: Orientation, seed: u64) -> ModelProto {
     let Config { hidden, features, skips, .. } = *config;
     let mut builder = Builder::new("transformer", seed);
@@ -57,7 +57,7 @@ pub(crate) fn transformer(config: &Config, resolution: usize, orientation: Orien
     let tokens = layer_norm(b, "norm", &tokens, hidden);
     let [fine, coarse] = carried;
 
-    // Each step doubles the size, halves the features and takes in a skip of the same size and features.
+    // Each decoder step doubles the size, halves the features and concatenates a skip of equal size and features.
     let coarse = b.conv_transpose("skip.coarse.0", &coarse, hidden, 4 * features);
     let fine = b.conv_transpose("skip.fine.0", &fine, hidden, 2 * features);
     let fine = b.conv_transpose("skip.fine.1", &fine, 2 * features, 2 * features);
@@ -76,9 +76,10 @@ pub(crate) fn transformer(config: &Config, resolution: usize, orientation: Orien
     builder.finish()
 }
 
-/// The paper, section "Serialization": each patch projected to a token, plus a learnt position. `[batch, M, K]`.
+/// The paper, section "Serialization": projects each patch to a token and adds a learned position embedding. Returns
+/// `[batch, M, K]`.
 fn serialize(b: &mut Builder, volume: &str, hidden: usize, edge: usize) -> String {
-    // A convolution whose stride is its kernel is the linear projection of every patch.
+    // A convolution with stride equal to its kernel is a linear projection of every patch.
     let weight = b.parameter("patch.weight", &[hidden, 1, PATCH, PATCH, PATCH], Init::Normal(0.02));
     let bias = b.parameter("patch.bias", &[hidden], Init::Constant(0.0));
     let patch = PATCH as i64;
@@ -91,8 +92,8 @@ fn serialize(b: &mut Builder, volume: &str, hidden: usize, edge: usize) -> Strin
     b.node("Add", &[&tokens, &position], vec![])
 }
 
-/// The paper, section "Encoding with Transformer Blocks": attention, then a feed-forward network, each after a
-/// normalisation and around a residual connection.
+/// The paper, section "Encoding with Transformer Blocks": attention and a feed-forward network, each with a preceding
+/// normalisation and a residual connection.
 fn block(b: &mut Builder, name: &str, x: &str, config: &Config, tokens: usize) -> String {
     let Config { hidden, mlp, .. } = *config;
     let y = layer_norm(b, &format!("{name}.norm.0"), x, hidden);
@@ -105,7 +106,7 @@ fn block(b: &mut Builder, name: &str, x: &str, config: &Config, tokens: usize) -
     b.node("Add", &[&x, &y], vec![])
 }
 
-/// Multi-head self-attention: softmax(q·k / √(K/H))·v in each head, then one projection.
+/// Multi-head self-attention: softmax(q·k / √(K/H))·v per head, then one projection.
 fn attention(b: &mut Builder, name: &str, x: &str, config: &Config, tokens: usize) -> String {
     let Config { hidden, heads, .. } = *config;
     let size = hidden / heads;
@@ -127,7 +128,7 @@ fn attention(b: &mut Builder, name: &str, x: &str, config: &Config, tokens: usiz
     b.linear(&format!("{name}.out"), &y, hidden, hidden, true)
 }
 
-/// x · Φ(x), exactly. As an operator of its own it came with opset 20 only; runtimes recognise these five nodes.
+/// The exact GELU x · Φ(x). A GELU operator exists only from opset 20; runtimes recognise and fuse these five nodes.
 fn gelu(b: &mut Builder, x: &str) -> String {
     let [root, one, half] = [std::f32::consts::SQRT_2, 1.0, 0.5].map(|value| b.number(value));
     let y = b.node("Div", &[x, &root], vec![]);
@@ -144,14 +145,14 @@ fn layer_norm(b: &mut Builder, name: &str, x: &str, hidden: usize) -> String {
     b.node("LayerNormalization", &[x, &weight, &bias], attributes)
 }
 
-/// Tokens back to where their patches were (`Proj` in the paper): `[batch, K, n, n, n]`.
+/// Rearranges tokens to the grid of their patches (`Proj` in the paper): `[batch, K, n, n, n]`.
 fn volumetric(b: &mut Builder, tokens: &str, hidden: usize, edge: usize) -> String {
     let channels_first = transpose(b, tokens, &[0, 2, 1]);
     let edge = edge as i64;
     reshape(b, &channels_first, &[0, hidden as i64, edge, edge, edge])
 }
 
-/// Two 3³ convolutions with a shortcut; the shortcut is a 1³ convolution where the channels change.
+/// Two 3³ convolutions with a shortcut, which is a 1³ convolution if the number of channels changes.
 fn residual_block(b: &mut Builder, name: &str, x: &str, inputs: usize, outputs: usize) -> String {
     let layer = |inputs, kernel| Conv { inputs, outputs, kernel, stride: 1, bias: false };
     let y = b.conv(&format!("{name}.conv.0"), x, layer(inputs, 3));
@@ -169,7 +170,7 @@ fn residual_block(b: &mut Builder, name: &str, x: &str, inputs: usize, outputs: 
     leaky_relu(b, &sum)
 }
 
-/// Each channel of each volume to mean 0 and variance 1; nothing is learnt.
+/// Normalises each channel of each volume to mean 0 and variance 1, without trainable parameters.
 fn instance_norm(b: &mut Builder, x: &str, channels: usize) -> String {
     let [scale, bias] = [1.0, 0.0].map(|value| b.numbers(&vec![value; channels]));
     b.node("InstanceNormalization", &[x, &scale, &bias], vec![AttributeProto::float("epsilon", EPSILON)])

@@ -1,18 +1,18 @@
-//! A convolution over what was made twice as large by repeating every voxel, computed before it is made larger.
+//! Folds nearest-neighbour upsampling by 2 into the convolution that follows it.
 //!
-//! Of the 5³ voxels that such a convolution reads, many are the same: each output is a sum over 3³ different ones, with
-//! weights that only depend on whether its coordinates are even or odd. So one convolution of 3³ over the small array, with
-//! eight times the channels, computes all of it in a fifth of the multiplications; then the eight are put side by side. The
-//! mathematics is the same. It is done to the graph as a model is loaded, not in the file: what is trained has the weights
-//! as published.
+//! Many of the 5³ voxels that such a convolution reads are equal: each output is a sum over 3³ distinct voxels, with
+//! weights that depend only on the parity of its coordinates. One convolution of 3³ over the small array with eight
+//! times the channels therefore computes the same result with a fifth of the multiplications, and its eight parts are
+//! then interleaved. The graph is changed when a model is loaded and not in the file, so that training uses the
+//! published weights.
 //!
-//! VGN's network is made of this: its heads alone take 70 % of its time otherwise.
+//! In VGN's network the heads alone take 70 % of the time without this.
 
 use std::collections::{HashMap, HashSet};
 
 use crate::onnx::{AttributeProto, DataType, DimensionValue, GraphProto, ModelProto, NodeProto, TensorProto};
 
-/// The model with all convolutions that gain from it computed so, or `None` if there is none. Weights must be f32.
+/// The model with all suitable convolutions folded, or `None` if there are none. Weights must be f32.
 pub(crate) fn with_upsampling_folded(model: &ModelProto) -> Option<ModelProto> {
     let graph = model.graph.as_ref()?;
     let facts = Facts::of(graph);
@@ -30,7 +30,7 @@ pub(crate) fn with_upsampling_folded(model: &ModelProto) -> Option<ModelProto> {
     if weights.is_empty() {
         return None;
     }
-    // What nobody reads any more; one such node may have been the only reader of another.
+    // Removes unused nodes. Repeated, because a removed node may have been the only reader of another.
     loop {
         let mut read: HashSet<String> = nodes.iter().flat_map(|node| node.input.iter().cloned()).collect();
         read.extend(graph.output.iter().map(|output| output.name().to_owned()));
@@ -47,8 +47,8 @@ pub(crate) fn with_upsampling_folded(model: &ModelProto) -> Option<ModelProto> {
     Some(ModelProto { graph: Some(graph), ..model.clone() })
 }
 
-/// Which convolutions of a graph gain, by their indices among its nodes, each with the index of the node that repeats the
-/// voxels it reads, and that nobody else reads.
+/// The convolutions of a graph that can be folded: index of the convolution node → index of the upsampling node before
+/// it. Only if no other node reads the upsampled array.
 #[must_use]
 pub fn upsampled_convolutions(graph: &GraphProto) -> HashMap<usize, usize> {
     let facts = Facts::of(graph);
@@ -62,31 +62,31 @@ pub fn upsampled_convolutions(graph: &GraphProto) -> HashMap<usize, usize> {
     graph.node.iter().enumerate().filter_map(pair).collect()
 }
 
-/// For each parity of an output's coordinate and each tap of a kernel, which tap of the small kernel it belongs to, and how
-/// many taps that has.
+/// For each parity of an output coordinate and each tap of a kernel: the tap of the small kernel it belongs to. Also
+/// returns the size of the small kernel.
 #[must_use]
 pub fn upsampled_taps(kernel: usize) -> ([Vec<usize>; 2], usize) {
     let small = Small::of(kernel);
     ([0, 1].map(|parity| (0..kernel).map(|tap| small.position(parity, tap)).collect()), small.kernel)
 }
 
-/// What has to be known of a graph.
+/// Lookup tables of a graph.
 struct Facts<'a> {
     /// Initialisers and constants.
     constants: HashMap<&'a str, &'a TensorProto>,
-    /// Which node computes a value.
+    /// The node that computes a value.
     makers: HashMap<&'a str, &'a NodeProto>,
-    /// The edge of a value's cube, `[batch, channels, edge, edge, edge]`.
+    /// The edge of a value of shape `[batch, channels, edge, edge, edge]`.
     edges: HashMap<&'a str, usize>,
 }
 
-/// A convolution over a small array in the place of one over a large array.
+/// A convolution over a small array that replaces one over an upsampled array.
 struct Folded<'a> {
-    /// The one over the large array.
+    /// The replaced convolution.
     node: &'a NodeProto,
-    /// The small array.
+    /// Name of the small array.
     input: &'a str,
-    /// Its edge.
+    /// Edge of the small array.
     edge: usize,
     /// Channels of the output.
     channels: usize,
@@ -127,7 +127,7 @@ impl<'a> Facts<'a> {
         let edge = *self.edges.get(node.input.first()?.as_str())?;
         match node.op_type() {
             "Relu" | "LeakyRelu" | "Transpose" | "Concat" => Some(edge),
-            // Only one that turns an array round leaves its size.
+            // Only a slice that reverses whole axes keeps the size.
             "Slice" => {
                 let all = |input: usize, value: i64| {
                     let values = self.whole_numbers(node.input.get(input)?)?;
@@ -144,7 +144,7 @@ impl<'a> Facts<'a> {
         }
     }
 
-    /// Whether a node repeats every voxel twice along each axis.
+    /// Whether a node is a nearest-neighbour upsampling by 2 along each axis.
     fn doubles(&self, node: &NodeProto) -> bool {
         let says = |name: &str, value: &str| node.attribute(name).is_some_and(|a| a.s() == value.as_bytes());
         let scales = node.input.get(2).and_then(|scales| self.numbers(scales));
@@ -155,15 +155,15 @@ impl<'a> Facts<'a> {
             && (scales.is_some_and(|scales| scales == [1.0, 1.0, 2.0, 2.0, 2.0]) || self.sizes_double(node))
     }
 
-    /// Whether the sizes that a node is given are those of its input, and twice as large along each axis: what
-    /// `torch.onnx.export` makes of `interpolate(x, 40)`, where x has an edge of 20.
+    /// Whether the output sizes of a Resize are the batch and channels of its input and twice its edge: the export of
+    /// `interpolate(x, 40)` by `torch.onnx.export` for an x with edge 20.
     fn sizes_double(&self, node: &NodeProto) -> bool {
         let [of, _, _, sizes] = node.input.as_slice() else { return false };
         let (Some(sizes), Some(&edge)) = (self.makers.get(sizes.as_str()), self.edges.get(of.as_str())) else {
             return false;
         };
         let [kept, doubled] = sizes.input.as_slice() else { return false };
-        // Any other policy would keep the proportions of all dimensions, the batch's among them.
+        // Other policies keep the aspect ratio over all dimensions, including the batch.
         let stretches = |policy: &AttributeProto| policy.s() == b"stretch";
         node.attribute("keep_aspect_ratio_policy").is_none_or(stretches)
             && sizes.op_type() == "Concat"
@@ -171,7 +171,7 @@ impl<'a> Facts<'a> {
             && self.is_batch_and_channels(kept, of)
     }
 
-    /// Whether a value is the first two dimensions of another, in the words of either of torch's exporters.
+    /// Whether a value is the first two dimensions of another, as either of torch's exporters writes it.
     fn is_batch_and_channels(&self, value: &str, of: &str) -> bool {
         let shape = |name: &str| {
             let node = self.makers.get(name)?;
@@ -193,7 +193,7 @@ impl<'a> Facts<'a> {
         }
     }
 
-    /// What takes the place of a node, if something better does.
+    /// The replacement of a node, if it can be folded.
     fn folded(&self, node: &'a NodeProto) -> Option<Folded<'a>> {
         let large = node.input.first()?;
         let resize = *self.makers.get(large.as_str())?;
@@ -234,10 +234,10 @@ impl Folded<'_> {
         [Some(self.weight.clone()), self.bias.clone(), Some(split), Some(join)].into_iter().flatten()
     }
 
-    /// The eight apart, `[batch, 2, 2, 2, channels, edge, edge, edge]`, and side by side.
+    /// Shapes of the separated parts, `[batch, 2, 2, 2, channels, edge, edge, edge]`, and of the interleaved output.
     fn sizes(&self) -> [TensorProto; 2] {
         let (channels, edge) = (self.channels as i64, self.edge as i64);
-        // 0 is the batch as it is.
+        // 0 keeps the batch dimension.
         let sizes = |name: &str, sizes: &[i64]| TensorProto::from_i64(&self.name(name), &[sizes.len() as i64], sizes);
         [
             sizes("split", &[0, 2, 2, 2, channels, edge, edge, edge]),
@@ -282,10 +282,10 @@ fn node(op: &str, input: Vec<String>, output: &str, attribute: Vec<AttributeProt
 
 /// The convolution over the small array along one axis.
 ///
-/// The output 2i + p, with p 0 or 1, reads the large array at 2i + p + d, for d from −r to r, which is the small array at
-/// i + ⌊(p + d) / 2⌋.
+/// The output 2i + p, with p 0 or 1, reads the large array at 2i + p + d, for d from −r to r. This is the small array
+/// at i + ⌊(p + d) / 2⌋.
 struct Small {
-    /// Of the convolution over the large array: half its kernel.
+    /// Radius of the large kernel.
     r: usize,
     kernel: usize,
 }
@@ -296,14 +296,16 @@ impl Small {
         Self { r, kernel: 2 * r.div_ceil(2) + 1 }
     }
 
-    /// Which of the small kernel's weights the weight `tap` of the large kernel belongs to.
+    /// The tap of the small kernel to which tap `tap` of the large kernel belongs.
     fn position(&self, parity: usize, tap: usize) -> usize {
-        // ⌊(p + d) / 2⌋ from its least value on; d = tap − r, and an even number added before is half of it after.
+        // ⌊(p + d) / 2⌋ counted from the first tap of the small kernel, with d = tap − r. An even offset keeps the
+        // division exact.
         let half = self.kernel / 2;
         (parity + tap + 2 * half - self.r) / 2
     }
 
-    /// `[8 × channels, inputs, kernel³]` of `[channels, inputs, (2 r + 1)³]`, first those of the even x, y and z.
+    /// The small weights, `[8 × channels, inputs, kernel³]`, from the large ones, `[channels, inputs, (2 r + 1)³]`. The
+    /// first part is that of even x, y and z.
     fn weights(&self, large: &[f32], channels: usize, inputs: usize) -> Vec<f32> {
         let (taps, kernel) = (2 * self.r + 1, self.kernel);
         let mut small = vec![0.0; 8 * channels * inputs * kernel.pow(3)];
@@ -321,14 +323,14 @@ impl Small {
     }
 }
 
-/// What a convolution does along every axis.
+/// Parameters of a convolution that are equal along every axis.
 struct Shape {
     kernel: usize,
     pad: usize,
     stride: usize,
 }
 
-/// If it does the same along every axis, and nothing unusual.
+/// The parameters of a convolution, if they are equal along every axis and there are no groups or dilations.
 fn shape(node: &NodeProto) -> Option<Shape> {
     let same = |name: &str, count: usize, default: Option<usize>| {
         let Some(attribute) = node.attribute(name) else { return default };
@@ -364,7 +366,7 @@ mod tests {
     use crate::{Architecture, Orientation, averaged_over_rotations};
 
     #[test]
-    fn a_small_kernel_reads_what_the_large_one_reads() {
+    fn taps_of_the_small_kernel_match_those_of_the_large_one() {
         for (kernel, small) in [(3, 3), (5, 3), (7, 5), (9, 5)] {
             let axis = Small::of(kernel);
             assert_eq!(axis.kernel, small);
@@ -383,21 +385,21 @@ mod tests {
     }
 
     #[test]
-    fn what_gains_is_folded_and_nothing_else() {
+    fn only_suitable_convolutions_are_folded() {
         let count = |model: &ModelProto, op: &str| {
             model.graph.as_ref().unwrap().node.iter().filter(|node| node.op_type() == op).count()
         };
         let vgn = Architecture::Vgn.build_with(40, Orientation::Axes, 0).unwrap();
         let folded = with_upsampling_folded(&vgn).unwrap();
-        // The heads and the last convolution of the decoder; over 3³ there is nothing to gain.
+        // The heads and the last convolution of the decoder. Kernels of 3³ do not gain.
         assert_eq!((count(&vgn, "Resize"), count(&folded, "Resize")), (3, 1));
         assert_eq!((count(&vgn, "Conv"), count(&folded, "Conv")), (7, 7));
         let scales = |model: &ModelProto| count(model, "Constant");
-        assert_eq!(scales(&vgn) - scales(&folded), 2, "those of the two that are gone");
+        assert_eq!(scales(&vgn) - scales(&folded), 2, "the scales of the two removed Resize nodes");
         let weights = |model: &ModelProto| -> usize {
             model.graph.as_ref().unwrap().initializer.iter().filter(|w| w.is_float()).map(TensorProto::elements).sum()
         };
-        assert!(weights(&folded) < 2 * weights(&vgn), "the old weights are gone");
+        assert!(weights(&folded) < 2 * weights(&vgn), "the old weights are removed");
         assert!(with_upsampling_folded(&folded).is_none());
 
         let turns = averaged_over_rotations(&vgn).unwrap();
@@ -405,15 +407,19 @@ mod tests {
         assert!(with_upsampling_folded(&Architecture::TransformerSmall.build(40, 0).unwrap()).is_none());
     }
 
-    /// The graph with its Resizes in the words of torch's exporters: `interpolate(x, 2 · edge)`.
-    fn in_torchs_words(model: &ModelProto, edges: &[i64], words: fn(&str, &str) -> Vec<NodeProto>) -> ModelProto {
+    /// The graph with its Resize nodes as torch's exporters write `interpolate(x, 2 · edge)`.
+    fn as_exported_by_torch(
+        model: &ModelProto,
+        edges: &[i64],
+        sizes_of: fn(&str, &str) -> Vec<NodeProto>,
+    ) -> ModelProto {
         let mut model = model.clone();
         let graph = model.graph.as_mut().unwrap();
         let mut edges = edges.iter();
         for mut resize in std::mem::take(&mut graph.node) {
             if resize.op_type() == "Resize" {
                 let (x, name) = (resize.input[0].clone(), resize.output[0].clone());
-                graph.node.extend(words(&x, &name));
+                graph.node.extend(sizes_of(&x, &name));
                 let size = TensorProto::from_i64(&format!("{name}.size"), &[3], &[*edges.next().unwrap(); 3]);
                 graph.initializer.push(size);
                 let sizes = vec![format!("{name}.kept"), format!("{name}.size")];
@@ -431,11 +437,11 @@ mod tests {
         node("Shape", vec![x.to_owned()], output, end.map_or_else(Vec::new, between))
     }
 
-    fn of_today(x: &str, name: &str) -> Vec<NodeProto> {
+    fn current_exporter(x: &str, name: &str) -> Vec<NodeProto> {
         vec![shape(x, &format!("{name}.kept"), Some(2))]
     }
 
-    fn of_yesterday(x: &str, name: &str) -> Vec<NodeProto> {
+    fn old_exporter(x: &str, name: &str) -> Vec<NodeProto> {
         let [all, from, to, axes] = ["all", "from", "to", "axes"].map(|what| format!("{name}.{what}"));
         let number = |name: &String, value| {
             node(
@@ -451,36 +457,37 @@ mod tests {
     }
 
     #[test]
-    fn what_torch_exports_is_folded_into_the_same() {
+    fn graphs_exported_by_torch_are_folded_too() {
         let vgn = Architecture::Vgn.build(40, 0).unwrap();
         let folded = with_upsampling_folded(&vgn).unwrap().graph.unwrap();
         let gained = |folded: &GraphProto| -> Vec<TensorProto> {
             folded.initializer.iter().filter(|tensor| tensor.is_float()).cloned().collect()
         };
-        for words in [of_today, of_yesterday] {
-            let torchs = with_upsampling_folded(&in_torchs_words(&vgn, &[10, 20, 40], words)).unwrap().graph.unwrap();
+        for sizes_of in [current_exporter, old_exporter] {
+            let torchs =
+                with_upsampling_folded(&as_exported_by_torch(&vgn, &[10, 20, 40], sizes_of)).unwrap().graph.unwrap();
             assert!(gained(&torchs) == gained(&folded), "the same weights");
             let count = |op: &str| torchs.node.iter().filter(|node| node.op_type() == op).count();
-            assert_eq!(
-                (count("Resize"), count("Concat"), count("Shape")),
-                (1, 1, 1),
-                "over 3³ there is nothing to gain"
-            );
+            assert_eq!((count("Resize"), count("Concat"), count("Shape")), (1, 1, 1), "the kernel of 3³ is not folded");
 
-            let trebled = in_torchs_words(&vgn, &[10, 20, 60], words);
+            let trebled = as_exported_by_torch(&vgn, &[10, 20, 60], sizes_of);
             let left = with_upsampling_folded(&trebled).unwrap().graph.unwrap();
-            assert_eq!(left.node.iter().filter(|node| node.op_type() == "Resize").count(), 2, "no mere doubling");
+            assert_eq!(
+                left.node.iter().filter(|node| node.op_type() == "Resize").count(),
+                2,
+                "upsampling by 3 is not folded"
+            );
         }
-        let mut kept = in_torchs_words(&vgn, &[10, 20, 40], of_today);
+        let mut kept = as_exported_by_torch(&vgn, &[10, 20, 40], current_exporter);
         for node in kept.graph.as_mut().unwrap().node.iter_mut().filter(|node| node.op_type() == "Resize") {
             node.attribute.push(AttributeProto::string("keep_aspect_ratio_policy", "not_larger"));
         }
         assert!(with_upsampling_folded(&kept).is_none());
-        // Sizes of another value, or of other dimensions, say nothing.
+        // Sizes of another value or of other dimensions are not accepted.
         let another: fn(&str, &str) -> Vec<NodeProto> = |_, name| vec![shape("tsdf", &format!("{name}.kept"), Some(2))];
         let others: fn(&str, &str) -> Vec<NodeProto> = |x, name| vec![shape(x, &format!("{name}.kept"), Some(3))];
-        for words in [another, others] {
-            assert!(with_upsampling_folded(&in_torchs_words(&vgn, &[10, 20, 40], words)).is_none());
+        for sizes_of in [another, others] {
+            assert!(with_upsampling_folded(&as_exported_by_torch(&vgn, &[10, 20, 40], sizes_of)).is_none());
         }
     }
 }

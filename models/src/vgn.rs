@@ -5,7 +5,7 @@ use crate::graph::{Builder, Conv};
 use crate::heads::{Orientation, heads, volume};
 use crate::onnx::{AttributeProto, ModelProto};
 
-/// VGN over volumes of `resolution`³ voxels (a multiple of 8): 313,238 parameters with quaternions, whatever the
+/// VGN for volumes of `resolution`³ voxels (a multiple of 8). With quaternions it has 313,238 parameters at every
 /// resolution.
 pub(crate) fn vgn(resolution: usize, orientation: Orientation, seed: u64) -> ModelProto {
     let mut builder = Builder::new("vgn", seed);
@@ -28,7 +28,7 @@ fn conv_relu(b: &mut Builder, name: &str, x: &str, conv: Conv) -> String {
     b.node("Relu", &[&x], vec![])
 }
 
-/// Repeats every voxel twice along each axis.
+/// Nearest-neighbour upsampling by 2 along each axis.
 fn double(b: &mut Builder, x: &str) -> String {
     let scales = b.numbers(&[1.0, 1.0, 2.0, 2.0, 2.0]);
     let attributes = vec![

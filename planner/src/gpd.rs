@@ -7,30 +7,30 @@ use grasp_models::{Classifier, LoadError, Options};
 use crate::hand_fit::HandFit;
 use crate::{PlanError, PlanParams, Planner, Scene};
 
-/// Candidates that are scored between two calls of `is_wanted`.
+/// Number of candidates scored between two calls of `is_wanted`.
 const BATCH: usize = 64;
 
-/// Grasp pose detection: places where the hand fits, scored by a classifier (ten Pas et al. 2017).
+/// Grasp pose detection (GPD): candidate grasps on a point cloud, scored by a classifier (ten Pas et al., IJRR 2017).
 pub struct Gpd {
     classifier: Classifier,
 }
 
 impl Gpd {
-    /// With a classifier of its own.
+    /// A planner with a loaded classifier.
     #[must_use]
     pub fn new(classifier: Classifier) -> Self {
         Self { classifier }
     }
 
-    /// With the classifier of a file.
+    /// Loads the classifier from a file.
     ///
     /// # Errors
-    /// [`LoadError`] where the file is no classifier.
+    /// [`LoadError`] if the file is not a valid classifier.
     pub fn load(path: &Path) -> Result<Self, LoadError> {
         Ok(Self::new(Classifier::load(path, &Options::default())?))
     }
 
-    /// A success is more likely than a failure, as GPD's code has it.
+    /// The default parameters: the threshold 0.5 keeps candidates that succeed more likely than not, as in GPD's code.
     #[must_use]
     pub fn decode_params() -> DecodeParams {
         DecodeParams { threshold: 0.5, ..DecodeParams::default() }

@@ -1,4 +1,4 @@
-//! Places where the hand fits into a point cloud, which GPD and SHAF choose from.
+//! Fits the hand to a point cloud. GPD and SHAF choose from the candidates.
 
 use std::borrow::Cow;
 
@@ -9,40 +9,41 @@ use rand_chacha::rand_core::SeedableRng;
 
 use crate::{PlanError, PlanParams, Scene};
 
-/// No part of the hand comes closer to the table than this, metres: the noise of a depth camera.
+/// Smallest distance between the hand and the table, metres: a margin for camera noise.
 const TABLE_CLEARANCE: f64 = 0.002;
 
-/// An object is worth grasping if it is wider than this, and narrower than the hand's opening by this, metres.
+/// Graspable objects are wider than this, and narrower than the hand's opening minus this, metres.
 const APERTURE_MARGIN: f64 = 0.01;
 
-/// The places in one scene.
+/// The candidates in one scene.
 #[derive(Debug)]
 pub struct HandFit {
-    /// The points of the objects.
+    /// Points of the objects.
     pub cloud: Cloud,
-    /// Where the hand fits.
+    /// Candidate grasps.
     pub candidates: Vec<Candidate>,
-    /// Points that are not of an object.
+    /// Number of points that belong to no object.
     other_points: usize,
-    /// Rotations at which the hand does not fit.
+    /// Number of rotations at which the hand does not fit.
     misfits: usize,
 }
 
-/// The points of objects on a table, without the table and the border of a cube with an edge of `size` metres.
+/// The points of objects on a table, without the points of the table and of the border of the workspace. Task frame;
+/// `size` is the edge of the workspace and `table` the height of the table, metres.
 #[must_use]
 pub fn object_points(points: &[SurfacePoint], size: f64, table: f64) -> Vec<SurfacePoint> {
     points.iter().filter(|point| is_on_an_object(&point.position, size, table)).copied().collect()
 }
 
 impl HandFit {
-    /// GPD's parameters for a hand over a table at this height.
+    /// GPD's parameters for a hand above a table at height `table`, metres.
     #[must_use]
     pub fn params(hand: Hand, table: f64) -> Params {
         let aperture = APERTURE_MARGIN..=(2.0 * hand.half_opening() - APERTURE_MARGIN);
         Params { hand, aperture, ..Params::above(table + TABLE_CLEARANCE) }
     }
 
-    /// Fits the hand.
+    /// Fits the hand to the points of the scene.
     pub(crate) fn of(scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Self, PlanError> {
         let volume = &scene.volume;
         let size = volume.resolution() as f64 * volume.voxel_size();
@@ -66,7 +67,8 @@ impl HandFit {
         Ok(Self { cloud, candidates, other_points, misfits })
     }
 
-    /// Those of the grasps, best first, that the parameters let pass.
+    /// The grasps that pass the parameters, in the frame of the volume's pose. `grasps` are in the task frame, best
+    /// first.
     pub(crate) fn select(&self, grasps: Vec<Grasp>, scene: &Scene, params: &DecodeParams) -> Decoded {
         let pose = scene.volume.pose();
         let in_frame: Vec<Grasp> = grasps.into_iter().map(|grasp| Grasp { pose: pose * grasp.pose, ..grasp }).collect();

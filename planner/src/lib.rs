@@ -1,4 +1,5 @@
-//! Grasp planners: from a volume, or the points in it, to grasps. The server and the benchmark run the same ones.
+//! Grasp planners: they find grasps in a volume, or in its observed points. The server and the benchmark use the same
+//! planners.
 
 mod gpd;
 mod hand_fit;
@@ -16,16 +17,17 @@ pub use network::NetworkPlanner;
 pub use shaf::{HighestProposal, Shaf};
 pub use source::{Loaded, Source};
 
-/// What a planner gets.
+/// Input of a planner.
 #[derive(Debug)]
 pub struct Scene {
-    /// What networks read, and what collisions are checked against.
+    /// The volume: input of networks and of the collision check.
     pub volume: Volume,
-    /// The observed surface in the volume's own frame, where it is known more finely than by the volume.
+    /// The observed surface in the volume's own frame (metres), if it is known at a higher resolution than the
+    /// volume's.
     pub points: Option<Vec<SurfacePoint>>,
 }
 
-/// How a planner chooses grasps.
+/// Parameters of planning.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PlanParams {
     /// Thresholds, constraints, the hand and its clearance.
@@ -34,26 +36,26 @@ pub struct PlanParams {
     pub table: Option<f64>,
 }
 
-/// Why a planner has no answer.
+/// Why planning failed.
 #[derive(Clone, Debug, Error)]
 pub enum PlanError {
     /// The network or the classifier failed.
     #[error(transparent)]
     Run(#[from] RuntimeError),
-    /// The network's output is not one of grasps.
+    /// The output of the network is invalid.
     #[error(transparent)]
     Decode(#[from] DecodeError),
-    /// The caller no longer wants the answer.
+    /// Planning stopped because `is_wanted` returned false.
     #[error("planning was cancelled")]
     Cancelled,
 }
 
 /// Finds grasps in a scene.
 pub trait Planner {
-    /// Plans. The same scene and parameters give the same grasps. `is_wanted` is called from time to time; once it is
-    /// false, planning stops.
+    /// Returns the grasps in the frame of the volume's pose, best first. The same scene and parameters give the same
+    /// grasps. Planners call `is_wanted` repeatedly and stop when it returns false.
     ///
     /// # Errors
-    /// [`PlanError`].
+    /// [`PlanError`] if the network fails, its output is invalid, or planning is cancelled.
     fn plan(&mut self, scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Decoded, PlanError>;
 }

@@ -1,4 +1,4 @@
-//! The simple high-point heuristic that GIGA's paper compares with, in its two forms.
+//! SHAF, the highest-point heuristic that GIGA's paper compares with, in two forms.
 
 use grasp::gpd::ranked;
 use grasp::{DecodeParams, Decoded, Grasp};
@@ -6,11 +6,11 @@ use grasp::{DecodeParams, Decoded, Grasp};
 use crate::hand_fit::HandFit;
 use crate::{NetworkPlanner, PlanError, PlanParams, Planner, Scene};
 
-/// The highest of the places where the hand fits.
+/// SHAF on the candidates of GPD: the highest comes first.
 pub struct Shaf;
 
 impl Shaf {
-    /// Its quality is a rank and no probability, so that nothing is dropped by it.
+    /// The default parameters. The quality is a rank and not a probability, so the threshold keeps all grasps.
     #[must_use]
     pub fn decode_params() -> DecodeParams {
         DecodeParams { threshold: 1e-6, ..DecodeParams::default() }
@@ -25,7 +25,7 @@ impl Planner for Shaf {
     }
 }
 
-/// The highest of a network's proposals with a quality above 0.5.
+/// SHAF on the grasps of a network with a quality above 0.5: the highest comes first.
 pub struct HighestProposal(pub NetworkPlanner);
 
 impl Planner for HighestProposal {
@@ -37,7 +37,7 @@ impl Planner for HighestProposal {
     }
 }
 
-/// By the height of the grasp's position; the sort is stable, so the better of two equals stays ahead.
+/// Sorts by the height of the grasp's position. The sort is stable, so at equal height the better grasp comes first.
 fn highest_first(grasps: &mut [Grasp]) {
     grasps.sort_by(|a, b| b.pose.translation.z.total_cmp(&a.pose.translation.z));
 }

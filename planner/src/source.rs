@@ -7,28 +7,28 @@ use grasp_models::{Backend, Classifier, Entry, LoadError, Network, Options};
 
 use crate::{Gpd, NetworkPlanner, Planner, Shaf};
 
-/// A planner of a model folder, by its name and version, and what it is loaded from.
+/// A planner of a model folder by name and version, before it is loaded.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Source {
-    /// A network, from volumes to maps.
+    /// A network.
     Network(Entry),
-    /// Places where the hand fits into a point cloud, scored by a classifier.
+    /// GPD with a classifier.
     Gpd(Entry),
-    /// The highest of those places.
+    /// SHAF, which needs no file.
     Shaf,
 }
 
-/// A planner that is ready to run.
+/// A loaded planner.
 pub enum Loaded {
-    /// One that can take several volumes at once.
+    /// A network, which accepts batches of volumes.
     Network(NetworkPlanner),
-    /// One that takes scenes one by one.
+    /// A planner that processes one scene at a time.
     Single(Box<dyn Planner + Send>),
 }
 
 impl Source {
-    /// The finest volume that a planner without a network takes, voxels along an edge: in a cube of 0.3 m as fine as the
-    /// point cloud is thinned to.
+    /// Largest resolution for planners without a network, voxels along an edge: at 0.3 m it matches the voxel size of
+    /// the downsampled point cloud.
     pub const MAX_RESOLUTION: usize = 100;
 
     fn entry(&self) -> Option<&Entry> {
@@ -38,31 +38,31 @@ impl Source {
         }
     }
 
-    /// As requests name it.
+    /// Name of the model in requests.
     #[must_use]
     pub fn name(&self) -> &str {
         self.entry().map_or("shaf", |entry| &entry.metadata.name)
     }
 
-    /// As requests name it.
+    /// Version of the model in requests.
     #[must_use]
     pub fn version(&self) -> &str {
         self.entry().map_or("1", |entry| &entry.metadata.version)
     }
 
-    /// Of its file; empty without a file.
+    /// SHA-256 of its file, hexadecimal; empty without a file.
     #[must_use]
     pub fn sha256(&self) -> &str {
         self.entry().map_or("", |entry| &entry.sha256)
     }
 
-    /// Its file.
+    /// Path of its file.
     #[must_use]
     pub fn path(&self) -> Option<&Path> {
         self.entry().map(|entry| entry.path.as_path())
     }
 
-    /// Where it comes from.
+    /// Origin of the model: the provenance entries of its file.
     #[must_use]
     pub fn provenance(&self) -> BTreeMap<String, String> {
         match self.entry() {
@@ -71,7 +71,7 @@ impl Source {
         }
     }
 
-    /// The network's file and metadata, if it is a network.
+    /// The entry of the network, if the planner is a network.
     #[must_use]
     pub fn network(&self) -> Option<&Entry> {
         match self {
@@ -80,7 +80,7 @@ impl Source {
         }
     }
 
-    /// Orders two versions of a name, the older first.
+    /// Orders two versions of one model, older first.
     #[must_use]
     pub fn by_version(&self, other: &Self) -> Ordering {
         match (self.entry(), other.entry()) {
@@ -89,7 +89,7 @@ impl Source {
         }
     }
 
-    /// How its grasps are chosen by default.
+    /// Default decoding parameters.
     #[must_use]
     pub fn decode_params(&self) -> DecodeParams {
         match self {
@@ -99,10 +99,10 @@ impl Source {
         }
     }
 
-    /// Loads it `count` times, for as many threads.
+    /// Loads the planner `count` times, once per thread, and returns the backend that runs it.
     ///
     /// # Errors
-    /// [`LoadError`] where its file is not what it should be.
+    /// [`LoadError`] if the file is invalid or cannot run with `options`.
     pub fn load(&self, options: &Options, count: usize) -> Result<(Vec<Loaded>, Backend), LoadError> {
         let single = |planner: Box<dyn Planner + Send>| Loaded::Single(planner);
         Ok(match self {

@@ -1,4 +1,4 @@
-//! Each planner on two boxes that stand on a table. `ORT_DYLIB_PATH` must name ONNX Runtime's library.
+//! Runs each planner on two boxes on a table. `ORT_DYLIB_PATH` must name the ONNX Runtime library.
 
 use std::cell::Cell;
 use std::path::PathBuf;
@@ -9,9 +9,9 @@ use grasp_planner::{Gpd, HighestProposal, NetworkPlanner, PlanError, PlanParams,
 use nalgebra::{Isometry3, Point3, Vector3};
 
 const TABLE: f64 = 0.05;
-/// Middle of the base and sides of a high and a low box, metres.
+/// Centre of the base and edge lengths of a high and a low box, metres.
 const BOXES: [([f64; 2], [f64; 3]); 2] = [([0.1, 0.15], [0.04, 0.05, 0.12]), ([0.2, 0.16], [0.045, 0.04, 0.05])];
-/// 2 mm.
+/// Distance between surface points, metres.
 const STEP: f64 = 0.002;
 
 /// The top and the four sides of a box.
@@ -32,7 +32,7 @@ fn surface(([x, y], [a, b, height]): ([f64; 2], [f64; 3])) -> Vec<SurfacePoint> 
     points
 }
 
-/// The boxes as a camera in front of them sees them, in a frame.
+/// The boxes as seen by a camera in front of them, with the volume at the pose `frame`.
 fn scene(frame: Isometry3<f64>) -> Scene {
     let mut points: Vec<SurfacePoint> = BOXES.into_iter().flat_map(surface).collect();
     let table = (0..150).flat_map(|i| (0..150).map(move |j| (f64::from(i) * STEP, f64::from(j) * STEP)));
@@ -71,7 +71,7 @@ fn planners() -> Vec<(&'static str, Box<dyn Planner>, DecodeParams)> {
 }
 
 #[test]
-fn every_planner_grasps_the_boxes_and_says_the_same_again() {
+fn every_planner_grasps_the_boxes_and_is_deterministic() {
     let scene = scene(Isometry3::identity());
     for (name, mut planner, decode) in planners() {
         let decoded = plan(planner.as_mut(), &scene, decode);
@@ -103,7 +103,7 @@ fn grasps_are_in_the_frame_of_the_volume() {
 }
 
 #[test]
-fn grasps_come_best_first_by_the_measure_of_the_planner() {
+fn grasps_are_sorted_by_the_criterion_of_the_planner() {
     let scene = scene(Isometry3::identity());
     for (name, mut planner, decode) in planners() {
         let grasps = plan(planner.as_mut(), &scene, decode).grasps;
@@ -118,13 +118,13 @@ fn grasps_come_best_first_by_the_measure_of_the_planner() {
 }
 
 #[test]
-fn without_points_the_surface_of_the_volume_is_taken() {
+fn without_points_the_surface_of_the_volume_is_used() {
     let scene = Scene { points: None, ..scene(Isometry3::identity()) };
     assert!(!plan(&mut Shaf, &scene, Shaf::decode_params()).grasps.is_empty());
 }
 
 #[test]
-fn planning_stops_once_the_answer_is_not_wanted() {
+fn planning_stops_when_it_is_cancelled() {
     let scene = scene(Isometry3::identity());
     let params = PlanParams { decode: Shaf::decode_params(), table: Some(TABLE) };
     let mut gpd = Gpd::load(&zoo("classifiers/gpd.onnx")).unwrap();

@@ -3,39 +3,40 @@ use std::fmt::Display;
 
 use thiserror::Error;
 
-/// A field of a message is not what it must be.
+/// A field of a message is invalid.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[error("{message}")]
 pub struct FieldError {
     /// Path of the field in the request, such as `volume.pose.orientation` or `views[1].camera.k`.
     pub field: Cow<'static, str>,
-    /// The path, the value, and what it must be.
+    /// The path, the value, and the requirement.
     pub message: String,
 }
 
 impl FieldError {
-    /// `{field} is {value}, {needed}`.
+    /// An error with the message `{field} is {value}, {needed}`.
     pub fn new(field: impl Into<Cow<'static, str>>, value: impl Display, needed: impl Display) -> Self {
         let field = field.into();
         let message = on_a_line(&format!("{field} is {value}, {needed}"));
         Self { field, message }
     }
 
-    /// `{field}: {reason}`.
+    /// An error with the message `{field}: {reason}`.
     pub fn refused(field: impl Into<Cow<'static, str>>, reason: impl Display) -> Self {
         let field = field.into();
         let message = on_a_line(&format!("{field}: {reason}"));
         Self { field, message }
     }
 
-    /// The same of a field inside of `outer`.
+    /// The same error with `outer` prepended to the path.
     #[must_use]
     pub fn inside(self, outer: impl Display) -> Self {
         Self { field: format!("{outer}.{}", self.field).into(), message: format!("{outer}.{}", self.message) }
     }
 }
 
-/// What may hold a client's own words, for a log and for headers: on one line, and no longer than both take.
+/// Escapes control characters and truncates text that may contain input of the client, so that it fits on one log line
+/// and into a header.
 #[must_use]
 pub fn on_a_line(text: &str) -> String {
     const LONGEST: usize = 1500;
@@ -55,7 +56,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_client_wrote_forges_no_line_and_fits_a_header() {
+    fn client_input_cannot_forge_log_lines_and_fits_into_a_header() {
         let error =
             FieldError::new("outputs", "`a\nINFO forged\u{1b}[0m`", "the outputs are quality, rotation and width");
         assert!(error.message.starts_with("outputs is `a\\nINFO forged\\u{1b}[0m`, the"), "{error}");

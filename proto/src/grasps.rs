@@ -23,13 +23,12 @@ impl TryFrom<&pb::Grasp> for Grasp {
 
 impl From<&Dropped> for pb::Dropped {
     fn from(dropped: &Dropped) -> Self {
-        // At most one per voxel, and `Volume::MAX_RESOLUTION`³ is 2²⁴.
+        // No overflow: at most one per voxel, and `Volume::MAX_RESOLUTION`³ is 2²⁴.
         let count = |n: usize| n as u32;
         Self {
             below_threshold: count(dropped.below_threshold),
             mask: count(dropped.mask),
             width: count(dropped.width),
-            border: count(dropped.border),
             region: count(dropped.region),
             approach: count(dropped.approach),
             height: count(dropped.height),

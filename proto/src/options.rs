@@ -7,19 +7,19 @@ use nalgebra::{Isometry3, Unit, Vector3};
 use crate::pose::{self, PoseFields};
 use crate::{FieldError, pb};
 
-/// Where the table was in training, metres above the volume's bottom.
+/// Height of the table in training, metres above the volume's bottom.
 pub const TABLE_HEIGHT: f64 = 0.05;
 
-/// From the pre-grasp to the grasp, metres: VGN's trials.
+/// Default distance from the pre-grasp to the grasp, metres, as in VGN's trials.
 const PREGRASP: f64 = 0.05;
 
-/// From the grasp upwards, metres: VGN's trials.
+/// Default distance of the retreat, metres, as in VGN's trials.
 const RETREAT: f64 = 0.1;
 
-/// The longest name of a planner, and of its version, bytes.
+/// Longest name of a model and longest version, bytes.
 pub const MAX_NAME: usize = 256;
 
-/// Farthest that a hand is sent, metres.
+/// Largest pre-grasp and retreat distance, metres.
 const REACH: f64 = 10.0;
 
 const PARENT: PoseFields = PoseFields {
@@ -27,50 +27,50 @@ const PARENT: PoseFields = PoseFields {
     orientation: "options.convention.parent_from_grasp.orientation",
 };
 
-/// What is asked of the grasps, checked.
+/// The validated options of a request.
 #[derive(Clone, Debug)]
 pub struct DetectParams {
-    /// Which planner; empty if any.
+    /// Name of the model; empty for the default.
     pub model: String,
-    /// Which version of it; empty for the newest.
+    /// Version of the model; empty for the newest.
     pub version: String,
-    /// The smallest quality, where it is not the model's own.
+    /// Smallest quality; `None` means the threshold of the model.
     pub threshold: Option<f32>,
-    /// That of the best grasp when nothing reaches the threshold.
+    /// Smallest quality of the single best grasp if no grasp reaches the threshold; `None` disables it.
     pub force: Option<f32>,
-    /// The most grasps.
+    /// Largest number of grasps.
     pub max_grasps: usize,
-    /// Whether to say why there are no others.
+    /// Whether to report the dropped grasps.
     pub explain: bool,
-    /// Where and how.
+    /// Region, approach and height.
     pub constraints: Constraints,
-    /// The hand, where it is not the Panda's.
+    /// The hand; `None` means the Panda hand.
     pub hand: Option<Hand>,
-    /// What is done about collisions.
+    /// Mode of the collision check.
     pub collision: Collision,
-    /// Height of the table above the volume's bottom, if there is one.
+    /// Height of the table above the volume's bottom, metres; `None` without a table.
     pub table: Option<f64>,
-    /// Which frame of the hand is told.
+    /// Frame of the hand in which poses are reported.
     pub convention: Convention,
-    /// From the pre-grasp to the grasp, metres.
+    /// Distance from the pre-grasp to the grasp, metres.
     pub pregrasp: f64,
-    /// Where the hand goes then.
+    /// Motion of the hand after the grasp.
     pub retreat: Retreat,
 }
 
-/// What is done about grasps whose open hand would meet something.
+/// Mode of the collision check of the open hand.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Collision {
-    /// Nobody looks.
+    /// No check.
     Off,
-    /// They are marked.
+    /// Grasps in collision are flagged.
     Flag,
-    /// They are dropped.
+    /// Grasps in collision are dropped.
     Filter,
 }
 
 impl DetectParams {
-    /// A planner's own parameters, with what is asked instead.
+    /// The decoding parameters of a planner, overridden by the options.
     #[must_use]
     pub fn decode_params(&self, own: DecodeParams) -> DecodeParams {
         DecodeParams {
@@ -83,14 +83,14 @@ impl DetectParams {
         }
     }
 
-    /// What the hand must keep clear of.
+    /// Parameters of the collision check.
     #[must_use]
     pub fn clearance(&self) -> Clearance {
         let hand = self.hand.unwrap_or(Hand::PANDA);
         Clearance { hand, from: self.pregrasp, table: self.table, ..Clearance::default() }
     }
 
-    /// The poses of a grasp as they are told: itself, the pre-grasp, the retreat.
+    /// The reported poses of a grasp: grasp, pre-grasp and retreat, in the requested convention.
     #[must_use]
     pub fn poses(&self, grasp: &Isometry3<f64>) -> [Isometry3<f64>; 3] {
         let depth = self.hand.map_or(grasp::FINGER_DEPTH, |hand| hand.depth);
@@ -105,7 +105,7 @@ impl TryFrom<&pb::Options> for DetectParams {
         for (field, name) in [("options.model", &options.model), ("options.version", &options.version)] {
             if name.len() > MAX_NAME {
                 let value = format_args!("{} bytes long", name.len());
-                return Err(FieldError::new(field, value, format_args!("at most {MAX_NAME} are taken")));
+                return Err(FieldError::new(field, value, format_args!("must be at most {MAX_NAME} bytes")));
             }
         }
         let collision = options.collision.unwrap_or_default();
@@ -182,7 +182,7 @@ fn region(bounds: &pb::Box) -> Result<Region, FieldError> {
     let [lower, upper] = corners(bounds, FIELD)?;
     for (axis, name) in ["x", "y", "z"].into_iter().enumerate() {
         if lower[axis] > upper[axis] {
-            let needed = format_args!("must be at least that of `min`, {}", lower[axis]);
+            let needed = format_args!("must be at least `min.{name}`, {}", lower[axis]);
             return Err(FieldError::new(format!("{FIELD}.max.{name}"), upper[axis], needed));
         }
     }
@@ -192,7 +192,7 @@ fn region(bounds: &pb::Box) -> Result<Region, FieldError> {
 fn direction(vector: Option<pb::Vector3>, field: &'static str) -> Result<Unit<Vector3<f64>>, FieldError> {
     let pb::Vector3 { x, y, z } = vector.ok_or_else(|| FieldError::new(field, "absent", "must be given"))?;
     let vector = Vector3::new(x, y, z);
-    // By its largest part first: squares of what is large are infinite.
+    // Scaled by the largest component first, so that the squares do not overflow.
     let direction = Unit::try_new(vector / vector.amax().max(1e-9), 1e-9);
     let direction = direction.filter(|unit| unit.iter().all(|c| c.is_finite()) && vector.norm() > 1e-9);
     direction.ok_or_else(|| {
@@ -244,7 +244,7 @@ fn convention(convention: &pb::Convention) -> Result<Convention, FieldError> {
             return Err(FieldError::new("options.convention.parent_from_grasp", "absent", needed));
         }
         (Ok(origin), Some(_)) => {
-            let needed = "must be ORIGIN_PARENT where parent_from_grasp is given";
+            let needed = "must be ORIGIN_PARENT if parent_from_grasp is given";
             return Err(FieldError::new(ORIGIN, origin.as_str_name(), needed));
         }
         (Err(_), _) => {
@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_asked_is_what_the_papers_do() {
+    fn the_defaults_are_those_of_the_papers() {
         let params = DetectParams::try_from(&pb::Options::default()).unwrap();
         let own = DecodeParams { threshold: 0.8, force: Some(0.5), ..DecodeParams::default() };
         assert_eq!(params.decode_params(own), own);
@@ -293,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn a_retreat_may_be_straight_up_and_a_pose_the_parents() {
+    fn retreat_direction_and_parent_frame_are_applied() {
         let up = pb::Vector3 { x: 0.0, y: 0.0, z: 2.0 };
         let parent = (&Isometry3::translation(0.0, 0.0, 0.0584)).into();
         let options = pb::Options {
@@ -311,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_is_named() {
+    fn each_invalid_option_is_named() {
         let vector = |x, y, z| Some(pb::Vector3 { x, y, z });
         let options = |change: fn(&mut pb::Options)| {
             let mut options = pb::Options::default();
@@ -333,7 +333,7 @@ mod tests {
         let region = Some(pb::Box { min: vector(0.0, 0.0, 0.2), max: vector(0.1, 0.1, 0.1) });
         assert_eq!(
             refused(pb::Options { region, ..Default::default() }),
-            "options.region.max.z is 0.1, must be at least that of `min`, 0.2"
+            "options.region.max.z is 0.1, must be at least `min.z`, 0.2"
         );
         let approach = Some(pb::Cone { axis: vector(0.0, 0.0, 0.0), angle: 0.5 });
         assert_eq!(

@@ -2,25 +2,26 @@ use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
 use crate::{FieldError, pb};
 
-/// How far from 1 the length of an orientation may be: what single precision and four printed digits leave.
+/// Largest deviation of an orientation's length from 1: room for single precision and for values printed with four
+/// digits.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
-/// A pose of a message, checked; errors name it by `field`.
+/// Converts and validates a pose message. Errors name it `field`.
 ///
 /// # Errors
-/// [`FieldError`] when it is not whole, not finite, or its orientation not of unit length.
+/// [`FieldError`] if a part is absent or not finite, or the orientation has no unit length.
 pub fn pose(pose: &pb::Pose, field: &'static str) -> Result<Isometry3<f64>, FieldError> {
     const FIELDS: PoseFields = PoseFields { position: "position", orientation: "orientation" };
     decode(pose, &FIELDS).map_err(|error| error.inside(field))
 }
 
-/// The fields of one pose, as a request names them.
+/// Paths of the parts of a pose in the request.
 pub(crate) struct PoseFields {
     pub position: &'static str,
     pub orientation: &'static str,
 }
 
-/// The pose as an isometry, its orientation brought to unit length.
+/// The pose as an isometry with a normalised orientation.
 pub(crate) fn decode(pose: &pb::Pose, fields: &PoseFields) -> Result<Isometry3<f64>, FieldError> {
     let position = pose.position.ok_or_else(|| FieldError::new(fields.position, "absent", "must be given"))?;
     let pb::Vector3 { x, y, z } = position;

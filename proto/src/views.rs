@@ -5,14 +5,14 @@ use crate::pb::depth_view::Extrinsics;
 use crate::pose::{self, PoseFields};
 use crate::{FieldError, pb};
 
-/// The most views of one request.
+/// Largest number of views in one request.
 pub const MAX_VIEWS: usize = 64;
 
 /// Longest edge of an image, pixels.
 const MAX_EDGE: u32 = 16_384;
 
-/// How far from the middle of an image, as a share of its edges, a principal point may lie on both axes alike: that of
-/// another resolution does, that of an image cut out of a larger one may lie anywhere else.
+/// Tolerance for the principal point, as a fraction of the image size. Intrinsics of another resolution are off by a
+/// similar fraction on both axes; those of a cropped image usually are not.
 const OFF_CENTRE: f64 = 0.1;
 
 const WORKSPACE: PoseFields =
@@ -24,25 +24,25 @@ const FRAME_FROM_CAMERA: PoseFields =
 const FRAME_FROM_CLOUD: PoseFields =
     PoseFields { position: "frame_from_cloud.position", orientation: "frame_from_cloud.orientation" };
 
-/// The cube in which grasps are looked for, checked.
+/// The validated workspace.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Workspace {
-    /// `T_frame_task`.
+    /// `T_frame_task`: pose of the workspace in the caller's frame.
     pub frame_from_task: Isometry3<f64>,
-    /// Edge, metres; the model's own, where it is `None`.
+    /// Edge, metres; `None` means the size of the model.
     pub size: Option<f64>,
-    /// The frame of the grasps.
+    /// Name of the caller's frame.
     pub frame_id: String,
-    /// When the views were taken.
+    /// Time at which the views were taken.
     pub stamp: Option<prost_types::Timestamp>,
 }
 
-/// What one camera saw as points of the task frame, with where it stood.
+/// The points of one camera, in the task frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Points {
-    /// Metres.
+    /// The points, metres.
     pub points: Vec<Point3<f64>>,
-    /// The camera.
+    /// Position of the camera, metres.
     pub eye: Point3<f64>,
 }
 
@@ -55,7 +55,7 @@ impl TryFrom<pb::Workspace> for Workspace {
             return Err(FieldError::new(
                 "workspace.size",
                 size,
-                "must be above 0 and at most 100 m, or 0 for the model's",
+                "must be above 0 and at most 100 m, or 0 for the size of the model",
             ));
         }
         let frame_from_task = pose.map_or(Ok(Isometry3::identity()), |pose| pose::decode(&pose, &WORKSPACE))?;
@@ -63,10 +63,10 @@ impl TryFrom<pb::Workspace> for Workspace {
     }
 }
 
-/// Checks how many views there are.
+/// Checks the number of views.
 ///
 /// # Errors
-/// [`FieldError`] when there are none or too many.
+/// [`FieldError`] if there are none or more than [`MAX_VIEWS`].
 pub fn check_count(views: usize) -> Result<(), FieldError> {
     if (1..=MAX_VIEWS).contains(&views) {
         return Ok(());
@@ -74,10 +74,10 @@ pub fn check_count(views: usize) -> Result<(), FieldError> {
     Err(FieldError::new("views", format_args!("a list of {views}"), format_args!("must have from 1 to {MAX_VIEWS}")))
 }
 
-/// The depth image number `index`, in metres, and its camera's pose to the task frame.
+/// Converts depth view `index`: depth in metres, row by row, and the camera pose in the task frame.
 ///
 /// # Errors
-/// [`FieldError`] names what is not what it must be.
+/// [`FieldError`] names the invalid field of the view.
 pub fn depth_view(view: &pb::DepthView, index: usize, frame_from_task: &Isometry3<f64>) -> Result<View, FieldError> {
     try_depth_view(view, frame_from_task).map_err(|error| error.inside(format_args!("views[{index}]")))
 }
@@ -120,16 +120,16 @@ fn try_depth_view(view: &pb::DepthView, frame_from_task: &Isometry3<f64>) -> Res
     let image = DepthImage::new(intrinsics, &depth).map_err(|error| FieldError::refused("camera", error))?;
     match (image.unit(), view.unit()) {
         (Unit::Millimetres, _) => {
-            let needed =
-                "these look like millimetres: send them as u16 with DEPTH_UNIT_U16_MILLIMETRES, or divide them by 1000";
+            let needed = "must be metres but looks like millimetres: send u16 with DEPTH_UNIT_U16_MILLIMETRES, or divide \
+                          by 1000";
             return Err(FieldError::new("data", "in metres, with a median above 20", needed));
         }
         (Unit::Thousandths, pb::DepthUnit::U16Millimetres) => {
-            let needed = "these look like metres: send them as f32 with DEPTH_UNIT_F32_METRES";
+            let needed = "must be millimetres but looks like metres: send f32 with DEPTH_UNIT_F32_METRES";
             return Err(FieldError::new("data", "in millimetres, with a median below 20", needed));
         }
         (Unit::Thousandths, _) => {
-            let needed = "no such camera sees so near: were they divided by 1000 twice?";
+            let needed = "is closer than depth cameras measure: check that the values were not divided by 1000 twice";
             return Err(FieldError::new("data", "in metres, with a median below 0.02", needed));
         }
         (Unit::Metres, _) => {}
@@ -137,7 +137,7 @@ fn try_depth_view(view: &pb::DepthView, frame_from_task: &Isometry3<f64>) -> Res
     Ok(View { intrinsics, depth, camera_from_task })
 }
 
-/// The intrinsic matrix, as cameras' drivers give it.
+/// Validates the intrinsic matrix.
 fn intrinsics(camera: &pb::Camera) -> Result<Intrinsics, FieldError> {
     const FORM: &str = "must be nine numbers, row by row: fx 0 cx, 0 fy cy, 0 0 1";
     for (field, edge) in [("camera.width", camera.width), ("camera.height", camera.height)] {
@@ -154,34 +154,34 @@ fn intrinsics(camera: &pb::Camera) -> Result<Intrinsics, FieldError> {
         return wrong("must be finite");
     }
     if [skew, cx, cy] == [0.0; 3] && (left != 0.0 || right != 0.0) {
-        return wrong("has its principal point in the last row: is it transposed?");
+        return wrong("must have its principal point in the last column: send the matrix row by row, not transposed");
     }
     if [zero, left, right] != [0.0; 3] || (one - 1.0).abs() > 1e-6 {
         return wrong(FORM);
     }
     if skew.abs() > 1e-3 * fx.abs() {
-        return wrong("must have no skew (its second number): rectify the image");
+        return wrong("must have no skew (second number): rectify the image");
     }
     if !(fx > 0.0 && fy > 0.0) {
-        return wrong("must have focal lengths above 0 (its first and fifth number)");
+        return wrong("must have focal lengths above 0 (first and fifth number)");
     }
     let [u, v] = [cx / f64::from(camera.width) - 0.5, cy / f64::from(camera.height) - 0.5];
     if u.abs().min(v.abs()) > OFF_CENTRE && (u - v).abs() <= OFF_CENTRE {
         let needed = format_args!(
-            "must be of an image of {} × {} pixels, and has its principal point (its third and sixth number) far from \
-             the middle: is it of another resolution? If the image was cut out of a larger one, send that",
+            "must be of an image of {} × {} pixels, but its principal point (third and sixth number) is far from the \
+             centre: send the intrinsics of this resolution; if the image was cropped, send the whole image",
             camera.width, camera.height
         );
         return Err(FieldError::new("camera.k", format_args!("{k:?}"), needed));
     }
-    // Both fit: they are at most MAX_EDGE.
+    // No overflow: both are at most MAX_EDGE.
     Ok(Intrinsics { width: camera.width as usize, height: camera.height as usize, fx, fy, cx, cy })
 }
 
-/// The points number `index` and where their camera stood, in the task frame.
+/// Converts cloud view `index`: points and camera position in the task frame, metres.
 ///
 /// # Errors
-/// [`FieldError`] names what is not what it must be.
+/// [`FieldError`] names the invalid field of the view.
 pub fn cloud_view(view: &pb::CloudView, index: usize, frame_from_task: &Isometry3<f64>) -> Result<Points, FieldError> {
     try_cloud_view(view, frame_from_task).map_err(|error| error.inside(format_args!("views[{index}]")))
 }
@@ -209,7 +209,7 @@ fn try_cloud_view(view: &pb::CloudView, frame_from_task: &Isometry3<f64>) -> Res
     };
     let points: Vec<_> = view.points.as_chunks().0.iter().filter_map(point).collect();
     if points.is_empty() {
-        return Err(FieldError::new("points", "NaN throughout", "must have a point that is none"));
+        return Err(FieldError::new("points", "NaN throughout", "must have at least one finite point"));
     }
     Ok(Points { points, eye: task_from_cloud * Point3::new(x, y, z) })
 }
@@ -218,7 +218,7 @@ fn try_cloud_view(view: &pb::CloudView, frame_from_task: &Isometry3<f64>) -> Res
 mod tests {
     use super::*;
 
-    /// A wall half a metre away.
+    /// A wall at a distance of 0.5 m.
     fn view() -> pb::DepthView {
         pb::DepthView {
             data: [500_u16; 12].iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>().into(),
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn each_mistake_is_named() {
+    fn each_invalid_field_is_named() {
         let camera = |k: &[f64]| Some(pb::Camera { width: 4, height: 3, k: k.to_vec() });
         assert_eq!(refused(|v| v.camera = None), "views[1].camera is absent, must be given");
         assert_eq!(
@@ -266,14 +266,14 @@ mod tests {
             "views[1].camera.k is 4 numbers, must be nine numbers, row by row: fx 0 cx, 0 fy cy, 0 0 1"
         );
         let transposed = [5.0, 0.0, 0.0, 0.0, 5.0, 0.0, 2.0, 1.5, 1.0];
-        assert!(refused(|v| v.camera = camera(&transposed)).ends_with("is it transposed?"));
+        assert!(refused(|v| v.camera = camera(&transposed)).ends_with("not transposed"));
         let skewed = [5.0, 0.3, 2.0, 0.0, 5.0, 1.5, 0.0, 0.0, 1.0];
         assert!(refused(|v| v.camera = camera(&skewed)).ends_with("rectify the image"));
         assert!(refused(|v| v.camera = camera(&[0.0; 9])).contains("must be nine numbers"));
         assert!(refused(|v| v.camera = camera(&[f64::NAN; 9])).ends_with("must be finite"));
         for scale in [2.0, 0.75, 0.5] {
             let k = [5.0 * scale, 0.0, 2.0 * scale, 0.0, 5.0 * scale, 1.5 * scale, 0.0, 0.0, 1.0];
-            assert!(refused(|v| v.camera = camera(&k)).contains("is it of another resolution?"));
+            assert!(refused(|v| v.camera = camera(&k)).contains("send the intrinsics of this resolution"));
         }
         let negative = [-5.0, 0.0, 2.0, 0.0, 5.0, 1.5, 0.0, 0.0, 1.0];
         assert!(refused(|v| v.camera = camera(&negative)).contains("focal lengths above 0"));
@@ -295,25 +295,25 @@ mod tests {
     }
 
     #[test]
-    fn an_image_may_be_cut_out_of_a_larger_one() {
+    fn a_cropped_image_is_accepted() {
         let camera = pb::Camera { width: 4, height: 3, k: vec![5.0, 0.0, -1.0, 0.0, 5.0, 1.2, 0.0, 0.0, 1.0] };
         let view = pb::DepthView { camera: Some(camera), ..view() };
         assert_eq!(depth_view(&view, 0, &Isometry3::identity()).unwrap().intrinsics.cx, -1.0);
     }
 
     #[test]
-    fn a_wrong_unit_is_told_and_not_answered_with_nothing() {
+    fn a_wrong_depth_unit_is_an_error() {
         let f32s = |value: f32| [value; 12].iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
         let metres = |value: f32| refused(|v| (v.data, v.unit) = (f32s(value).into(), pb::DepthUnit::F32Metres.into()));
-        assert!(metres(500.0).contains("these look like millimetres"), "{}", metres(500.0));
-        assert!(metres(0.0005).contains("divided by 1000 twice"));
+        assert!(metres(500.0).contains("looks like millimetres"), "{}", metres(500.0));
+        assert!(metres(0.0005).contains("not divided by 1000 twice"));
         let millimetres =
             refused(|v| v.data = [1_u16; 12].iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>().into());
-        assert!(millimetres.contains("these look like metres"), "{millimetres}");
+        assert!(millimetres.contains("looks like metres"), "{millimetres}");
     }
 
     #[test]
-    fn points_are_brought_into_the_task_frame() {
+    fn points_are_transformed_into_the_task_frame() {
         let points: [f32; 6] = [0.1, 0.2, 0.3, f32::NAN, 0.0, 0.0];
         let view = pb::CloudView {
             points: points.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>().into(),
@@ -321,7 +321,7 @@ mod tests {
             camera_position: Some(pb::Vector3::default()),
         };
         let points = cloud_view(&view, 0, &Isometry3::translation(0.5, 0.0, 0.0)).unwrap();
-        let [point] = points.points[..] else { panic!("the NaN is left out") };
+        let [point] = points.points[..] else { panic!("the NaN point is ignored") };
         assert!((point - Point3::new(0.6, 0.2, 0.3)).norm() < 1e-6);
         assert!((points.eye - Point3::new(0.5, 0.0, 0.0)).norm() < 1e-12);
         let refused = |view: pb::CloudView| cloud_view(&view, 2, &Isometry3::identity()).unwrap_err().to_string();
@@ -335,7 +335,7 @@ mod tests {
     }
 
     #[test]
-    fn a_workspace_has_a_size() {
+    fn the_workspace_size_is_checked() {
         let workspace = |size| Workspace::try_from(pb::Workspace { size, ..Default::default() });
         assert_eq!(workspace(0.0).unwrap().size, None);
         assert_eq!(workspace(0.3).unwrap().size, Some(0.3));

@@ -8,11 +8,11 @@ use crate::{FieldError, pb};
 
 const POSE: PoseFields = PoseFields { position: "volume.pose.position", orientation: "volume.pose.orientation" };
 
-/// The resolution that a volume claims, checked against the length of its data: what a model is chosen by, before
-/// anything is converted.
+/// The resolution of a volume message, checked against the length of its data. The server selects the model with it
+/// before the data is converted.
 ///
 /// # Errors
-/// [`FieldError`] when the resolution or the dtype is not supported, or the data's length does not fit them.
+/// [`FieldError`] if the resolution or the dtype is not supported, or the length of the data does not match.
 pub fn resolution(volume: &pb::Volume) -> Result<usize, FieldError> {
     let value_size = match volume.dtype() {
         pb::DataType::F32 => 4,
@@ -40,14 +40,14 @@ pub fn resolution(volume: &pb::Volume) -> Result<usize, FieldError> {
 impl TryFrom<&pb::Volume> for Volume {
     type Error = FieldError;
 
-    /// Checks every field; the data is copied once, while it is widened.
+    /// Validates every field. The data is copied once, during the conversion to f32.
     fn try_from(volume: &pb::Volume) -> Result<Self, FieldError> {
         let resolution = resolution(volume)?;
         let pose = volume.pose.as_ref().map_or(Ok(Isometry3::identity()), |p| pose::decode(p, &POSE))?;
         let values = match volume.dtype() {
             pb::DataType::F16 => widen_f16(&volume.data),
             pb::DataType::U8 => volume.data.iter().map(|&v| f32::from(v) / 255.0).collect(),
-            // `resolution` has refused what is not a type.
+            // `resolution` has rejected an unspecified type.
             pb::DataType::F32 | pb::DataType::Unspecified => {
                 volume.data.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect()
             }
@@ -56,7 +56,7 @@ impl TryFrom<&pb::Volume> for Volume {
     }
 }
 
-/// Through a block on the stack: the bytes need not be aligned, and `half` converts slices with the CPU's instructions.
+/// Converts block by block on the stack: the input may be unaligned, and `half` converts slices with CPU instructions.
 fn widen_f16(data: &[u8]) -> Vec<f32> {
     let mut values = vec![0.0; data.len() / 2];
     let mut block = [f16::ZERO; 512];
@@ -70,8 +70,8 @@ fn widen_f16(data: &[u8]) -> Vec<f32> {
     values
 }
 
-/// Writes a volume as `dtype`, in the frame `frame_id`. U8 rounds to the nearest of 255 steps; what is above 0 stays
-/// above 0, for 0 means unobserved. An unspecified type is written as F32.
+/// Encodes a volume as `dtype`, in the frame `frame_id`. U8 rounds to 1/255; values above 0 stay above 0, because 0
+/// means unobserved. An unspecified type is encoded as F32.
 #[must_use]
 pub fn encode(volume: &Volume, dtype: pb::DataType, frame_id: impl Into<String>) -> pb::Volume {
     let values = volume.values();
@@ -83,7 +83,7 @@ pub fn encode(volume: &Volume, dtype: pb::DataType, frame_id: impl Into<String>)
     pb::Volume {
         data: data.into(),
         dtype: dtype.into(),
-        // At most `Volume::MAX_RESOLUTION`.
+        // No overflow: at most `Volume::MAX_RESOLUTION`.
         resolution: volume.resolution() as u32,
         voxel_size: volume.voxel_size(),
         pose: Some(volume.pose().into()),
@@ -92,7 +92,7 @@ pub fn encode(volume: &Volume, dtype: pb::DataType, frame_id: impl Into<String>)
     }
 }
 
-/// Into a buffer of the final size, which the compiler turns into wide copies.
+/// Writes into a buffer of the final size, which the compiler turns into wide copies.
 fn to_bytes<const N: usize>(values: &[f32], encode: impl Fn(f32) -> [u8; N]) -> Vec<u8> {
     let mut data = vec![0; N * values.len()];
     for (bytes, &value) in data.as_chunks_mut().0.iter_mut().zip(values) {
@@ -119,7 +119,7 @@ mod tests {
 
     use super::*;
 
-    /// A volume of 9³, so that the half-precision blocks do not come out even.
+    /// A volume of 9³ voxels, which is not a multiple of the half-precision block.
     fn volume() -> impl Strategy<Value = Volume> {
         let pose = (-5.0..5.0, -3.0..3.0).prop_map(|(x, turn): (f64, f64)| {
             Isometry3::new(nalgebra::Vector3::new(x, -x, 1.0), nalgebra::Vector3::new(0.0, turn, 0.4))
@@ -130,7 +130,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_encoded_is_decoded(volume in volume()) {
+        fn encoding_and_decoding_round_trips(volume in volume()) {
             for (dtype, error) in [(pb::DataType::F32, 0.0), (pb::DataType::F16, 0.00025), (pb::DataType::U8, 0.00393)] {
                 let message = encode(&volume, dtype, "base");
                 let decoded = Volume::try_from(&message).unwrap();
@@ -138,13 +138,13 @@ mod tests {
                 prop_assert_eq!((decoded.resolution(), decoded.voxel_size()), (9, 0.01));
                 for (decoded, value) in decoded.values().iter().zip(volume.values()) {
                     prop_assert!((decoded - value).abs() <= error, "{} became {}", value, decoded);
-                    prop_assert_eq!(*decoded == 0.0, *value == 0.0, "0 means unobserved, and nothing else does");
+                    prop_assert_eq!(*decoded == 0.0, *value == 0.0, "exactly the unobserved values are 0");
                 }
             }
         }
 
         #[test]
-        fn bytes_need_not_be_aligned(volume in volume(), offset in 0..4_usize) {
+        fn unaligned_data_is_decoded(volume in volume(), offset in 0..4_usize) {
             for dtype in [pb::DataType::F32, pb::DataType::F16] {
                 let mut message = encode(&volume, dtype, "");
                 let wanted = Volume::try_from(&message).unwrap();
@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn the_length_is_checked_before_anything_is_converted() {
+    fn the_length_is_checked_without_converting_the_data() {
         let message = pb::Volume { dtype: pb::DataType::F16.into(), resolution: 256, ..Default::default() };
         let error = resolution(&message).unwrap_err();
         assert_eq!(error.field, "volume.data");

@@ -18,145 +18,144 @@ use crate::serving::reload::{Stamps, stamps};
 use crate::transport::request_body::Limits;
 use crate::transport::tokens::Tokens;
 
-/// Everything that can be set, checked.
+/// The validated configuration.
 pub(crate) struct Config {
     pub store: Store,
-    /// Of the store's files, from before they were read.
+    /// Taken before the store's files were read.
     pub stamps: Stamps,
     pub default_model: Option<String>,
     pub listen: SocketAddr,
     pub http: SocketAddr,
-    /// Sessions of each model.
+    /// Sessions per model.
     pub workers: usize,
-    /// Threads of each session.
+    /// Threads per session.
     pub threads: usize,
-    /// What runs the models; the machine's choice where there is none.
+    /// Execution provider; None selects the fastest that the machine supports.
     pub provider: Option<Provider>,
-    /// In which numbers.
+    /// Numeric precision; None selects the fastest.
     pub precision: Option<Precision>,
-    /// Threads that move messages.
+    /// Threads of the async runtime.
     pub io_threads: usize,
-    /// Requests of each model that may wait.
+    /// Queued requests per model.
     pub queue: usize,
-    /// How many volumes a session takes at once.
     pub batching: Batching,
-    /// How often it is looked whether the models have changed.
+    /// Interval at which the model folder is polled; None disables polling.
     pub watch: Option<Duration>,
-    /// The server's certificate, and whose clients it takes.
+    /// The server's certificate, and the CA of client certificates.
     pub tls: Option<ServerTlsConfig>,
     pub tokens: Option<Arc<Tokens>>,
     pub max_connections: usize,
     pub limits: Limits,
-    /// Volumes that are kept from view to view.
+    /// Concurrent TrackGrasps streams, each with one volume.
     pub max_tracked: usize,
-    /// For how long, without a view.
+    /// Time without a request after which a TrackGrasps stream ends.
     pub track_timeout: Duration,
-    /// Requests that the page shows; none where there is no page.
+    /// Requests that the page shows; 0 disables the page.
     pub recent: usize,
     pub drain_timeout: Duration,
-    /// Where traces go.
+    /// URL of the OpenTelemetry collector.
     pub otlp: Option<String>,
     pub log: String,
     pub log_format: LogFormat,
 }
 
-/// Requests that the page shows, unless told otherwise: their volumes are 5 MB.
+/// Default of `--recent`; the volumes of that many requests take 5 MB.
 const RECENT: usize = 20;
 
-/// How the log is written.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum LogFormat {
     Text,
     Json,
 }
 
-/// Answers volumes with 6-DoF grasps over gRPC.
+/// Detects 6-DoF grasps in depth images, point clouds and TSDF volumes, over gRPC.
 ///
-/// Every flag can be given by the environment too. ORT_DYLIB_PATH names ONNX Runtime's shared library.
+/// Each flag can also be set by an environment variable. ORT_DYLIB_PATH is the path of ONNX Runtime's shared library.
 //
-// Values are read as text and checked together, so that one run reports every mistake.
+// Flags are parsed as text and validated together, so that one run reports every invalid value.
 #[derive(Parser)]
 #[command(name = "graspd", version, max_term_width = 100)]
 struct Flags {
-    /// Folder whose .onnx files are served.
+    /// Model folder. All .onnx files in it are served.
     #[arg(long, env = "GRASPD_MODELS", value_name = "DIR")]
     models: Option<PathBuf>,
 
-    /// Model that answers requests which name none, if their volume fits it. By default the one that the file `default` in
-    /// the folder of models names, else the first by name.
+    /// Model for requests that name no model, if it accepts their resolution. If not set, the file `default` in the
+    /// model folder names it; without that file it is the first network by name.
     #[arg(long, env = "GRASPD_DEFAULT_MODEL", value_name = "NAME")]
     default_model: Option<String>,
 
-    /// Address of the gRPC listener. Port 0 takes a free one; stdout says which.
+    /// Address of the gRPC listener. Port 0 selects a free port, which is printed to stdout.
     #[arg(long, env = "GRASPD_LISTEN", value_name = "ADDR", default_value = "127.0.0.1:50051")]
     listen: String,
 
-    /// Address of the HTTP listener: /metrics for Prometheus, /healthz, /readyz.
+    /// Address of the HTTP listener: /metrics (Prometheus), /healthz, /readyz and the web page at /.
     #[arg(long, env = "GRASPD_HTTP", value_name = "ADDR", default_value = "127.0.0.1:9090")]
     http: String,
 
-    /// Sessions of each model: requests that it answers at the same time.
+    /// Sessions per model. Each session processes one batch at a time.
     #[arg(long, env = "GRASPD_WORKERS", value_name = "N", default_value = "1")]
     workers: String,
 
-    /// Threads of each session. By default the CPUs that this process may use, divided by --workers.
+    /// Threads per session. Default: the CPUs available to the process divided by --workers.
     #[arg(long, env = "GRASPD_THREADS", value_name = "N")]
     threads: Option<String>,
 
-    /// What runs the models: cpu, openvino, cuda or tensorrt, or it is an error. auto takes the fastest that this machine
-    /// and this ONNX Runtime have, and that gives the answers that cpu gives.
+    /// Execution provider of ONNX Runtime: cpu, openvino, cuda, tensorrt or auto. auto selects the fastest provider
+    /// that is available and whose outputs match those of cpu in fp32. A named provider that is not available is an
+    /// error.
     #[arg(long, env = "GRASPD_PROVIDER", value_name = "NAME", default_value = "auto")]
     provider: String,
 
-    /// The numbers they are computed in: fp32, bf16, fp16 or int8, or it is an error. auto takes the fastest.
+    /// Numeric precision: fp32, bf16, fp16, int8 or auto. auto selects the fastest. A named precision that is not
+    /// available is an error.
     #[arg(long, env = "GRASPD_PRECISION", value_name = "NAME", default_value = "auto")]
     precision: String,
 
-    /// Requests of each model that may wait for a session. Further ones are refused at once.
+    /// Queue length per model, requests. If the queue is full, requests are refused immediately.
     #[arg(long, env = "GRASPD_QUEUE", value_name = "N", default_value = "32")]
     queue: String,
 
-    /// Volumes that a session takes at once, if so many wait. More than 1 serves more volumes on a card; on a CPU it only
-    /// makes each wait for the others.
+    /// Maximum batch size, volumes. Values above 1 raise the throughput on a GPU. On a CPU they only raise the latency.
     #[arg(long, env = "GRASPD_MAX_BATCH", value_name = "N", default_value = "1")]
     max_batch: String,
 
-    /// How long a session that could take more volumes waits for them, counted from the first, milliseconds. 0 takes what
-    /// is there.
+    /// Maximum time that a session waits for a batch to fill, from the arrival of its first volume, milliseconds. 0
+    /// disables waiting.
     #[arg(long, env = "GRASPD_BATCH_DELAY", value_name = "MS", default_value = "0", allow_negative_numbers = true)]
     batch_delay: String,
 
-    /// How often it is looked whether files of the folder have changed, seconds: what is new is loaded and warmed up
-    /// beside what is served, then served instead. With 0 nobody looks; SIGHUP loads anew in any case.
+    /// Interval at which the model folder is polled for changes, seconds. Changed models are loaded and warmed up in
+    /// the background, then replace the old ones. 0 disables polling. SIGHUP always reloads the folder.
     #[arg(long, env = "GRASPD_WATCH", value_name = "SECONDS", default_value = "2", allow_negative_numbers = true)]
     watch: String,
 
-    /// Certificate that the gRPC listener shows, with those between it and its CA, PEM. With it TLS is spoken, alone.
+    /// Certificate chain of the gRPC listener, PEM. Enables TLS; plaintext connections are then refused.
     #[arg(long, env = "GRASPD_TLS_CERT", value_name = "FILE")]
     tls_cert: Option<PathBuf>,
 
-    /// The certificate's private key, PEM.
+    /// Private key of the certificate, PEM.
     #[arg(long, env = "GRASPD_TLS_KEY", value_name = "FILE")]
     tls_key: Option<PathBuf>,
 
-    /// Take only clients that show a certificate of one of these CAs, PEM.
+    /// CA certificates, PEM. Clients must present a certificate that one of them has signed (mutual TLS).
     #[arg(long, env = "GRASPD_TLS_CLIENT_CA", value_name = "FILE")]
     tls_client_ca: Option<PathBuf>,
 
-    /// Take only requests that bring one of the tokens in this file, one in a line, as `authorization: Bearer TOKEN`.
-    /// SIGHUP reads it anew. Health is told without.
+    /// File of access tokens, one per line. Requests must have the header `authorization: Bearer TOKEN` with one of
+    /// them. SIGHUP reloads the file. Health checks need no token.
     #[arg(long, env = "GRASPD_TOKEN_FILE", value_name = "FILE")]
     token_file: Option<PathBuf>,
 
-    /// Connections that may be open at a time. Further ones are closed at once.
+    /// Maximum number of open connections. Further connections are closed immediately.
     #[arg(long, env = "GRASPD_MAX_CONNECTIONS", value_name = "N", default_value = "16384")]
     max_connections: String,
 
-    /// Volumes that are kept from view to view, one for each call of TrackGrasps. Further calls are refused.
+    /// Maximum number of concurrent TrackGrasps streams, each with one volume. Further streams are refused.
     #[arg(long, env = "GRASPD_MAX_TRACKED", value_name = "N", default_value = "64")]
     max_tracked: String,
 
-    /// How long a volume is kept without a request, seconds. Then the call ends.
+    /// Time without a request after which a TrackGrasps stream ends and its volume is dropped, seconds.
     #[arg(
         long,
         env = "GRASPD_TRACK_TIMEOUT",
@@ -166,12 +165,12 @@ struct Flags {
     )]
     track_timeout: String,
 
-    /// The latest requests that are kept to be looked at, with what was seen, on the page of the HTTP listener. 0 for no
-    /// page, which is also the default with --token-file: whoever reaches that listener sees it.
+    /// Number of latest requests shown on the web page of the HTTP listener, with their scenes. 0 disables the page.
+    /// Default: 20, or 0 with --token-file, because the page needs no token.
     #[arg(long, env = "GRASPD_RECENT", value_name = "N")]
     recent: Option<String>,
 
-    /// How long a message may stand still in the middle, seconds.
+    /// Maximum pause within a message, seconds. After it the request is refused.
     #[arg(
         long,
         env = "GRASPD_STALL_TIMEOUT",
@@ -181,11 +180,11 @@ struct Flags {
     )]
     stall_timeout: String,
 
-    /// Largest message that is taken, bytes.
+    /// Maximum message size, bytes.
     #[arg(long, env = "GRASPD_MAX_MESSAGE_BYTES", value_name = "N", default_value = "16777216")]
     max_message_bytes: String,
 
-    /// After SIGTERM, how long requests that were taken may still run, seconds.
+    /// Time that accepted requests have to finish after SIGTERM, seconds.
     #[arg(
         long,
         env = "GRASPD_DRAIN_TIMEOUT",
@@ -195,34 +194,35 @@ struct Flags {
     )]
     drain_timeout: String,
 
-    /// Collector of OpenTelemetry that gets a trace of each request, over gRPC without TLS, such as http://127.0.0.1:4317.
-    /// A request that brings a W3C traceparent is a part of its caller's trace. By default nobody gets any.
+    /// OpenTelemetry collector that receives a trace of each request, over OTLP/gRPC without TLS, such as
+    /// http://127.0.0.1:4317. Requests with a W3C `traceparent` header join that trace. If not set, tracing is
+    /// disabled.
     #[arg(long, env = "GRASPD_OTLP", value_name = "URL")]
     otlp: Option<String>,
 
-    /// What is logged to stderr: a level, or tracing's directives such as `warn,graspd=debug`.
+    /// Log filter: a level, or directives of Rust's `tracing` such as `warn,graspd=debug`. The log goes to stderr.
     #[arg(long, env = "GRASPD_LOG", value_name = "FILTER", default_value = "info")]
     log: String,
 
-    /// How the log is written: text or json.
+    /// Log format: text or json.
     #[arg(long, env = "GRASPD_LOG_FORMAT", value_name = "FORMAT", default_value = "text")]
     log_format: String,
 }
 
-/// Every mistake in the configuration.
+/// All errors of a configuration.
 #[derive(Debug, Default)]
 pub(crate) struct ConfigErrors(Vec<String>);
 
 impl Config {
-    /// From the command line and the environment. `--help` and unknown flags end the process, as clap does.
+    /// Reads the command line and the environment. clap ends the process on `--help` and on unknown flags.
     pub fn from_args() -> Result<Self, ConfigErrors> {
         Self::new(Flags::parse())
     }
 
     fn new(flags: Flags) -> Result<Self, ConfigErrors> {
-        const ADDRESS: &str = "an address and a port, such as 127.0.0.1:50051";
+        const ADDRESS: &str = "an IP address and a port, such as 127.0.0.1:50051";
         const COUNT: &str = "a whole number from 1 to 1024";
-        const BYTES: &str = "a whole number of bytes above 0";
+        const BYTES: &str = "a whole number of bytes greater than 0";
         let cpus = available_parallelism().map_or(1, NonZeroUsize::get);
         let mut errors = ConfigErrors::default();
 
@@ -238,12 +238,12 @@ impl Config {
         let queue = errors.parse("queue", &flags.queue, COUNT).map(|Count(queue)| queue);
         let max_batch = errors.parse("max-batch", &flags.max_batch, COUNT).map(|Count(volumes)| volumes);
         let batch_delay = errors
-            .parse("batch-delay", &flags.batch_delay, "a number of milliseconds from 0 to a million")
+            .parse("batch-delay", &flags.batch_delay, "a number of milliseconds from 0 to 1,000,000")
             .map(|Seconds(milliseconds)| milliseconds / 1000);
         let watch = errors.seconds("watch", &flags.watch);
         let max_message_bytes = errors.parse("max-message-bytes", &flags.max_message_bytes, BYTES);
         let max_connections =
-            errors.parse::<NonZeroUsize>("max-connections", &flags.max_connections, "a whole number above 0");
+            errors.parse::<NonZeroUsize>("max-connections", &flags.max_connections, "a whole number greater than 0");
         let max_tracked = errors.parse("max-tracked", &flags.max_tracked, COUNT).map(|Count(volumes)| volumes);
         let track_timeout = errors.seconds("track-timeout", &flags.track_timeout);
         let recent = match &flags.recent {
@@ -252,7 +252,7 @@ impl Config {
         };
         let stall = errors.seconds("stall-timeout", &flags.stall_timeout);
         if stall == Some(Duration::ZERO) {
-            errors.add("stall-timeout", "is 0, nobody could say a word; it must be above");
+            errors.add("stall-timeout", "is 0, must be greater than 0");
         }
         let tls = errors.tls(flags.tls_cert.as_deref(), flags.tls_key.as_deref(), flags.tls_client_ca.as_deref());
         let tokens = flags.token_file.map(Tokens::read).transpose();
@@ -266,7 +266,7 @@ impl Config {
         let store = match flags.models {
             Some(models) => Store::open(&models).map_err(|error| errors.add("models", error)).ok(),
             None => {
-                errors.add("models", "is missing: name the folder that holds the .onnx files");
+                errors.add("models", "is missing: set it to the folder that contains the .onnx files");
                 None
             }
         };
@@ -287,7 +287,7 @@ impl Config {
                 threads: threads?,
                 provider: provider.map(|Choice(provider)| provider)?,
                 precision: precision.map(|Choice(precision)| precision)?,
-                // A request costs them a tenth of a millisecond: more than four would only take CPUs from the networks.
+                // A request takes 0.1 ms of their time. More than four would only take CPUs from the networks.
                 io_threads: cpus.min(4),
                 queue: queue?,
                 batching: Batching { max: max_batch?, delay: batch_delay? },
@@ -320,13 +320,13 @@ impl ConfigErrors {
         None
     }
 
-    /// No TLS, or all that it needs.
+    /// The TLS configuration from its files; None without TLS, an error if a file is missing or unreadable.
     fn tls(&mut self, cert: Option<&Path>, key: Option<&Path>, ca: Option<&Path>) -> Option<Option<ServerTlsConfig>> {
         let (cert, key) = match (cert, key, ca) {
             (None, None, None) => return Some(None),
             (Some(cert), Some(key), _) => (cert, key),
-            (None, ..) => return self.refuse("tls-cert", "is missing, --tls-key and --tls-client-ca need it"),
-            (_, None, _) => return self.refuse("tls-key", "is missing, --tls-cert needs it"),
+            (None, ..) => return self.refuse("tls-cert", "is missing, --tls-key and --tls-client-ca require it"),
+            (_, None, _) => return self.refuse("tls-key", "is missing, --tls-cert requires it"),
         };
         let cert = self.read("tls-cert", cert);
         let key = self.read("tls-key", key);
@@ -343,23 +343,23 @@ impl ConfigErrors {
     }
 
     fn parse<T: FromStr>(&mut self, flag: &str, value: &str, expected: &str) -> Option<T> {
-        value.parse().map_err(|_| self.add(flag, format_args!("is `{value}`, it must be {expected}"))).ok()
+        value.parse().map_err(|_| self.add(flag, format_args!("is `{value}`, must be {expected}"))).ok()
     }
 
     fn seconds(&mut self, flag: &str, value: &str) -> Option<Duration> {
-        self.parse(flag, value, "a number of seconds from 0 to a million").map(|Seconds(duration)| duration)
+        self.parse(flag, value, "a number of seconds from 0 to 1,000,000").map(|Seconds(duration)| duration)
     }
 }
 
 impl Display for ConfigErrors {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        writeln!(f, "graspd: {} in the configuration:", if self.0.len() == 1 { "a mistake" } else { "mistakes" })?;
+        writeln!(f, "graspd: invalid configuration:")?;
         self.0.iter().try_for_each(|error| writeln!(f, "  {error}"))?;
-        writeln!(f, "`graspd --help` says what each flag means.")
+        writeln!(f, "See `graspd --help` for all flags.")
     }
 }
 
-/// Of threads, or of requests that wait: a thousand volumes are more than anyone waits for.
+/// A number of threads, sessions, volumes or queued requests, from 1 to 1024.
 struct Count(usize);
 
 impl FromStr for Count {
@@ -377,7 +377,7 @@ impl FromStr for Seconds {
 
     fn from_str(text: &str) -> Result<Self, ()> {
         let seconds: f64 = text.parse().map_err(drop)?;
-        // Longer ones could not be added to a moment.
+        // Adding a much longer duration to an `Instant` would overflow.
         if seconds > 1e6 {
             return Err(());
         }

@@ -20,7 +20,7 @@ use crate::serving::registry::ModelRegistry;
 use crate::telemetry::metrics::Metrics;
 use crate::telemetry::recent::RecentRequests;
 
-/// What the HTTP listener shows.
+/// State shared by the HTTP handlers.
 #[derive(Clone)]
 pub(crate) struct HttpState {
     pub metrics: Arc<Metrics>,
@@ -28,15 +28,14 @@ pub(crate) struct HttpState {
     pub recent: Arc<RecentRequests>,
 }
 
-/// What a machine asks over HTTP: Prometheus its metrics, an orchestrator whether to restart or to send requests. And a page
-/// for people, with what it reads.
+/// Serves `/metrics` for Prometheus, the probes `/healthz` and `/readyz`, and the web page with its API.
 pub(crate) async fn serve(listener: TcpListener, pages: HttpState, state: watch::Receiver<State>) -> io::Result<()> {
     let (metrics, now) = (Arc::clone(&pages.metrics), state.clone());
     let mut app = Router::new()
         .route("/metrics", get(async move || ([(CONTENT_TYPE, Metrics::CONTENT_TYPE)], metrics.render(*now.borrow()))))
         .route("/healthz", get("ok\n"))
         .route("/readyz", get(async move || readiness(*state.borrow())));
-    if pages.recent.is_kept() {
+    if pages.recent.is_enabled() {
         let page = Router::new()
             .route("/", get(Html(include_str!("http/page.html"))))
             .route("/api/requests", get(requests))
@@ -56,19 +55,19 @@ fn readiness(state: State) -> impl IntoResponse {
     }
 }
 
-/// The latest requests in short, the last one first.
+/// Summaries of the latest requests, newest first.
 async fn requests(Shared(pages): Shared<HttpState>) -> Json<Value> {
     Json(pages.recent.list())
 }
 
-/// One of them, with the observed surface and the grasps.
+/// One request with its surface mesh and grasps.
 async fn request(Path(number): Path<u64>, Shared(pages): Shared<HttpState>) -> Result<Json<Value>, StatusCode> {
-    // A mesh takes some milliseconds, which the threads that move messages do not have.
+    // Meshing takes milliseconds, too long for the threads of the async runtime.
     let found = tokio::task::spawn_blocking(move || pages.recent.get(number)).await;
     found.ok().flatten().map(Json).ok_or(StatusCode::NOT_FOUND)
 }
 
-/// What is served, and what runs it.
+/// The served models with their provider and precision.
 async fn models(Shared(pages): Shared<HttpState>) -> Json<Value> {
     let model = |engine: &Arc<crate::serving::engine::Engine>| {
         json!({
@@ -81,7 +80,7 @@ async fn models(Shared(pages): Shared<HttpState>) -> Json<Value> {
     Json(pages.models.now().iter().map(model).collect())
 }
 
-/// The number of the last request, whenever there is another.
+/// Server-sent events: the number of the latest request, on each new request.
 async fn events(Shared(pages): Shared<HttpState>) -> Sse<impl Stream<Item = Result<Event, Infallible>>> {
     let numbers = WatchStream::new(pages.recent.last());
     Sse::new(numbers.map(|number| Ok(Event::default().data(number.to_string())))).keep_alive(KeepAlive::default())

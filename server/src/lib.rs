@@ -1,7 +1,8 @@
-//! graspd: grasps for what a depth camera sees, over gRPC.
+//! graspd: a gRPC service that detects grasps in depth images, point clouds and TSDF volumes.
 //!
-//! A request goes from `transport` (connections, TLS, tokens, limits) through `rpc` (messages, refusals) to `serving`
-//! (model registry, queues, sessions), and back. `telemetry` observes it, `http` shows it.
+//! A request passes from `transport` (connections, TLS, tokens, limits) through `rpc` (messages, refusals) to `serving`
+//! (model registry, queues, sessions). `telemetry` records logs, traces and metrics; `http` serves metrics, probes and
+//! a web page.
 
 mod config;
 mod http;

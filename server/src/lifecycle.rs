@@ -1,4 +1,4 @@
-//! From the command line to the end of the drain.
+//! Startup, serving and shutdown of the process.
 
 use std::io::Write;
 use std::net::SocketAddr;
@@ -28,7 +28,7 @@ use crate::telemetry::recent::RecentRequests;
 use crate::telemetry::subscriber::{self, Log, Traces};
 use crate::transport::listener::{self, GrpcConfig};
 
-/// Runs graspd as its command line says, until it is told to stop.
+/// Runs graspd with the configuration of the command line and the environment, until SIGTERM or SIGINT.
 #[must_use]
 pub fn run() -> ExitCode {
     let config = match Config::from_args() {
@@ -39,7 +39,7 @@ pub fn run() -> ExitCode {
         }
     };
     let started = runtime(&config).and_then(|runtime| Ok((subscriber::init(&config, &runtime)?, runtime)));
-    // The log outlives all that logs.
+    // The log must outlive everything that writes to it.
     let ((log, traces), runtime) = match started {
         Ok(started) => started,
         Err(error) => {
@@ -56,42 +56,41 @@ pub fn run() -> ExitCode {
     }
 }
 
-/// How long those are waited for who are still computing when the process ends.
-const PATIENCE: Duration = Duration::from_secs(2);
+/// How long the shutdown waits for tasks and sessions that are still running.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// The threads that move messages.
 fn runtime(config: &Config) -> anyhow::Result<Runtime> {
     let mut builder = tokio::runtime::Builder::new_multi_thread();
     let builder = builder.worker_threads(config.io_threads).thread_name("grpc").enable_all();
-    builder.build().context("cannot start the runtime's threads")
+    builder.build().context("cannot start the threads of the async runtime")
 }
 
-/// From the configuration to the last session dropped.
+/// Starts the runtime's tasks, serves, and joins the session threads.
 fn serve_until_stopped(config: &Config, runtime: Runtime, log: &Log, traces: &Traces) -> anyhow::Result<()> {
     let connections = allow_connections(config.max_connections);
     let onnxruntime = grasp_models::init()?;
-    info!(version = onnxruntime.version, library = %onnxruntime.library.display(), "ONNX Runtime");
+    info!(version = onnxruntime.version, library = %onnxruntime.library.display(), "ONNX Runtime loaded");
 
     let metrics = Arc::new(Metrics::new(log.dropped.clone()));
     let sessions = Arc::new(SessionThreads::default());
     let served = runtime.block_on(serve(config, connections, &metrics, &sessions));
     traces.finish();
-    // With the runtime the last way to reach the sessions goes.
-    runtime.shutdown_timeout(PATIENCE);
-    // No session should still be inside ONNX Runtime when the process ends.
-    sessions.join(PATIENCE);
+    // Dropping the runtime's tasks drops the engines, which ends the sessions.
+    runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
+    // ONNX Runtime may crash if the process exits during an inference.
+    sessions.join(SHUTDOWN_TIMEOUT);
     served
 }
 
-/// From binding the listeners to the end of the drain.
+/// Binds the listeners, loads the models, serves, and drains.
 async fn serve(
     config: &Config,
     connections: usize,
     metrics: &Arc<Metrics>,
     sessions: &Arc<SessionThreads>,
 ) -> anyhow::Result<()> {
-    let mut signals = Signals::new().context("cannot handle signals")?;
-    let hangup = hangup().context("cannot handle signals")?;
+    let mut signals = Signals::new().context("cannot install a signal handler")?;
+    let hangup = hangup().context("cannot install a signal handler")?;
     let grpc = bind(config.listen, "--listen").await?;
     let http = bind(config.http, "--http").await?;
     announce(&format!("grpc listening on {}", grpc.local_addr()?));
@@ -106,21 +105,21 @@ async fn serve(
     let Config { tls, tokens, limits, max_tracked, track_timeout, queue, .. } = config;
     let calls = Calls::new(Arc::clone(metrics), recent, state.clone());
     let inference = InferenceRpc::new(Arc::clone(&models), calls.clone());
-    let kept = TrackedVolumes::new(*max_tracked, *track_timeout, metrics.tracked());
-    let service = GraspRpc::new(Arc::clone(&models), calls, kept, *queue);
+    let tracked_volumes = TrackedVolumes::new(*max_tracked, *track_timeout, metrics.tracked());
+    let service = GraspRpc::new(Arc::clone(&models), calls, tracked_volumes, *queue);
     if let Some(tokens) = tokens {
-        tokio::spawn(Arc::clone(tokens).watch(self::hangup().context("cannot handle signals")?));
+        tokio::spawn(Arc::clone(tokens).watch(self::hangup().context("cannot install a signal handler")?));
     }
-    let entrance = GrpcConfig { tls: tls.clone(), tokens: tokens.clone(), connections, limits: *limits };
+    let grpc_config = GrpcConfig { tls: tls.clone(), tokens: tokens.clone(), connections, limits: *limits };
     let mut grpc =
-        tokio::spawn(listener::serve(grpc, entrance, service, inference, Arc::clone(metrics), state.clone()));
+        tokio::spawn(listener::serve(grpc, grpc_config, service, inference, Arc::clone(metrics), state.clone()));
 
     let folder = ModelFolder::new(config, models, Arc::clone(sessions), Arc::clone(metrics));
     let entries = config.store.entries().to_vec();
     let mut loading = tokio::task::spawn_blocking(move || folder.load(&entries, &state).map(|()| folder));
     let stopped = tokio::select! {
         loaded = &mut loading => {
-            tokio::spawn(loaded.context("loading the models panicked")??.watch(hangup, config.watch));
+            tokio::spawn(loaded.context("the thread that loads the models panicked")??.watch(hangup, config.watch));
             false
         }
         () = signals.next() => true,
@@ -138,8 +137,8 @@ async fn serve(
     readiness.drain();
     tokio::select! {
         ended = &mut grpc => { ended??; info!("drained") }
-        () = tokio::time::sleep(config.drain_timeout) => warn!("still busy after the drain timeout, leaving"),
-        () = signals.next() => warn!("told twice, leaving"),
+        () = tokio::time::sleep(config.drain_timeout) => warn!("drain timeout: exiting with unfinished requests"),
+        () = signals.next() => warn!("second signal: exiting immediately"),
     }
     http.abort();
     Ok(())
@@ -149,24 +148,29 @@ async fn bind(address: SocketAddr, flag: &str) -> anyhow::Result<TcpListener> {
     TcpListener::bind(address).await.with_context(|| format!("cannot listen on {flag} {address}"))
 }
 
-/// Raises the limit of open files as far as this process may: many systems give 1024 to who does not ask for more. Returns
-/// how many connections may be open then.
+/// Raises the soft limit of open files, often 1024, to the hard limit. Returns the connection limit: `connections`, or
+/// less if the limit of open files is too low.
 fn allow_connections(connections: usize) -> usize {
-    // Models, listeners and logs are files, too.
+    // Files that are not connections: models, listeners, the log.
     const OTHERS: u64 = 64;
     let limit = getrlimit(Resource::Nofile);
     if let Err(error) = setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit }) {
-        warn!(%error, "the limit of open files stays as it is");
+        warn!(%error, "cannot raise the limit of open files");
     }
     let files = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
-    let most = usize::try_from(files.saturating_sub(OTHERS)).unwrap_or(usize::MAX).max(1);
-    if most < connections {
-        warn!(files, connections, most, "fewer files may be open than connections are allowed (--max-connections)");
+    let possible = usize::try_from(files.saturating_sub(OTHERS)).unwrap_or(usize::MAX).max(1);
+    if possible < connections {
+        warn!(
+            open_files = files,
+            max_connections = connections,
+            limit = possible,
+            "the limit of open files is too low for --max-connections; raise it (ulimit -n)"
+        );
     }
-    connections.min(most)
+    connections.min(possible)
 }
 
-/// Tells whoever started this process; it need not be listening.
+/// Prints a line for the parent process. Errors are ignored: stdout may be closed.
 fn announce(line: &str) {
     let _ = writeln!(std::io::stdout(), "{line}");
 }

@@ -9,18 +9,18 @@ use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_server;
 use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse};
 
-/// Where the process is in its life. Health, readiness and the service all read this one value.
+/// Lifecycle state of the process, read by health checks, `/readyz` and the services.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum State {
-    /// Warming up the sessions.
+    /// The models are loaded and warmed up.
     Starting,
-    /// Every session has answered once.
+    /// Every session has completed an inference.
     Ready,
-    /// Told to stop: answers what it has taken, takes nothing more.
+    /// Shutting down: accepted requests are finished, new connections and messages are not accepted.
     Draining,
 }
 
-/// The one who may change the [`State`].
+/// Owner of the [`State`].
 pub(crate) struct Readiness(watch::Sender<State>);
 
 impl Readiness {
@@ -36,7 +36,7 @@ impl Readiness {
         self.0.send_replace(State::Ready);
     }
 
-    /// The last state: it is not told without the sender being dropped, which ends whatever watches.
+    /// Sets the last state and drops the sender, which ends all streams of [`Health::watch`].
     pub fn drain(self) {
         self.0.send_replace(State::Draining);
     }
@@ -44,11 +44,11 @@ impl Readiness {
 
 /// Returns once the state is [`State::Draining`].
 pub(crate) async fn draining(mut state: watch::Receiver<State>) {
-    // An error means that the sender is gone, which leaves nobody to serve for either.
+    // An error means that the sender was dropped, which also ends serving.
     let _ = state.wait_for(|&state| state == State::Draining).await;
 }
 
-/// grpc.health.v1 for the server as a whole (``) and for the services it has.
+/// grpc.health.v1, for the server (empty name) and for each service.
 pub(crate) struct Health(pub watch::Receiver<State>);
 
 #[tonic::async_trait]
@@ -56,7 +56,9 @@ impl health_server::Health for Health {
     async fn check(&self, request: Request<HealthCheckRequest>) -> Result<Response<HealthCheckResponse>, Status> {
         let service = request.into_inner().service;
         if !is_known(&service) {
-            return Err(Status::not_found(format!("no service `{service}`; there is `{SERVICE_NAME}`")));
+            return Err(Status::not_found(format!(
+                "service `{service}` not found; available: `{SERVICE_NAME}`, `{INFERENCE}`"
+            )));
         }
         Ok(Response::new(response(serving_status(*self.0.borrow()))))
     }
@@ -64,7 +66,7 @@ impl health_server::Health for Health {
     type WatchStream = BoxStream<HealthCheckResponse>;
 
     async fn watch(&self, request: Request<HealthCheckRequest>) -> Result<Response<Self::WatchStream>, Status> {
-        // As the protocol has it, an unknown service is no error here: it could come up later.
+        // The protocol requires SERVICE_UNKNOWN here, not an error.
         let known = is_known(&request.into_inner().service);
         let status = move |state| if known { serving_status(state) } else { ServingStatus::ServiceUnknown };
         Ok(Response::new(Box::pin(WatchStream::new(self.0.clone()).map(move |state| Ok(response(status(state)))))))

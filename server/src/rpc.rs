@@ -1,4 +1,4 @@
-//! The calls of `grasp.v1` and of the Open Inference Protocol.
+//! The gRPC services `grasp.v1` and Open Inference Protocol.
 
 pub(crate) mod call;
 pub(crate) mod grasp_service;

@@ -1,4 +1,4 @@
-//! The models that are served: their registry, their queues and session threads, and what is made of a request's views.
+//! The served models: registry, queues, session threads, hot reload, and the fusion of views into scenes.
 
 pub(crate) mod engine;
 pub(crate) mod queue;

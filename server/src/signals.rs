@@ -9,12 +9,12 @@ pub(crate) struct Signals {
 }
 
 impl Signals {
-    /// From here on the signals no longer end the process by themselves.
+    /// Installs the handlers; the signals no longer end the process.
     pub fn new() -> io::Result<Self> {
         Ok(Self { terminate: signal(SignalKind::terminate())?, interrupt: signal(SignalKind::interrupt())? })
     }
 
-    /// Waits for the next of them.
+    /// Waits for the next signal.
     pub async fn next(&mut self) {
         tokio::select! {
             _ = self.terminate.recv() => {}
@@ -23,7 +23,7 @@ impl Signals {
     }
 }
 
-/// SIGHUP, which no longer ends the process either: whoever sends it wants the models loaded anew.
+/// SIGHUP, which reloads the models and the tokens. Installing the handler keeps it from ending the process.
 pub(crate) fn hangup() -> io::Result<Signal> {
     signal(SignalKind::hangup())
 }

@@ -1,4 +1,4 @@
-//! What operators see: the log, traces, metrics, and the latest requests.
+//! Log, traces, metrics, and the latest requests for the web page.
 
 pub(crate) mod metrics;
 pub(crate) mod recent;

@@ -1,4 +1,4 @@
-//! Connections, TLS, tokens, deadlines, and limits on what is received and sent.
+//! Connections, TLS, tokens, deadlines, and limits on messages and buffered responses.
 
 pub(crate) mod connections;
 pub(crate) mod deadline;

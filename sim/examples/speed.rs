@@ -1,4 +1,4 @@
-//! How fast data are made on one core: `make bench-sim`. A table, and as the last line one JSON object.
+//! Speed of data generation on one core: `make bench-sim`. Prints a table, and a JSON object as the last line.
 
 use std::time::Instant;
 
@@ -13,7 +13,7 @@ use serde_json::json;
 
 const SCENES: u64 = 40;
 
-/// Seconds it took to make `SCENES` of one kind, and how much came of it.
+/// Durations in seconds for `SCENES` scenes of one kind, with the number of points and views.
 #[derive(Clone, Copy, Default)]
 struct Times {
     labelling: f64,
@@ -43,7 +43,7 @@ fn main() {
         fusing: sum.fusing + times.fusing,
         views: sum.views + times.views,
     });
-    println!("one core; {SCENES} scenes a row, 120 points of six yaws each, 640×480 views, 40³ voxels");
+    println!("one core; {SCENES} scenes per row, 120 points with six yaws each, 640×480 views, 40³ voxels");
     let ([points, scenes], [generate, render, fuse]) = (all.rates(2 * SCENES), all.milliseconds(2 * SCENES));
     let line = json!({
         "points_per_second_per_core": points,
@@ -83,12 +83,12 @@ impl Times {
         Self { labelling, points, generating, rendering, fusing, views: views.len() }
     }
 
-    /// Points and scenes a second.
+    /// Points and scenes per second.
     fn rates(&self, scenes: u64) -> [f64; 2] {
         [self.points as f64, scenes as f64].map(|count| count / self.labelling)
     }
 
-    /// To generate a scene, and to render and to fuse a view.
+    /// Milliseconds to generate a scene, to render a view and to fuse a view.
     fn milliseconds(&self, scenes: u64) -> [f64; 3] {
         let views = self.views as f64;
         [self.generating / scenes as f64, self.rendering / views, self.fusing / views].map(|seconds| seconds * 1e3)

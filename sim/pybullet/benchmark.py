@@ -1,4 +1,4 @@
-"""The clutter-removal benchmark: grasp after grasp until a table is empty, or nothing works any more."""
+"""The clutter-removal benchmark: grasps are executed until the table is empty or two fail in a row."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from planners import Grasp, Planner, Random, Served
 from world import Attempt, World
 
 MAX_FAILURES = 2
-"""In a row, after which a round ends."""
+"""Failures in a row that end a round."""
 
 
 @dataclass(frozen=True)
-class Game:
-    """What is played, and with what."""
+class BenchmarkConfig:
+    """Scenes, planner and cameras."""
 
     scene: str
     """`packed` or `pile`."""
@@ -30,7 +30,7 @@ class Game:
     planner: str
     """`random` or `grpc:HOST:PORT`."""
     options: Options
-    """What is asked of a server."""
+    """Options of each request."""
     cameras: list[Array]
     noise: bool
     hand: Path
@@ -44,49 +44,49 @@ class Executed:
 
     grasp: Grasp
     proposals: int
-    """Among which it was the best."""
+    """How many grasps the planner proposed."""
     objects: int
-    """On the table before."""
+    """On the table before the attempt."""
     attempt: Attempt
 
 
 @dataclass
 class Round:
-    """One scene, cleared or not."""
+    """One scene, cleared as far as the planner can."""
 
     seed: int
     number: int
     objects: int
-    """On the table at first."""
+    """On the table at the start."""
     executed: list[Executed] = field(default_factory=list)
     ending: str = "cleared"
     """Else `nothing_seen`, `nothing_proposed` or `gave_up`."""
     fusion: list[float] = field(default_factory=list)
-    """Seconds to fuse each observation, where the planner tells."""
+    """Seconds to fuse each observation, if the planner reports them."""
     planning: list[float] = field(default_factory=list)
-    """Seconds of each planning without that."""
+    """Seconds of each planning without fusion."""
 
 
-class Player:
-    """A world and a planner for any number of rounds."""
+class Benchmark:
+    """A world and a planner, for any number of rounds."""
 
-    def __init__(self, game: Game) -> None:
-        self.game = game
-        self.world = World(game.hand)
-        self.served = Served(game.planner.removeprefix("grpc:"), game.options) if game.planner != "random" else None
+    def __init__(self, config: BenchmarkConfig) -> None:
+        self.config = config
+        self.world = World(config.hand)
+        self.served = Served(config.planner.removeprefix("grpc:"), config.options) if config.planner != "random" else None
 
     def play(self, seed: int, number: int) -> Round:
         """Clears the scene of a round as far as the planner can."""
-        game, world = self.game, self.world
-        # A generator for each use: the scene stays the same, whatever the planner and the camera draw.
+        config, world = self.config, self.world
+        # One generator each, so that the scene does not depend on what the planner and the camera draw.
         scene_rng, noise_rng, planner_rng = (np.random.default_rng([seed, number, use]) for use in range(3))
         planner: Planner = self.served or Random(planner_rng)
-        make = world.packed if game.scene == "packed" else world.pile
-        make(game.urdfs, game.count, scene_rng)
+        make = world.packed if config.scene == "packed" else world.pile
+        make(config.urdfs, config.count, scene_rng)
         played = Round(seed, number, len(world.objects))
         failures = 0
         while world.objects:
-            views = observe(world, game.cameras, noise_rng if game.noise else None)
+            views = observe(world, config.cameras, noise_rng if config.noise else None)
             if not sees_anything(views):
                 played.ending = "nothing_seen"
                 break
@@ -107,11 +107,11 @@ class Player:
         return played
 
     def draws(self, played: Round, grasp: Grasp) -> Callable[[], None] | None:
-        """Draws the next attempt of a round, where that is wanted."""
-        folder = self.game.pictures
+        """What draws the next attempt of a round, if pictures are requested."""
+        folder = self.config.pictures
         if folder is None:
             return None
-        path = folder / f"{self.game.scene}-{played.seed}-{played.number:04}-{len(played.executed):02}.png"
+        path = folder / f"{self.config.scene}-{played.seed}-{played.number:04}-{len(played.executed):02}.png"
 
         def draw() -> None:
             # Along the hand's x axis, so that its fingers are side by side.

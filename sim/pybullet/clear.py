@@ -1,4 +1,4 @@
-"""Clears tables with a planner, and says how well it did: `grasp-sim bench` in PyBullet.
+"""Clears tables with a planner and reports its success rates: `grasp-sim bench` in PyBullet.
 
 The scene of a round depends on its seed and its number alone. The last line that is printed is a JSON object.
 """
@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from benchmark import Game, Player, Round
+from benchmark import Benchmark, BenchmarkConfig, Round
 from camera import Array, circle, side
 from graspd import CollisionCheck, Error, Options
 from score import spread, summary
@@ -22,7 +22,7 @@ from world import HAND
 
 
 def arguments() -> argparse.Namespace:
-    """What was asked."""
+    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--scene", choices=["packed", "pile"], default="packed")
     parser.add_argument("--objects", type=Path, required=True, metavar="DIR", help="folder of URDF files")
@@ -34,35 +34,35 @@ def arguments() -> argparse.Namespace:
     )
     parser.add_argument("--count", type=positive, default=5, metavar="N", help="objects a scene")
     parser.add_argument("--planner", type=planner, default="random", help="random, or grpc:HOST:PORT, a running graspd")
-    parser.add_argument("--model", default="", metavar="NAME", help="of the server's, instead of its default")
+    parser.add_argument("--model", default="", metavar="NAME", help="name of a model of the server, instead of its default model")
     parser.add_argument("--threshold", type=share, default=0.9, metavar="T", help="smallest quality of a grasp")
     parser.add_argument(
         "--force",
         type=lambda text: None if text == "none" else share(text),
         default=0.5,
         metavar="T",
-        help="where nothing reaches the threshold, the best grasp down to this quality; none for never",
+        help="if no grasp reaches the threshold, take the best one down to this quality; none disables it",
     )
-    parser.add_argument("--clear", action="store_true", help="drop grasps whose open hand would meet what was seen")
+    parser.add_argument("--clear", action="store_true", help="drop grasps whose open hand would collide with the observed surface")
     parser.add_argument(
         "--views", type=cameras, default="side", help="side[:DEGREES], one side view; or N, so many on VGN's circle"
     )
-    parser.add_argument("--noise", choices=["none", "dex"], default="dex", help="of the depth: the benchmark's is dex")
+    parser.add_argument("--noise", choices=["none", "dex"], default="dex", help="depth noise; the benchmark uses dex")
     parser.add_argument("--rounds", type=positive, default=100, metavar="N", help="scenes for each seed")
-    parser.add_argument("--seed", type=int, default=1, metavar="S", help="the first")
-    parser.add_argument("--seeds", type=positive, default=1, metavar="K", help="so many from there on")
-    parser.add_argument("--hand", type=Path, default=HAND, metavar="URDF", help="with our hand's frames and joints")
-    parser.add_argument("--jobs", type=positive, default=1, metavar="J", help="processes; more make planning slower")
-    parser.add_argument("--attempts", type=Path, metavar="FILE", help="also write a JSON line an attempt")
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="the first seed")
+    parser.add_argument("--seeds", type=positive, default=1, metavar="K", help="number of consecutive seeds")
+    parser.add_argument("--hand", type=Path, default=HAND, metavar="URDF", help="a hand with the frames and joints of sim/hand/hand.urdf")
+    parser.add_argument("--jobs", type=positive, default=1, metavar="J", help="parallel processes; more make each planning slower")
+    parser.add_argument("--attempts", type=Path, metavar="FILE", help="also write one JSON line for each attempt")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="also draw each attempt, the fingers closed")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="also write what is printed here")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="also write the report to this file")
     return parser.parse_args()
 
 
 def positive(text: str) -> int:
-    """A number that counts something."""
+    """A count."""
     if not text.isdecimal() or int(text) == 0:
-        raise argparse.ArgumentTypeError(f"is {text!r}, must be a whole number above 0")
+        raise argparse.ArgumentTypeError(f"is {text!r}, must be an integer greater than 0")
     return int(text)
 
 
@@ -73,19 +73,19 @@ def share(text: str) -> float:
     except ValueError:
         value = math.nan
     if not 0 < value <= 1:
-        raise argparse.ArgumentTypeError(f"is {text!r}, must be above 0 and at most 1")
+        raise argparse.ArgumentTypeError(f"is {text!r}, must be greater than 0 and at most 1")
     return value
 
 
 def planner(text: str) -> str:
-    """`random` or a server."""
+    """`random`, or the address of a server."""
     if text != "random" and not text.startswith("grpc:"):
         raise argparse.ArgumentTypeError(f"is {text!r}, must be random or grpc:HOST:PORT")
     return text
 
 
 def cameras(text: str) -> list[Array]:
-    """Where the cameras stand."""
+    """Camera poses."""
     kind, _, angle = text.partition(":")
     try:
         if kind == "side":
@@ -102,38 +102,38 @@ def part_of(folder: Path, part: str) -> list[Path]:
     urdfs = sorted(folder.glob("*.urdf"))
     kept = [urdf for index, urdf in enumerate(urdfs) if part == "all" or (index % 5 == 4) == (part == "validation")]
     if not kept:
-        raise FileNotFoundError(f"--objects is {folder}: there is no .urdf file in it for --part {part}")
+        raise FileNotFoundError(f"--objects is {folder}: it has no .urdf file for --part {part}")
     return kept
 
 
-def played(game: Game, numbers: list[tuple[int, int]], jobs: int) -> Iterator[Round]:
-    """Plays rounds in their order, each a seed and a number."""
+def played(config: BenchmarkConfig, numbers: list[tuple[int, int]], jobs: int) -> Iterator[Round]:
+    """Plays rounds, each a seed and a number, in order."""
     if jobs == 1:
-        start(game)
+        start(config)
         yield from map(play, numbers)
         return
-    # Bullet and gRPC do not outlive a fork.
-    with multiprocessing.get_context("spawn").Pool(jobs, start, [game]) as pool:
+    # Bullet and gRPC do not survive a fork.
+    with multiprocessing.get_context("spawn").Pool(jobs, start, [config]) as pool:
         yield from pool.imap(play, numbers)
 
 
-# Of this process.
-player: Player
+# One for each process.
+benchmark: Benchmark
 
 
-def start(game: Game) -> None:
-    """Makes a process ready to play."""
-    global player
-    player = Player(game)
+def start(config: BenchmarkConfig) -> None:
+    """Prepares a process."""
+    global benchmark
+    benchmark = Benchmark(config)
 
 
 def play(number: tuple[int, int]) -> Round:
     """Plays a round."""
-    return player.play(*number)
+    return benchmark.play(*number)
 
 
 def attempts(planner: str, rounds: Iterable[Round]) -> Iterator[dict[str, Any]]:
-    """What there is to say of each, under the names of `grasp-sim bench --attempts`."""
+    """A record of each attempt, with the names of `grasp-sim bench --attempts`."""
     for played in rounds:
         for number, executed in enumerate(played.executed):
             grasp, attempt = executed.grasp, executed.attempt
@@ -159,12 +159,12 @@ def attempts(planner: str, rounds: Iterable[Round]) -> Iterator[dict[str, Any]]:
 
 
 def main() -> None:
-    """Plays and reports."""
+    """Runs the benchmark and prints the report."""
     asked = arguments()
     collision = CollisionCheck("filter") if asked.clear else None
     if asked.pictures:
         asked.pictures.mkdir(parents=True, exist_ok=True)
-    game = Game(
+    config = BenchmarkConfig(
         scene=asked.scene,
         urdfs=part_of(asked.objects, asked.part),
         count=asked.count,
@@ -178,7 +178,7 @@ def main() -> None:
     seeds = range(asked.seed, asked.seed + asked.seeds)
     numbers = [(seed, number) for seed in seeds for number in range(asked.rounds)]
     rounds = []
-    for done, latest in enumerate(played(game, numbers, asked.jobs), 1):
+    for done, latest in enumerate(played(config, numbers, asked.jobs), 1):
         rounds.append(latest)
         if sys.stderr.isatty():
             print(f"\r{done} of {len(numbers)} rounds", end="", file=sys.stderr, flush=True)
@@ -194,8 +194,8 @@ def main() -> None:
             "force": asked.force,
             "clear": asked.clear,
         },
-        "setup": f"PyBullet, {asked.scene}, {len(game.urdfs)} objects of {asked.objects} ({asked.part}), "
-        f"{len(game.cameras)} views, noise {asked.noise}, {asked.count} objects a scene, {asked.rounds} rounds, "
+        "setup": f"PyBullet, {asked.scene}, {len(config.urdfs)} objects of {asked.objects} ({asked.part}), "
+        f"{len(config.cameras)} views, noise {asked.noise}, {asked.count} objects a scene, {asked.rounds} rounds, "
         f"seed {asked.seed}, hand {asked.hand}",
     }
     if asked.attempts:

@@ -1,4 +1,4 @@
-"""Where grasps come from: each planner looks at the same depth images and proposes grasps, best first."""
+"""Planners: each gets depth images and proposes grasps, best first."""
 
 from __future__ import annotations
 
@@ -42,14 +42,15 @@ class Planner(Protocol):
 
 
 class Served:
-    """A running graspd, which is sent the depth images."""
+    """A running graspd, which gets the depth images."""
 
     def __init__(self, address: str, options: Options | None = None) -> None:
         self.options = options
-        self.client = Client(address)
+        # GPD on a busy machine takes seconds.
+        self.client = Client(address, timeout=60.0)
 
     def plan(self, views: Sequence[DepthView]) -> Plan:
-        """Asks for grasps. `graspd.Error` if the server refuses or is not there."""
+        """Requests grasps. Raises `graspd.Error` if the server refuses or cannot be reached."""
         found = self.client.detect_from_depth(views, options=self.options)
         grasps = [Grasp(grasp.pose, grasp.width, grasp.quality) for grasp in found.grasps]
         return Plan(grasps, found.latency.fusion)

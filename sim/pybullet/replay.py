@@ -1,7 +1,7 @@
-"""Tries here what `grasp-sim label --export` tried: how often does a success stay one, and a failure?
+"""Replays the trials of `grasp-sim label --export`, and reports how many successes and failures have the same result.
 
-A success is here that the object rose. Scenes in which an object moves by more than 3 mm when they are laid are left
-out. Of each other scene at most 12 successes and 12 failures are tried. The last line that is printed is a JSON object.
+A trial succeeds here if the object rose. Scenes in which an object moves by more than 3 mm when they are placed are
+skipped. Of each other scene at most 12 successes and 12 failures are tried. The last line that is printed is a JSON object.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from score import share, wilson
 from world import HAND, World
 
 MOST_MOVED = 0.003
-"""Metres; an object that moves more stands otherwise here, in another scene."""
+"""Metres; a scene in which an object moves further is skipped."""
 SETTLING_TIME = 0.5
 TRIALS = 12
 """Of each label in a scene."""
@@ -32,7 +32,7 @@ TRIALS = 12
 
 @dataclass(frozen=True)
 class Settings:
-    """How to try."""
+    """How trials are run."""
 
     folders: list[Path]
     hand: Path
@@ -44,12 +44,12 @@ class Settings:
 
 @dataclass(frozen=True)
 class Replay:
-    """A scene that was laid."""
+    """A scene that was placed."""
 
     moved: list[float]
     """How far each object moved, metres."""
     records: list[dict[str, Any]] | None
-    """What became of each trial; None of a scene that stands otherwise."""
+    """The result of each trial; None if the objects moved."""
 
 
 class Replayer:
@@ -60,7 +60,7 @@ class Replayer:
         self.world = World(settings.hand)
 
     def replay(self, scene: dict[str, Any]) -> Replay:
-        """Lays a scene and tries its grasps."""
+        """Places a scene and tries its grasps."""
         world, settings = self.world, self.settings
         rng = np.random.default_rng([settings.seed, scene["scene"]])
         objects = [(self.urdf(each["object"]), each["scale"], pose(each["pose"])) for each in scene["objects"]]
@@ -96,7 +96,7 @@ class Replayer:
         return Replay(moved, records)
 
     def expected(self, trial: dict[str, Any]) -> int:
-        """What became of it there: with contacts allowed, where that was tried, else with none."""
+        """The exported result: with contacts allowed if that was tried, else without contacts."""
         executed = trial.get("executed") if self.settings.allow_contact else None
         return int(trial["label"] if executed is None else executed)
 
@@ -107,7 +107,7 @@ class Replayer:
             if path.is_file():
                 return path
         searched = ", ".join(map(str, self.settings.folders))
-        raise FileNotFoundError(f"there is no {name}.urdf in {searched}: name its folder with --objects")
+        raise FileNotFoundError(f"{name}.urdf not found in {searched}; pass its folder with --objects")
 
 
 def pose(numbers: list[float]) -> Pose:
@@ -132,7 +132,7 @@ def shaken(grasp: Pose, shake: tuple[float, float], rng: np.random.Generator) ->
 
 
 def arguments() -> argparse.Namespace:
-    """What was asked."""
+    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("export", type=Path, help="what grasp-sim label --export wrote")
     parser.add_argument(
@@ -154,7 +154,7 @@ def arguments() -> argparse.Namespace:
     )
     parser.add_argument("--limit", type=positive, default=400, metavar="N", help="successes, and failures, at most")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="of the shaking")
-    parser.add_argument("--hand", type=Path, default=HAND, metavar="URDF", help="with our hand's frames and joints")
+    parser.add_argument("--hand", type=Path, default=HAND, metavar="URDF", help="a hand with the frames and joints of sim/hand/hand.urdf")
     parser.add_argument("--jobs", type=positive, default=1, metavar="J", help="processes")
     parser.add_argument("--records", type=Path, metavar="FILE", help="also write a JSON line a trial")
     return parser.parse_args()

@@ -18,7 +18,7 @@ from hand import MAX_OPENING, STEPS_PER_SECOND, Hand
 from pybullet_utils.bullet_client import BulletClient  # type: ignore[import-untyped]
 
 HAND = Path(__file__).resolve().parent.parent / "hand/hand.urdf"
-"""Our own."""
+"""The Panda hand."""
 
 SIZE = 0.3
 TABLE_HEIGHT = 0.05
@@ -28,14 +28,14 @@ SOLVER_ITERATIONS = 150
 REST_SPEED = 0.01
 """Norm of a resting body's velocity, m/s and rad/s together."""
 REST_CHUNK = 60
-"""Steps between two looks at whether everything rests."""
+"""Steps between two checks that everything rests."""
 
 PREGRASP_DISTANCE = 0.05
 LIFT = 0.1
 STEEPEST_LIFT_BACK = math.pi / 3
 """How far off straight down an approach may be for the hand to lift back along it; else it lifts straight up."""
 EMPTY_OPENING = 0.1 * MAX_OPENING
-"""A hand that is less open holds nothing."""
+"""A hand with a smaller opening holds nothing."""
 LEAST_RISE = 0.03
 WIDEST_OPENING = MAX_OPENING + 0.005
 """Wider, a finger is jammed beyond the end of its range."""
@@ -43,7 +43,7 @@ WIDEST_OPENING = MAX_OPENING + 0.005
 
 @dataclass(frozen=True)
 class Attempt:
-    """What became of a grasp."""
+    """The result of a grasp."""
 
     outcome: str
     """`lifted`, `blocked_at_pregrasp`, `blocked_on_approach`, `closed_on_nothing` or `lost_in_lift`.
@@ -104,7 +104,7 @@ class World:
         try:
             body = int(self.bullet.loadURDF(str(path), pose.position, pose.quaternion, globalScaling=scale))
         except pybullet.error:
-            raise ValueError(f"{path} is not a URDF that PyBullet can load: it says above why") from None
+            raise ValueError(f"{path} is not a URDF that PyBullet can load; its messages above say why") from None
         self.objects[body] = path.stem
         return body
 
@@ -164,7 +164,7 @@ class World:
             self.forget(before)
 
     def settle(self) -> None:
-        """Waits until everything rests, taking away what left the workspace, until nothing leaves any more."""
+        """Simulates until everything rests, and removes objects outside the workspace, until none leaves it."""
         while True:
             self.wait_for_rest(2.0)
             gone = [body for body in self.objects if not all(0 <= c <= SIZE for c in self.position(body))]
@@ -174,7 +174,7 @@ class World:
                 self.remove(body)
 
     def wait_for_rest(self, seconds: float) -> None:
-        """Waits until everything rests, at most so long."""
+        """Simulates until everything rests, at most `seconds`."""
         for _ in range(math.ceil(seconds * STEPS_PER_SECOND / REST_CHUNK)):
             for _ in range(REST_CHUNK):
                 self.bullet.stepSimulation()
@@ -187,11 +187,11 @@ class World:
         return x, y, z
 
     def save(self) -> int:
-        """Remembers how everything stands and moves, until `forget`."""
+        """Saves poses and velocities, until `forget`."""
         return int(self.bullet.saveState())
 
     def restore(self, state: int) -> None:
-        """Puts everything back. The objects must be those that there were."""
+        """Restores poses and velocities. The objects must be the same."""
         self.bullet.restoreState(stateId=state)
 
     def forget(self, state: int) -> None:
@@ -282,5 +282,5 @@ def existing(urdf: str | Path) -> Path:
     """The path, if there is such a file."""
     path = Path(urdf)
     if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}: name a URDF")
+        raise FileNotFoundError(f"{path} not found; pass a URDF file")
     return path

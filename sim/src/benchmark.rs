@@ -1,4 +1,4 @@
-//! The clutter-removal benchmark: grasp after grasp until a table is empty, or nothing works any more.
+//! The clutter-removal benchmark: a planner's best grasp is executed repeatedly until the table is empty or it fails.
 
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -16,21 +16,21 @@ use crate::planner::{BenchPlanner, Observation, PlannerSpec};
 use crate::scene::{SceneKind, generate, settle};
 use crate::trial::{Outcome, execute};
 
-/// Failures in a row after which a round ends.
+/// Consecutive failures that end a round.
 const MAX_FAILURES: usize = 2;
 
-/// Scenes and cameras of a benchmark; the same scenes whatever the planner.
+/// Scenes and cameras of a benchmark. The scenes do not depend on the planner.
 #[derive(Clone, Debug)]
 pub struct Benchmark {
     /// Pile or packed.
     pub kind: SceneKind,
-    /// What the scenes are made of.
+    /// Objects of the scenes.
     pub objects: ObjectSet,
-    /// Objects a scene starts with.
+    /// Initial number of objects of a scene.
     pub count: usize,
-    /// Where the scene is looked at from before each grasp.
+    /// Cameras that observe the scene before each grasp.
     pub views: Views,
-    /// Share of the observations whose depth carries noise.
+    /// Share of the observations with depth noise.
     pub noise: f64,
     /// Number of scenes.
     pub rounds: u64,
@@ -43,41 +43,41 @@ pub struct Benchmark {
 pub enum Ending {
     /// The table is empty.
     Cleared,
-    /// The cameras see nothing.
+    /// The cameras see no object.
     NothingSeen,
-    /// The planner proposed nothing.
+    /// The planner proposed no grasp.
     NothingProposed,
-    /// Two failures in a row.
+    /// Two consecutive failures.
     GaveUp,
 }
 
-/// One scene, cleared or not.
+/// The result of a round.
 #[derive(Clone, Debug)]
 pub struct Round {
-    /// Objects on the table at first.
+    /// Objects on the table at the start.
     pub objects: usize,
-    /// The grasps that were executed.
+    /// Executed grasps.
     pub attempts: Vec<Attempt>,
-    /// Why it ended.
+    /// Why the round ended.
     pub ending: Ending,
-    /// Time to fuse the views of each observation.
+    /// Fusion time of each observation.
     pub fusion: Vec<Duration>,
-    /// Time of each planning: network and post-processing, without fusion.
+    /// Planning time of each observation: network and post-processing, without fusion.
     pub planning: Vec<Duration>,
 }
 
 /// An executed grasp.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Attempt {
-    /// Which.
+    /// The grasp.
     pub grasp: Grasp,
-    /// What became of it.
+    /// Its outcome.
     pub outcome: Outcome,
-    /// How far from the grasp the hand closed, because its approach met something, metres.
+    /// Distance from the grasp at which the hand closed because its approach was in contact, metres; else 0.
     pub short_by: f64,
 }
 
-/// What can be watched while a benchmark is played.
+/// Progress of a running benchmark.
 pub enum Event<'a> {
     /// A grasp was executed.
     Attempt {
@@ -85,11 +85,11 @@ pub enum Event<'a> {
         round: u64,
         /// Number of the attempt in it.
         number: usize,
-        /// The scene as it was before.
+        /// The scene before the attempt.
         before: &'a World,
-        /// Everything that was proposed, the executed one first.
+        /// All proposed grasps, the executed one first.
         proposals: &'a [Grasp],
-        /// The grasp, and what became of it.
+        /// The executed grasp and its outcome.
         attempt: &'a Attempt,
     },
     /// A round has ended.
@@ -97,7 +97,7 @@ pub enum Event<'a> {
 }
 
 impl Benchmark {
-    /// Plays every round, on all cores, before the eyes of `watch`.
+    /// Runs every round, on all cores. `watch` receives the events.
     ///
     /// # Errors
     /// The first error of a planner.
@@ -108,7 +108,7 @@ impl Benchmark {
         options: &Options,
         watch: impl Fn(Event<'_>) + Sync,
     ) -> anyhow::Result<Vec<Round>> {
-        // Planners that wait for the next round: there are as many as threads, however the rounds are dealt out.
+        // Idle planners are reused, so that there are at most as many planners as threads.
         let idle = Mutex::new(Vec::new());
         let idle = || idle.lock().unwrap_or_else(PoisonError::into_inner);
         (0..self.rounds)
@@ -124,7 +124,7 @@ impl Benchmark {
             .collect()
     }
 
-    /// The scene of a round, and the generator for what happens in it.
+    /// The scene of a round, and the random generator for the rest of the round.
     #[must_use]
     pub fn scene(&self, number: u64) -> (World, ChaCha8Rng) {
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
@@ -133,7 +133,7 @@ impl Benchmark {
         (world, rng)
     }
 
-    /// Looks at a scene; `None` if nothing of it is seen.
+    /// Observes a scene; `None` if the cameras see no object.
     #[must_use]
     pub fn observe(&self, world: &World, rng: &mut ChaCha8Rng) -> Option<Observation> {
         Observation::new(observe(world, &self.views, self.noise, rng))

@@ -1,4 +1,4 @@
-//! The depth camera: where it stands, what it sees, and how it errs.
+//! The simulated depth camera: poses, rendering and noise.
 
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_3, TAU};
 use std::ops::RangeInclusive;
@@ -14,25 +14,25 @@ use crate::TABLE_HEIGHT;
 use crate::physics::World;
 use grasp_picture::{Instance, render};
 
-/// Nearest depth that is seen, metres.
+/// Smallest measured depth, metres.
 const NEAR: f64 = 0.1;
 
-/// Furthest depth that is seen, metres.
+/// Greatest measured depth, metres.
 const FAR: f64 = 2.0;
 
-/// Where a scene is looked at from.
+/// Camera poses of an observation.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Views {
-    /// GIGA's and the paper's one fixed side view, turned by `azimuth` radians about the vertical.
+    /// The single fixed side view of GIGA and the paper, rotated by `azimuth` about the vertical.
     Side {
-        /// 0 is the paper's view.
+        /// Radians; 0 is the paper's view.
         azimuth: f64,
     },
     /// VGN's six views on a circle, 30° from the vertical.
     Circle,
-    /// So many views from anywhere: azimuth any, polar angle 20–75°, distance 0.48–0.72 m.
+    /// Random views, their number in this range: any azimuth, polar angle 20–75°, distance 0.48–0.72 m.
     Random(RangeInclusive<usize>),
-    /// As one of these has it, drawn anew for every observation.
+    /// One of these, drawn for every observation.
     OneOf(Vec<Views>),
 }
 
@@ -61,7 +61,8 @@ impl Views {
     }
 }
 
-/// A camera at `distance` from `target`, `polar` from the vertical, at `azimuth` about it, upright: `T_camera_task`.
+/// `T_camera_task` of an upright camera at `distance` (metres) from `target`, at the angle `polar` from the vertical
+/// and `azimuth` about it (radians).
 #[must_use]
 pub fn look_at(target: &Point3<f64>, distance: f64, polar: f64, azimuth: f64) -> Isometry3<f64> {
     let direction = Vector3::new(polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos());
@@ -89,7 +90,7 @@ pub fn look(world: &World, cameras: &[Isometry3<f64>]) -> Vec<View> {
         .collect()
 }
 
-/// Looks at the scene from where `views` says, a share `noise` of the times with noise in every image.
+/// Renders the scene from cameras drawn from `views`. With probability `noise` every image gets noise.
 #[must_use]
 pub fn observe(world: &World, views: &Views, noise: f64, rng: &mut impl Rng) -> Vec<View> {
     let mut views = look(world, &views.sample(rng));
@@ -99,8 +100,8 @@ pub fn observe(world: &World, views: &Views, noise: f64, rng: &mut impl Rng) -> 
     views
 }
 
-/// Adds the noise of GIGA's evaluation (Dex-Net's model): one Gamma(1000, 0.001) factor per image, then for every
-/// second image N(0, 5 mm) drawn on a quarter-resolution grid and enlarged bilinearly.
+/// Adds the noise of GIGA's evaluation (Dex-Net's model): one Gamma(1000, 0.001) factor per image, and with probability
+/// 0.5 additive N(0, 5 mm), drawn on a quarter-resolution grid and interpolated bilinearly.
 pub fn add_noise(view: &mut View, rng: &mut impl Rng) {
     let gamma = Gamma::new(1000.0f32, 0.001).expect("both parameters are positive");
     let factor = gamma.sample(rng);
@@ -142,7 +143,7 @@ pub fn fuse(views: &[View], resolution: usize) -> Fusion {
     fusion
 }
 
-/// What views see, every pixel with a depth a point, in the task frame.
+/// The point cloud of the views in the task frame: one point for every pixel with a depth.
 #[must_use]
 pub fn points(views: &[View]) -> Vec<SurfacePoint> {
     let points = views.iter().flat_map(|view| {

@@ -1,6 +1,6 @@
-//! Candidates for the classifier of GPD, tried in simulation: images of what the hand would close on, with labels.
+//! Training data of GPD's classifier: images of grasp candidates with labels.
 //!
-//! GPD labels a candidate by geometry, antipodal or not; here it is what a trial in the simulator came to.
+//! GPD labels candidates by geometry (antipodal or not). Here the label is the outcome of a trial in simulation.
 
 use grasp::gpd::{Cloud, Image, candidates};
 use grasp::{Hand, WORKSPACE_SIZE};
@@ -14,7 +14,7 @@ use crate::label::SceneConfig;
 use crate::trial;
 
 impl SceneConfig {
-    /// Makes scene number `index`, looks at it, and tries up to [`points`](Self::points) random ones of the candidates.
+    /// Generates and observes scene number `index`, and tries up to [`points`](Self::points) random candidates.
     #[must_use]
     pub fn candidates(&self, index: u64) -> Candidates {
         let mut rng = self.rng(index);

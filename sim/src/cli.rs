@@ -1,4 +1,4 @@
-//! The command line, one file a command.
+//! The command line, one file per command.
 
 mod bench;
 mod candidates;
@@ -24,44 +24,43 @@ use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::physics::World;
 use grasp_sim::scene::SceneKind;
 
-/// Simulated clutter for grasp detection: scenes, labels, benchmarks.
+/// Simulation for grasp detection: scenes, labels and benchmarks.
 #[derive(Parser)]
 #[command(version)]
 pub enum Command {
-    /// Make scenes, try grasps in them, and write what came of it as training data.
+    /// Generate scenes, try grasps in them and write training data.
     Label(label::Label),
-    /// Observe labelled scenes again: the same scenes and trials, other views and other noise.
+    /// Observe labelled scenes again with other views and noise; scenes and trials stay the same.
     Observe(observe::Observe),
-    /// Is now `observe`.
+    /// The former name of `observe`.
     #[command(hide = true, disable_help_flag = true)]
     Look {
         #[arg(num_args = 0.., trailing_var_arg = true, allow_hyphen_values = true)]
         _rest: Vec<String>,
     },
-    /// Turn a data set into another form.
+    /// Convert a data set to another format.
     Convert(convert::Convert),
-    /// Join what several machines have labelled.
+    /// Merge data sets that several machines have labelled.
     Merge(merge::Merge),
-    /// Count what is in a data set.
+    /// Print and draw statistics of a data set.
     Stats(stats::Stats),
-    /// Try exported grasps again, also those of another simulator.
+    /// Execute exported grasps again, also those of another simulator.
     Replay(replay::Replay),
     /// Draw objects, or write them as URDF and OBJ.
     Objects(objects::Objects),
-    /// Make scenes, fit the hand to what is seen of them, try it, and write images and labels for GPD's classifier.
+    /// Generate scenes, try grasp candidates and write training data for GPD's classifier.
     Candidates(candidates::Candidates),
-    /// Clear tables with a planner and say how well it did.
+    /// Run the clutter-removal benchmark with planners.
     Bench(bench::Bench),
-    /// Compare the quality of executed grasps with what became of them.
+    /// Compare the predicted quality of executed grasps with their success rate.
     Reliability(reliability::ReliabilityArgs),
     /// Regenerate the tables of the paper.
     Tables(tables::Tables),
-    /// One scene, from the depth camera through a server of its own to the lifted object.
+    /// Run one scene end to end: camera, graspd, execution of the best grasp.
     Demo(demo::Demo),
 }
 
 impl Command {
-    /// Does what was asked.
     pub fn run(self) -> anyhow::Result<()> {
         match self {
             Self::Label(command) => command.run(),
@@ -81,33 +80,33 @@ impl Command {
     }
 }
 
-/// What scenes are made of and seen with.
+/// Scenes and their observation.
 #[derive(Args, Clone)]
 struct SceneArgs {
-    /// How objects are put on the table.
+    /// Scenario: objects upright (packed) or dropped (pile).
     #[arg(long, value_enum, default_value = "packed")]
     scene: Scene,
 
-    /// The objects: our own, `train`, `test` or `generated` (a new one at every draw), or a folder of URDF files [default:
-    /// train to label, else test].
+    /// Objects: the procedural sets `train`, `test` or `generated` (a new object at every draw), or a folder of URDF
+    /// files [default: train for labels and candidates, otherwise test].
     #[arg(long, value_parser = parse_objects)]
     objects: Option<String>,
 
-    /// Of the folder's files by name, `validation` is every fifth, and `train` the others.
+    /// Part of the folder's files in the order of their names: `validation` is every fifth file, `train` the others.
     #[arg(long, value_enum, default_value = "all")]
     part: Part,
 
-    /// The cameras: `side[:DEGREES]` (the paper's one view, turned about the vertical), `circle` (six from above), or
-    /// `random:MIN-MAX` (so many from any azimuth, 20–75° off the vertical). Of several, separated by commas, one is
-    /// drawn for each observation.
+    /// Cameras: `side[:DEGREES]` (the paper's single view, rotated about the vertical), `circle` (six views from
+    /// above), or `random:MIN-MAX` (MIN to MAX views of any azimuth, 20–75° from the vertical). From a comma-separated
+    /// list one entry is drawn for each observation.
     #[arg(long, default_value = "side", value_parser = parse_camera_words)]
     views: String,
 
-    /// Share of the observations that carry the benchmark's depth noise.
+    /// Share of the observations with the benchmark's depth noise.
     #[arg(long, default_value_t = 1.0, value_parser = parse_share)]
     noise: f64,
 
-    /// Seed of everything random.
+    /// Random seed.
     #[arg(long, default_value_t = 1)]
     seed: u64,
 }
@@ -120,7 +119,7 @@ enum Part {
 }
 
 impl Part {
-    /// What a report says after the folder.
+    /// Suffix of the folder's name in reports.
     fn suffix(self) -> &'static str {
         match self {
             Self::All => "",
@@ -153,7 +152,7 @@ impl Scene {
 
     fn objects(self, name: &str) -> anyhow::Result<ObjectSet> {
         Ok(match (name, self) {
-            // What data sets say that were made before the word was changed.
+            // `endless` is the former name, which older data sets contain.
             ("generated" | "endless", _) => ObjectSet::generated(),
             ("train", _) => ObjectSet::procedural(Split::Train),
             ("test", Self::Pile) => ObjectSet::procedural(Split::PileTest),
@@ -176,13 +175,10 @@ impl SceneArgs {
             Part::Train => |index| index % 5 != 4,
             Part::Validation => |index| index % 5 == 4,
         };
-        ensure!(
-            PathBuf::from(name).is_dir(),
-            "--part takes a part of a folder of URDF files, not of --objects `{name}`"
-        );
+        ensure!(PathBuf::from(name).is_dir(), "--part needs a folder of URDF files, but --objects is `{name}`");
         let part = objects.listed().iter().enumerate().filter(|(index, _)| is_kept(*index));
         ObjectSet::of(part.map(|(_, object)| Arc::clone(object)).collect())
-            .with_context(|| format!("--objects is {name}: it has too few files for this --part"))
+            .with_context(|| format!("--objects {name}: too few URDF files for this --part; `validation` needs five"))
     }
 
     fn views(&self) -> anyhow::Result<Views> {
@@ -190,7 +186,7 @@ impl SceneArgs {
     }
 }
 
-/// A word of the command line that has another name now.
+/// The error for a renamed word of the command line.
 fn renamed(old: &str, new: &str) -> String {
     format!("`{old}` is now `{new}`")
 }
@@ -203,7 +199,7 @@ fn parse_camera_words(text: &str) -> Result<String, String> {
     if text.contains("anywhere") { Err(renamed("anywhere", "random")) } else { Ok(text.to_owned()) }
 }
 
-/// Refuses `--looks`.
+/// Rejects `--looks`, the former name of `--observations`.
 fn refuse_looks(_: &str) -> Result<String, String> {
     Err(renamed("--looks", "--observations"))
 }
@@ -213,8 +209,8 @@ fn parse_share(text: &str) -> Result<f64, String> {
     share.ok_or_else(|| "must be from 0 to 1".to_owned())
 }
 
-/// How cameras are written.
-const VIEWS: &str = "side, side:90, circle, random:1-6, or several with commas between";
+/// Valid values of `--views`, for error messages.
+const VIEWS: &str = "side, side:90, circle, random:1-6, or a comma-separated list of these";
 
 fn parse_views(text: &str) -> Option<Views> {
     if text.contains(',') {
@@ -225,7 +221,7 @@ fn parse_views(text: &str) -> Option<Views> {
         "side" if rest.is_empty() => Some(Views::Side { azimuth: 0.0 }),
         "side" => Some(Views::Side { azimuth: rest.parse::<f64>().ok()?.to_radians() }),
         "circle" if rest.is_empty() => Some(Views::Circle),
-        // What data sets say that were made before the word was changed.
+        // `anywhere` is the former name, which older data sets contain.
         "random" | "anywhere" => {
             let (min, max) = rest.split_once('-').unwrap_or((rest, rest));
             let (min, max) = (min.parse().ok()?, max.parse().ok()?);
@@ -235,7 +231,7 @@ fn parse_views(text: &str) -> Option<Views> {
     }
 }
 
-/// Adds the objects of a scene to a picture, each in its colour.
+/// Draws the objects of a scene, each in its own colour.
 fn show<'a>(picture: &'a mut Picture, world: &World) -> &'a mut Picture {
     for (index, body) in world.objects().iter().enumerate() {
         picture.mesh(&body.object.visual, &world.pose(body.id), body.scale, object_color(index));
@@ -248,7 +244,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn views_are_read_as_written() {
+    fn views_are_parsed() {
         assert_eq!(parse_views("side"), Some(Views::Side { azimuth: 0.0 }));
         assert_eq!(parse_views("side:180"), Some(Views::Side { azimuth: std::f64::consts::PI }));
         assert_eq!(parse_views("circle"), Some(Views::Circle));

@@ -1,15 +1,14 @@
 //! Scenes and trials as JSON lines, so that another simulator can replay them.
 //!
-//! A line a scene: `scene`, its number; `objects`, each `object` (its name), `scale` and `pose`; `trials`, each `pose`,
-//! `label`, `width`, `object` (an index into the objects: whose surface the point was drawn from), and of the yaws that
-//! were tried `yaws`, what came of each, and `yaw`, which of them `pose` has. Yaw k is k · 36° about the grasp's z. A pose
-//! is `[x, y, z, qx, qy, qz, qw]` in the task frame, metres.
+//! Each line is a scene. `scene` is its number. Each of its `objects` has `object` (the name), `scale` and `pose`. Each
+//! of its `trials` has `pose`, `label`, `width`, `object` (index of the object whose surface the point was sampled
+//! from), `yaws` (the outcome at each yaw) and `yaw` (the index of the yaw of `pose`). Yaw k is k · 36° about the
+//! grasp's z. A pose is `[x, y, z, qx, qy, qz, qw]` in the task frame, metres.
 //!
-//! `share` is the share of the tries of `pose` that held, in [0, 1], and `clearance` the smallest distance between the open
-//! hand on its way to `pose` and the objects, metres, at most 0.02. `executed`, where `grasp-sim replay` or another
-//! simulator has written it, is 1 if the grasp of `pose`, executed as in evaluation (the hand closes where its approach met
-//! something), lifted an object, else 0; for `label` an approach that met something is a failure. Older files have none of
-//! the three.
+//! `share` is the success rate of the repetitions of `pose`, in [0, 1]. `clearance` is the smallest distance between
+//! the objects and the open hand from pre-grasp to grasp, metres, at most 0.02. `executed` is written by `grasp-sim
+//! replay` or another simulator: 1 if the grasp, executed as in evaluation (on contact the hand closes), lifted an
+//! object, else 0. For `label` a contact on the approach is a failure. Older files lack these three.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, BufRead, BufReader, Seek, SeekFrom, Write};
@@ -24,20 +23,20 @@ use crate::label::{LabelledScene, YAWS};
 /// A scene with its trials.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Line {
-    /// Its number.
+    /// Scene number.
     pub scene: u64,
-    /// What stands in it.
+    /// Objects of the scene.
     pub objects: Vec<Object>,
-    /// The grasp points.
+    /// Grasp points.
     pub trials: Vec<Trial>,
 }
 
 /// An object of a scene.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Object {
-    /// Its name, as in its set or its folder; `grasp-sim objects` writes our own sets as files.
+    /// Name in its set or folder. `grasp-sim objects` writes the procedural sets as files.
     pub object: String,
-    /// The factor its mesh was scaled by.
+    /// Scale of its mesh.
     pub scale: f64,
     /// `T_task_object`.
     pub pose: [f64; 7],
@@ -46,36 +45,36 @@ pub struct Object {
 /// A grasp point.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Trial {
-    /// `T_task_grasp` of the yaw to learn.
+    /// `T_task_grasp` at the labelled yaw.
     pub pose: [f64; 7],
-    /// 1 if any yaw lifted an object.
+    /// 1 for a success, else 0.
     pub label: u8,
-    /// Opening after the lift, metres; the greatest for a failure.
+    /// Opening after the lift, metres; the maximum opening for a failure.
     pub width: f64,
-    /// The object whose surface the point was drawn from.
+    /// Index of the object whose surface the point was sampled from.
     pub object: Option<usize>,
-    /// Which yaw `pose` has.
+    /// Index of the yaw of `pose`.
     pub yaw: usize,
-    /// What came of each yaw.
+    /// Outcome of each yaw: 1 if it lifted an object.
     pub yaws: [u8; YAWS],
-    /// The share of the tries of `pose` that held; [`read`] takes it from the label where a file does not say.
-    #[serde(default = "not_said")]
+    /// Success rate of the repetitions of `pose`. If a file lacks it, [`read`] sets it to `label`.
+    #[serde(default = "missing_share")]
     pub share: f32,
-    /// The smallest distance between the open hand on its way and the objects, metres; 0 where it is not known.
+    /// Smallest distance between the objects and the open hand from pre-grasp to grasp, metres; 0 if unknown.
     #[serde(default)]
     pub clearance: f32,
-    /// 1 if `pose`, executed as in evaluation, lifted an object; none where that was not tried.
+    /// 1 if `pose`, executed as in evaluation, lifted an object; `None` if it was not executed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub executed: Option<u8>,
 }
 
-/// JSON has no such number.
-fn not_said() -> f32 {
+/// Marks a missing `share`: JSON has no NaN.
+fn missing_share() -> f32 {
     f32::NAN
 }
 
 impl Line {
-    /// What there is to say of a scene.
+    /// The line of a scene.
     #[must_use]
     pub fn of(number: u64, scene: &LabelledScene) -> Self {
         let objects = scene.objects.iter();
@@ -114,7 +113,7 @@ pub struct Export {
 }
 
 impl Export {
-    /// Opens a file, new or left by an earlier run; scenes from number `next` on are dropped, to be written again.
+    /// Creates a file, or opens that of an earlier run and removes its scenes from number `next` on.
     ///
     /// # Errors
     /// When the file cannot be read or written.
@@ -178,7 +177,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn files_that_do_not_say_how_much_room_there_was_are_read_too() {
+    fn files_without_share_and_clearance_are_read() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scenes.jsonl");
         let trial = |label: u8, more: &str| {
@@ -193,7 +192,7 @@ mod tests {
         let found: Vec<_> = line.trials.iter().map(|trial| (trial.share, trial.clearance, trial.executed)).collect();
         assert_eq!(found, [(1.0, 0.0, None), (0.0, 0.0, None), (0.75, 0.0125, Some(0))]);
 
-        // And written again they say the same.
+        // Written again, the lines have the same keys.
         let written = |index: usize| serde_json::to_string(&line.trials[index]).unwrap();
         assert!(written(2).ends_with(r#""share":0.75,"clearance":0.0125,"executed":0}"#), "{}", written(2));
         assert!(!written(0).contains("executed"), "{}", written(0));

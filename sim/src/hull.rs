@@ -1,21 +1,21 @@
-//! The convex hull, as the physics will see it.
+//! Convex hulls with the algorithm of the physics engine.
 
 use grasp_picture::Mesh;
 use nalgebra::Point3;
 use rapier3d::parry;
 
-/// Parts thinner than this volume (m³; a tenth of a cubic millimetre) are not solids.
+/// Smallest volume of a hull, m³.
 const LEAST_VOLUME: f64 = 1e-10;
 
-/// The convex hull of `points`; `None` where they span no volume.
+/// The convex hull of `points`; `None` if they enclose no volume.
 ///
-/// Computed with parry in single precision, as the physics will see it.
+/// Computed with parry in single precision, as in the physics engine.
 pub fn convex_hull(points: &[Point3<f64>]) -> Option<Mesh> {
     let mut points: Vec<[f32; 3]> = points.iter().map(|p| p.coords.cast().into()).collect();
     if points.iter().flatten().any(|x| !x.is_finite()) {
         return None;
     }
-    // Repeated points make the quickhull fail.
+    // parry's quickhull fails on repeated points.
     points.sort_by(|a, b| a.partial_cmp(b).unwrap_or(std::cmp::Ordering::Equal));
     points.dedup();
     let points: Vec<_> = points.into_iter().map(Into::into).collect();

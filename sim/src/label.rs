@@ -1,4 +1,4 @@
-//! Labels: grasp points on the observed surface of a scene, each tried at six yaws.
+//! Labelling: grasp points on the observed surface of a scene, each tried at six yaws.
 
 use std::f64::consts::PI;
 
@@ -15,67 +15,66 @@ use crate::physics::World;
 use crate::scene::{SceneKind, generate};
 use crate::trial;
 
-/// Yaws at which a point is tried, evenly from 0 to 180° inclusive.
+/// Yaws at which a point is tried, evenly spaced from 0 to 180° inclusive.
 pub const YAWS: usize = TURNS + 1;
 
-/// How much the hand is swollen on its way to a grasp that is labelled, metres a side, beyond what counts as a contact.
+/// Enlargement of the hand on its approach to a labelled grasp, metres per side, in addition to the contact distance.
 const SWELL: f64 = 0.0012;
 
-/// How often a grasp that held is tried again at most, each time a little off.
+/// Maximum number of repetitions of a successful grasp, each with a small pose error.
 const REPEATS: usize = 6;
 
-/// After so many tries again without a failure the grasp is not tried any more: most grasps hold, and in few of those that
-/// held so often would a further try fail.
+/// Repetitions end after this many successes without a failure. Most grasps hold, and further failures are rare then.
 const ENOUGH: usize = 3;
 
-/// How many of the tries may fail at most in a success: of the grasps that fail more often, one in three fails in another
-/// simulator.
+/// Greatest number of failed tries of a grasp that is labelled a success. Of grasps with more failures one in three
+/// fails in another simulator.
 const FAILURES: usize = 1;
 
-/// Standard deviation of that position from the grasp's, metres, and of that orientation, radians, over all directions: a
-/// calibrated arm and camera are off by so much.
+/// Standard deviations of the pose error over all directions, metres and radians: the accuracy of a calibrated arm and
+/// camera.
 const POSITION_ERROR: f64 = 0.002;
 const ROTATION_ERROR: f64 = 3.0 * PI / 180.0;
 
-/// Resolution of the second volume, whose surface the points are drawn from.
+/// Resolution of the second volume, from whose surface the points are sampled.
 const CLOUD_RESOLUTION: usize = 120;
 
-/// How scenes are made, looked at and tried.
+/// How scenes are generated, observed and labelled.
 #[derive(Clone, Debug)]
 pub struct SceneConfig {
     /// Pile or packed.
     pub kind: SceneKind,
-    /// What the scenes are made of.
+    /// Objects of the scenes.
     pub objects: ObjectSet,
-    /// Grasp points a scene.
+    /// Grasp points per scene.
     pub points: usize,
-    /// What the network will see.
+    /// Cameras of the stored observations.
     pub views: Views,
-    /// How often a scene is looked at anew, with other views and other noise.
+    /// Observations per scene, with different views and noise.
     pub observations: usize,
-    /// Share of the looks that carry the benchmark's noise.
+    /// Share of the observations with the benchmark's noise.
     pub noise: f64,
-    /// Seed of the whole data set.
+    /// Seed of the data set.
     pub seed: u64,
 }
 
-/// A scene as a network sees it, with what came of trying it.
+/// The observations and labels of a scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelledScene {
-    /// What stands in it.
+    /// Objects of the scene.
     pub objects: Vec<Placed>,
-    /// What was seen of it; at least one.
+    /// Observations; at least one.
     pub observations: Vec<LabelObservation>,
-    /// The grasp points.
+    /// Grasp points.
     pub points: Vec<Point>,
 }
 
 /// An object in a scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Placed {
-    /// Its name.
+    /// Name.
     pub name: String,
-    /// The factor its mesh was scaled by.
+    /// Scale of its mesh.
     pub scale: f64,
     /// `T_task_object`.
     pub pose: Isometry3<f64>,
@@ -93,30 +92,30 @@ pub struct LabelObservation {
 /// A grasp point, tried at every yaw.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Point {
-    /// The grasp to learn, in the task frame. Where a yaw lifted something: the middle of the widest run of yaws that did,
-    /// else the first yaw. Of a success the opening after the lift, and quality 1; else the greatest opening, and 0.
+    /// The labelled grasp in the task frame. Its yaw is the middle of the longest run of successful yaws, or the first
+    /// yaw if none succeeded. A success has the opening after the lift and quality 1, a failure the maximum opening and
+    /// 0.
     pub grasp: Grasp,
-    /// Which yaw that is.
+    /// Index of its yaw.
     pub yaw: usize,
-    /// Which yaws lifted something.
+    /// Which yaws lifted an object.
     pub lifted: [bool; YAWS],
-    /// The share of the tries of `grasp` that held, see [`Trial::share`].
+    /// Success rate of the repetitions of `grasp`, see [`Trial::share`].
     pub share: f32,
-    /// Of the open hand on its way to `grasp`, metres, see [`Trial::clearance`].
+    /// Clearance of the open hand on its approach to `grasp`, metres, see [`Trial::clearance`].
     pub clearance: f32,
-    /// The object whose surface the point was drawn from: an index into the scene's objects.
+    /// Index of the scene's object whose surface the point was sampled from.
     pub object: Option<usize>,
 }
 
 impl Point {
-    /// Whether a yaw lifted an object, and nearly always did so when the hand was a little off.
+    /// Whether a yaw lifted an object and at most one of its repetitions with pose errors failed.
     #[must_use]
     pub fn success(&self) -> bool {
         self.grasp.quality > 0.5
     }
 
-    /// The grasp to learn in voxels of `voxel_size`, or with 1 in metres, which turns of it hold too, and with how much
-    /// room to spare.
+    /// The label with lengths in voxels of `voxel_size`, or in metres if that is 1.
     #[must_use]
     pub fn trial(&self, voxel_size: f64) -> Trial {
         let turns = (1..TURNS).filter(|turn| self.success() && self.lifted[(self.yaw + turn) % TURNS]);
@@ -130,30 +129,30 @@ impl Point {
 }
 
 impl SceneConfig {
-    /// The generator that makes a scene and tries it.
+    /// The random generator of a scene and its trials.
     pub(crate) fn rng(&self, index: u64) -> ChaCha8Rng {
         generator(self.seed, index)
     }
 
-    /// A scene of Poisson(4) + 1 objects.
+    /// Generates a scene of Poisson(4) + 1 objects.
     pub(crate) fn scene(&self, rng: &mut ChaCha8Rng) -> World {
         let count = Poisson::new(4.0).expect("4 is positive").sample(rng) as usize + 1;
         generate(self.kind, &self.objects, count, rng)
     }
 
-    /// Makes, looks at and labels scene number `index`; `None` if nothing of it can be seen.
+    /// Generates, observes and labels scene number `index`; `None` if the cameras see no object.
     #[must_use]
     pub fn label(&self, index: u64) -> Option<LabelledScene> {
         let mut rng = self.rng(index);
         let mut world = self.scene(&mut rng);
         world.sleep();
-        // Labels cover what six clean views from above see, whatever the network will see.
+        // Points are sampled from six noise-free views from above, independent of the stored observations.
         let cloud = graspable(&look(&world, &Views::Circle.sample(&mut rng)));
         if cloud.is_empty() {
             return None;
         }
         let points = (0..self.points).map(|_| try_point(&world, &cloud, &mut rng)).collect();
-        let observations = self.look_at(&world, index, self.seed);
+        let observations = self.observe_world(&world, index, self.seed);
         let objects = world.objects().iter().map(|body| Placed {
             name: body.object.name.clone(),
             scale: body.scale,
@@ -162,16 +161,16 @@ impl SceneConfig {
         (!observations.is_empty()).then(|| LabelledScene { objects: objects.collect(), observations, points })
     }
 
-    /// Looks at scene number `index` without trying it: other views of the very scene that [`label`](Self::label) makes, or
-    /// the same if `seed` is the recipe's own.
+    /// Observes scene number `index` without trials. The scene is the one that [`label`](Self::label) generates. The
+    /// observations are the same, too, if `seed` is [`seed`](Self::seed).
     #[must_use]
     pub fn observe_again(&self, index: u64, seed: u64) -> Vec<LabelObservation> {
         let world = self.scene(&mut self.rng(index));
-        self.look_at(&world, index, seed)
+        self.observe_world(&world, index, seed)
     }
 
-    /// From a generator of its own, so that how often a scene is looked at does not change its labels.
-    fn look_at(&self, world: &World, index: u64, seed: u64) -> Vec<LabelObservation> {
+    /// Uses its own random generator, so that the number of observations does not change the labels.
+    fn observe_world(&self, world: &World, index: u64, seed: u64) -> Vec<LabelObservation> {
         let mut rng = generator(seed.wrapping_add(1 << 32), index);
         (0..self.observations).filter_map(|_| self.look(world, &mut rng)).collect()
     }
@@ -183,14 +182,14 @@ impl SceneConfig {
     }
 }
 
-/// A generator of a scene's own: the result does not depend on which thread makes it, or when.
+/// The random generator of one scene: results do not depend on the order or the threads.
 fn generator(seed: u64, index: u64) -> ChaCha8Rng {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     rng.set_stream(index);
     rng
 }
 
-/// The surface that these views see, without the table, the borders of the workspace, and what faces down.
+/// The observed surface without the table, the borders of the workspace and surfaces that face down.
 #[must_use]
 pub fn graspable(views: &[View]) -> Vec<SurfacePoint> {
     let mut surface = fuse(views, CLOUD_RESOLUTION).surface();
@@ -198,7 +197,7 @@ pub fn graspable(views: &[View]) -> Vec<SurfacePoint> {
     surface
 }
 
-/// Whether a point is above the table, away from the borders, and does not face down (the bounds of GIGA's code).
+/// Whether a point is above the table, away from the borders, and does not face down (the limits of GIGA's code).
 #[must_use]
 pub fn is_graspable(point: &SurfacePoint) -> bool {
     is_within_reach(&point.position) && point.normal.z > -0.1
@@ -212,9 +211,9 @@ pub fn is_within_reach(position: &Point3<f64>) -> bool {
     (0..3).all(|axis| (LOWER[axis]..=UPPER[axis]).contains(&position[axis]))
 }
 
-/// Draws a grasp point (VGN's `sample_grasp_point`): somewhere on the surface, at a random depth of the fingers.
+/// Samples a grasp pose (VGN's `sample_grasp_point`): a random surface point at a random depth between the fingers.
 ///
-/// The pose has its approach against the normal and its x axis near the task frame's.
+/// The approach is opposite to the normal; the x axis is close to that of the task frame.
 #[must_use]
 pub fn sample_pose(cloud: &[SurfacePoint], rng: &mut impl Rng) -> Isometry3<f64> {
     sample(cloud, rng).1
@@ -240,7 +239,7 @@ fn try_point(world: &World, cloud: &[SurfacePoint], rng: &mut impl Rng) -> Point
         trial::Outcome::Lifted { width, .. } => Some(width),
         _ => None,
     });
-    // The last yaw is the first one turned by half a turn, and the hand is symmetric.
+    // The last yaw is the first rotated by 180°, and the hand is symmetric.
     let widths: [Option<f64>; YAWS] = std::array::from_fn(|yaw| tried[yaw % TURNS]);
     let lifted = widths.map(|width| width.is_some());
     let object = world.nearest(&surface.position);
@@ -262,20 +261,20 @@ fn try_point(world: &World, cloud: &[SurfacePoint], rng: &mut impl Rng) -> Point
     }
 }
 
-/// The tries of a grasp: as it is, and with small errors.
+/// Results of a grasp: without and with pose errors.
 struct Tries {
     held: usize,
     failed: usize,
 }
 
 impl Tries {
-    /// Tries a grasp that is known to hold as it is: until it is a failure, held [`ENOUGH`] times more without one, or was
-    /// tried [`REPEATS`] times more.
+    /// Repeats a grasp that holds without pose error. Ends when it is a failure, after [`ENOUGH`] successes without a
+    /// failure, or after [`REPEATS`] repetitions.
     fn of(world: &World, grasp: &Isometry3<f64>, rng: &mut impl Rng) -> Self {
         let mut tries = Self { held: 1, failed: 0 };
         while tries.held + tries.failed <= REPEATS && tries.is_success() && !(tries.failed == 0 && tries.held > ENOUGH)
         {
-            match trial::label(world, &shaken(grasp, rng), 0.0).is_success() {
+            match trial::label(world, &perturbed(grasp, rng), 0.0).is_success() {
                 true => tries.held += 1,
                 false => tries.failed += 1,
             }
@@ -292,9 +291,9 @@ impl Tries {
     }
 }
 
-/// A grasp that is a little off.
-fn shaken(grasp: &Isometry3<f64>, rng: &mut impl Rng) -> Isometry3<f64> {
-    // The deviation over all directions is √3 that along one.
+/// The grasp with a random pose error.
+fn perturbed(grasp: &Isometry3<f64>, rng: &mut impl Rng) -> Isometry3<f64> {
+    // The deviation over all directions is √3 times that along one axis.
     let mut error =
         |deviation: f64| Vector3::from_fn(|_, _| -> f64 { StandardNormal.sample(rng) }) * (deviation / 3f64.sqrt());
     Isometry3::new(error(POSITION_ERROR), Vector3::zeros())
@@ -321,24 +320,24 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_widest_run_gives_its_middle() {
+    fn the_middle_of_the_longest_run_is_chosen() {
         let runs = |s: &str| middle_of_widest_run(&s.chars().map(|c| c == '1').collect::<Vec<_>>());
         assert_eq!(runs("000000"), None);
         assert_eq!(runs("010000"), Some(1));
         assert_eq!(runs("101110"), Some(3));
-        assert_eq!(runs("110110"), Some(0), "the first of equals, rounded down as scipy does");
+        assert_eq!(runs("110110"), Some(0), "the first of equal runs, rounded down as in scipy");
         assert_eq!(runs("111111"), Some(2));
     }
 
     #[test]
-    fn a_pose_approaches_against_the_normal() {
+    fn sampled_poses_approach_opposite_to_the_normal() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         for normal in [Vector3::z(), Vector3::x(), -Vector3::x(), Vector3::new(0.3, -0.5, 0.4).normalize()] {
             let cloud = [SurfacePoint { position: Point3::new(0.1, 0.1, 0.1), normal }];
             let pose = sample_pose(&cloud, &mut rng);
             assert!((pose.rotation * Vector3::z() + normal).norm() < 1e-9);
             let offset = pose.translation.vector - cloud[0].position.coords;
-            assert!((offset - normal * offset.dot(&normal)).norm() < 1e-9, "the depth runs along the normal");
+            assert!((offset - normal * offset.dot(&normal)).norm() < 1e-9, "the depth is along the normal");
         }
     }
 }

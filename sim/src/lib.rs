@@ -1,7 +1,8 @@
-//! Simulated clutter: objects, scenes, a depth camera, a hand that tries grasps, and what is made of them: labels to
-//! train on, and benchmarks. Nothing outside this crate knows physics; this crate knows nothing of libtorch.
+//! Simulation: objects, scenes, a depth camera, and trials of grasps with a simulated hand. It produces training labels
+//! and benchmarks. Only this crate depends on the physics engine; it does not depend on libtorch.
 //!
-//! The task frame: origin at a corner of the 0.3 m workspace cube, z up, the table's top at [`TABLE_HEIGHT`].
+//! The task frame has its origin at a corner of the workspace (a cube of 0.3 m) and z up. The table's top is at
+//! [`TABLE_HEIGHT`].
 
 pub mod benchmark;
 pub mod camera;

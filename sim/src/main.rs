@@ -1,4 +1,4 @@
-//! `grasp-sim`: makes clutter, labels it, and benchmarks grasp planners on it.
+//! `grasp-sim`: generates and labels scenes, and benchmarks grasp planners.
 
 mod cli;
 

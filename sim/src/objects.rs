@@ -1,4 +1,4 @@
-//! The things to grasp: solids of convex parts, made from seeds or read from URDF files.
+//! Objects: solids of convex parts, generated from seeds or read from URDF files.
 
 pub mod procedural;
 mod urdf;
@@ -11,14 +11,14 @@ use rand::{Rng, RngExt};
 use grasp_picture::Mesh;
 pub use urdf::ObjectError;
 
-/// A rigid object. Its frame has z up in the pose in which it best stands on a table.
+/// A rigid object. The z axis of its frame points up in its most stable pose on a table.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Object {
-    /// A name for reports: the kind and the seed, or the URDF's file name.
+    /// Name for reports: kind and seed, or the file name of the URDF.
     pub name: String,
     /// The collision shape: convex, closed meshes in the object's frame. They may overlap.
     pub parts: Vec<Mesh>,
-    /// The surface a camera sees, in the object's frame.
+    /// Surface for rendering, in the object's frame.
     pub visual: Mesh,
     /// Mass, kg.
     pub mass: f64,
@@ -27,7 +27,7 @@ pub struct Object {
 }
 
 impl Object {
-    /// Writes it into a folder as URDF and OBJ, as [`ObjectSet::load`] reads them.
+    /// Writes URDF and OBJ files into a folder, in the format that [`ObjectSet::load`] reads.
     ///
     /// # Errors
     /// [`ObjectError::Write`] names the file.
@@ -36,55 +36,55 @@ impl Object {
     }
 }
 
-/// Which procedural objects: the sets share no seed, hence no object.
+/// A set of procedural objects. The sets share no seed, hence no object.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Split {
-    /// 303 objects of every kind, to learn from.
+    /// 303 objects of every kind, for training.
     Train,
-    /// 40 objects of every kind, to be tested in piles.
+    /// 40 objects of every kind, for benchmarks with piles.
     PileTest,
-    /// 16 objects that stand upright, to be tested packed.
+    /// 16 objects that stand upright, for packed benchmarks.
     PackedTest,
 }
 
-/// What scenes draw their objects from; never empty.
+/// The set from which scenes draw their objects.
 #[derive(Clone, Debug)]
 pub struct ObjectSet {
-    /// Those to draw from; none for objects without end.
+    /// The objects; empty for the unlimited set of generated objects.
     objects: Vec<Arc<Object>>,
 }
 
 impl ObjectSet {
-    /// The objects of a split, the same on every call.
+    /// The objects of a split.
     #[must_use]
     pub fn procedural(split: Split) -> ObjectSet {
         let seeds = procedural::seeds(split).into_iter();
         ObjectSet { objects: seeds.map(|seed| Arc::new(procedural::object(seed))).collect() }
     }
 
-    /// A new object at every draw, to learn from: none of any test set, hardly ever one twice.
+    /// An unlimited set for training: every draw generates an object. It shares no object with the test sets.
     #[must_use]
     pub fn generated() -> ObjectSet {
         ObjectSet { objects: Vec::new() }
     }
 
-    /// Reads every `*.urdf` of a folder, in the order of their names.
+    /// Reads all `*.urdf` files of a folder, in the order of their names.
     ///
     /// # Errors
-    /// A folder that cannot be read or holds no URDF, and any file that is not a well-formed
-    /// single-link object; the error names the file.
+    /// If the folder cannot be read or has no URDF file, or a file is not a valid single-link object. The error names
+    /// the file.
     pub fn load(dir: &Path) -> Result<ObjectSet, ObjectError> {
         let objects = urdf::load_folder(dir)?.into_iter().map(Arc::new).collect();
         Ok(ObjectSet { objects })
     }
 
-    /// These objects; `None` of none.
+    /// A set of these objects; `None` if there are none.
     #[must_use]
     pub fn of(objects: Vec<Arc<Object>>) -> Option<ObjectSet> {
         (!objects.is_empty()).then_some(ObjectSet { objects })
     }
 
-    /// Any of them, each as likely.
+    /// Draws an object uniformly.
     pub fn draw(&self, rng: &mut impl Rng) -> Arc<Object> {
         if self.objects.is_empty() {
             return Arc::new(procedural::object(rng.random_range(procedural::GENERATED)));
@@ -92,7 +92,7 @@ impl ObjectSet {
         Arc::clone(&self.objects[rng.random_range(0..self.objects.len())])
     }
 
-    /// Those there are; none of a set without end.
+    /// The objects of the set; empty for the unlimited set.
     #[must_use]
     pub fn listed(&self) -> &[Arc<Object>] {
         &self.objects

@@ -1,7 +1,7 @@
-//! The physics: a table, rigid objects on it, and a hand. Everything that knows the engine is in here.
+//! The physics: a table, rigid objects and a hand. Only this module uses the physics engine.
 //!
-//! The interface is in metres, kilograms and f64; the engine's world is in centimetres and f32, because at the size of
-//! a grasp its collision code loses millimetres when it counts in metres.
+//! The interface uses metres, kilograms and f64. The engine works in centimetres and f32, because its collision
+//! detection is wrong by millimetres at this scale when lengths are in metres.
 
 mod gripper;
 mod hand;

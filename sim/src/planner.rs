@@ -17,18 +17,18 @@ use crate::TABLE_HEIGHT;
 use crate::camera::{View, fuse, points};
 use crate::label::is_graspable;
 
-/// What a planner is given: depth images, and the volume fused from them.
+/// Input of a planner: depth images and the volume fused from them.
 pub struct Observation {
     /// The depth images.
     pub views: Vec<View>,
     /// The volume they were fused into, task frame.
     pub volume: Volume,
-    /// How long that took.
+    /// Duration of the fusion.
     pub fusion: Duration,
 }
 
 impl Observation {
-    /// Fuses the views; `None` if they see nothing in the workspace but the table.
+    /// Fuses the views; `None` if they see no object in the workspace.
     #[must_use]
     pub fn new(views: Vec<View>) -> Option<Self> {
         let start = Instant::now();
@@ -48,11 +48,11 @@ pub enum BenchPlanner {
     Random,
     /// [`PlannerSpec::Server`].
     Server(Server),
-    /// One of those that graspd serves, in this process.
+    /// A planner of graspd in this process.
     Local {
-        /// It.
+        /// The planner.
         planner: Box<dyn Planner + Send>,
-        /// How it chooses grasps.
+        /// Its decoding parameters.
         decode: DecodeParams,
         /// Whether it reads the point cloud.
         reads_points: bool,
@@ -60,8 +60,8 @@ pub enum BenchPlanner {
 }
 
 impl BenchPlanner {
-    /// Proposes grasps for one observation, best first, in the task frame. `rng` is the round's own, so that random grasps
-    /// stay reproducible.
+    /// Proposes grasps for one observation, best first, in the task frame. `rng` is the round's generator, so that
+    /// random grasps are reproducible.
     ///
     /// # Errors
     /// When the network or the server behind the planner fails.
@@ -79,20 +79,20 @@ impl BenchPlanner {
     }
 }
 
-/// Which planner, as written on the command line.
+/// A planner as given on the command line.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum PlannerSpec {
     /// A random point of the observed surface, approached against its normal, at a random yaw.
     Random,
     /// An ONNX network of VGN's signature.
     Network(PathBuf),
-    /// A running graspd, which is sent the depth images.
+    /// A running graspd, which receives the depth images.
     Server(String),
-    /// The highest of the places where the hand fits.
+    /// SHAF: the highest candidate.
     Highest,
     /// The highest of an ONNX network's proposals with a quality above 0.5.
     HighestProposed(PathBuf),
-    /// Places where the hand fits, scored by an ONNX classifier.
+    /// GPD: candidates scored by an ONNX classifier.
     Gpd(PathBuf),
 }
 
@@ -110,12 +110,11 @@ impl From<&str> for PlannerSpec {
 }
 
 impl PlannerSpec {
-    /// Makes the planner; its network, if it has one, is run with `options` and its output decoded with `params`. GPD and
-    /// the heuristic choose as they do by default. A server decodes with its model's own parameters but for the threshold
-    /// and `force`.
+    /// Creates the planner. Networks run with `options` and decode with `params`. GPD and SHAF use their default
+    /// parameters. A server uses its model's parameters except for the threshold and `force`.
     ///
     /// # Errors
-    /// When the file is not the network or classifier it should be, or the server cannot be reached.
+    /// If the file is not the expected kind of network, or the server cannot be reached.
     pub fn build(&self, params: &DecodeParams, options: &Options) -> anyhow::Result<BenchPlanner> {
         let load = |path: &Path| {
             let network = NetworkPlanner::load(path, options)?;
@@ -149,7 +148,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn planners_are_named_as_on_the_command_line() {
+    fn planner_specs_are_parsed() {
         assert_eq!(PlannerSpec::from("random"), PlannerSpec::Random);
         assert_eq!(PlannerSpec::from("grpc:127.0.0.1:50051"), PlannerSpec::Server("127.0.0.1:50051".into()));
         assert_eq!(PlannerSpec::from("shaf"), PlannerSpec::Highest);

@@ -1,13 +1,13 @@
-//! Reliability: does a grasp of quality 0.9 lift its object nine times in ten?
+//! Reliability of predicted qualities: does a grasp of quality 0.9 succeed in 90 % of its executions?
 
 use serde::{Deserialize, Serialize};
 
-/// An executed grasp, as `bench --attempts` and `sim/pybullet/clear.py --attempts` write it; both have more fields.
+/// An executed grasp as written by `bench --attempts` and `sim/pybullet/clear.py --attempts`; other fields are ignored.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 pub struct Attempt {
-    /// What the planner promised.
+    /// Predicted quality.
     pub quality: f64,
-    /// Whether it lifted an object.
+    /// Whether the grasp lifted an object.
     #[serde(rename = "outcome", deserialize_with = "is_lifted")]
     pub lifted: bool,
 }
@@ -16,34 +16,34 @@ fn is_lifted<'a, D: serde::Deserializer<'a>>(outcome: D) -> Result<bool, D::Erro
     Ok(String::deserialize(outcome)? == "lifted")
 }
 
-/// Attempts whose quality is in one bin.
+/// Attempts with a quality in one bin.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Bin {
-    /// How many.
+    /// Number of attempts.
     pub attempts: u64,
-    /// How many of them lifted an object.
+    /// Number of attempts that lifted an object.
     pub lifted: u64,
-    /// Mean of their qualities; 0 of none.
+    /// Mean quality; 0 without attempts.
     pub quality: f64,
 }
 
-/// Quality against success.
+/// Reliability diagram.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Reliability {
     /// Bins of equal width, over qualities from 0 to 1.
     pub bins: Vec<Bin>,
-    /// Expected calibration error: the mean difference between a bin's quality and its share of successes, weighted by its
-    /// attempts (Guo et al. 2017, equation 3).
+    /// Expected calibration error: the mean absolute difference between a bin's quality and its success rate, weighted
+    /// by its attempts (Guo et al. 2017, equation 3).
     pub error: f64,
     /// All attempts in one bin.
     pub whole: Bin,
 }
 
-/// Bins of a diagram.
+/// Number of bins.
 const BINS: usize = 20;
 
 impl Reliability {
-    /// Of these attempts.
+    /// The diagram of these attempts.
     #[must_use]
     pub fn of(attempts: &[Attempt]) -> Self {
         let bin = |attempts: &mut dyn Iterator<Item = &Attempt>| {
@@ -65,8 +65,8 @@ impl Reliability {
 }
 
 impl Bin {
-    /// The share of the attempts that lifted an object, and its 95 % interval, which is right near 0 and 1 too
-    /// (Wilson 1927); `None` of none.
+    /// The success rate and its 95 % Wilson score interval (Wilson 1927), which is also valid near 0 and 1; `None`
+    /// without attempts.
     #[must_use]
     pub fn share(&self) -> Option<(f64, [f64; 2])> {
         const Z: f64 = 1.96;
@@ -87,21 +87,21 @@ mod tests {
     }
 
     #[test]
-    fn what_is_promised_and_kept_has_no_error() {
-        let honest: Vec<Attempt> = attempts(0.75, 8, 6).chain(attempts(0.52, 100, 52)).collect();
-        let found = Reliability::of(&honest);
+    fn calibrated_qualities_have_no_error() {
+        let calibrated: Vec<Attempt> = attempts(0.75, 8, 6).chain(attempts(0.52, 100, 52)).collect();
+        let found = Reliability::of(&calibrated);
         assert!(found.error < 1e-12, "{}", found.error);
         assert_eq!((found.whole.attempts, found.whole.lifted), (108, 58));
-        // One part of ten promises 0.2 too much, the others 0.1 too little.
+        // One tenth is 0.2 too high, the others are 0.1 too low.
         let other: Vec<Attempt> = attempts(1.0, 10, 8).chain(attempts(0.6, 90, 63)).collect();
         assert!((Reliability::of(&other).error - (0.1 * 0.2 + 0.9 * 0.1)).abs() < 1e-12);
-        assert_eq!(Reliability::of(&other).bins[BINS - 1].attempts, 10, "1 is in the last bin");
+        assert_eq!(Reliability::of(&other).bins[BINS - 1].attempts, 10, "quality 1 is in the last bin");
         assert_eq!(Reliability::of(&[]).error, 0.0);
     }
 
     #[test]
-    fn intervals_are_wilsons() {
-        // 5 of 10: 0.2366 to 0.7634, a textbook's figures.
+    fn intervals_are_wilson_score_intervals() {
+        // 5 of 10: 0.2366 to 0.7634, a textbook example.
         let (share, [low, high]) = Bin { attempts: 10, lifted: 5, quality: 0.5 }.share().unwrap();
         assert!(share == 0.5 && (low - 0.2366).abs() < 1e-4 && (high - 0.7634).abs() < 1e-4, "{low} {high}");
         assert_eq!(Bin::default().share(), None);

@@ -1,4 +1,4 @@
-//! Scenes: objects dropped into a pile or packed upright, settled on the table.
+//! Generation of scenes: objects dropped into a pile or placed upright, at rest on the table.
 
 use std::f64::consts::TAU;
 use std::ops::Range;
@@ -12,35 +12,35 @@ use crate::TABLE_HEIGHT;
 use crate::objects::{Object, ObjectSet};
 use crate::physics::{STEPS_PER_SECOND, World};
 
-/// The two ways in which a scene is made.
+/// The scenario.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SceneKind {
-    /// Objects dropped on one another at random.
+    /// Objects dropped at random.
     Pile,
     /// Objects standing upright, side by side.
     Packed,
 }
 
-/// The factors by which the objects of a pile are scaled.
+/// Scale of the objects of a pile.
 const PILE_SCALE: Range<f64> = 0.8..1.0;
 
-/// Those of packed ones.
+/// Scale of packed objects.
 const PACKED_SCALE: Range<f64> = 0.7..0.9;
 
 /// Velocity norm (m/s and rad/s together) at which a body counts as resting.
 const REST_SPEED: f64 = 0.01;
 
-/// Steps between two looks at whether everything rests.
+/// Steps between two checks for rest.
 const REST_CHUNK: u32 = 60;
 
-/// How many scenes are made at most until one comes to rest.
+/// Maximum number of scenes that are generated until one comes to rest.
 const DRAWS: usize = 3;
 
-/// Makes a scene of up to `count` objects drawn from `objects`, at rest; the same for the same state of `rng`.
+/// Generates a scene of up to `count` objects drawn from `objects`, at rest. It depends only on the state of `rng`.
 #[must_use]
 pub fn generate(kind: SceneKind, objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
-    // One pile in a hundred has a round object that never stops rolling: a camera would see another scene than the hand
-    // meets.
+    // One pile in a hundred has a round object that never stops rolling. The scene would change between observation and
+    // trial.
     let mut world = draw(kind, objects, count, rng);
     for _ in 1..DRAWS {
         if is_at_rest(&world) {
@@ -56,14 +56,14 @@ fn draw(kind: SceneKind, objects: &ObjectSet, count: usize, rng: &mut impl Rng) 
         SceneKind::Pile => pile(objects, count, rng),
         SceneKind::Packed => packed(objects, count, rng),
     };
-    // The contacts need a while longer than the eye before nothing creeps.
+    // A further second of simulation, because contacts still creep at speeds below `REST_SPEED`.
     wait_for_rest(&mut world, 5.0);
     (0..STEPS_PER_SECOND).for_each(|_| world.step());
     settle(&mut world);
     world
 }
 
-/// Simulates until everything rests, taking away what left the workspace, until nothing leaves any more.
+/// Simulates until everything rests and removes objects that left the workspace, until no object leaves.
 pub fn settle(world: &mut World) {
     loop {
         wait_for_rest(world, 2.0);
@@ -98,7 +98,7 @@ fn wait_for_rest(world: &mut World, timeout: f64) {
     }
 }
 
-/// Objects dropped one by one into an open box, which is then taken away.
+/// Drops objects one by one into an open box, and removes the box.
 fn pile(objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
     const BOX: Range<f64> = 0.02..0.28;
     const BOX_HEIGHT: f64 = 0.13;
@@ -118,11 +118,11 @@ fn pile(objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
     world
 }
 
-/// Objects stood upright where there is room.
+/// Places objects upright at free positions.
 fn packed(objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
     const ATTEMPTS: usize = 12;
     const CLEARANCE: f64 = 0.002;
-    /// By how much the bounding boxes that Bullet tells are larger on each side, metres.
+    /// Enlargement of Bullet's bounding boxes on each side, metres.
     const BOX_MARGIN: f64 = 0.003;
     let mut world = World::new();
     for _ in 0..ATTEMPTS {
@@ -133,8 +133,8 @@ fn packed(objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
         let (x, y) = (rng.random_range(0.08..0.22), rng.random_range(0.08..0.22));
         let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), rng.random_range(0.0..TAU));
         let scale = rng.random_range(PACKED_SCALE);
-        // As VGN's code has it, the object's origin goes to half its height: one that would then stand in the table is
-        // rejected, one that hangs above it falls.
+        // As in VGN's code, the object's origin is placed at half its height. An object that would intersect the table
+        // is rejected; an object above the table falls.
         let z = TABLE_HEIGHT + scale * height(&object) / 2.0 + BOX_MARGIN + CLEARANCE;
         let pose = Isometry3::from_parts(Translation3::new(x, y, z), rotation);
         if !world.is_occupied(&object, scale, &pose) {
@@ -145,7 +145,7 @@ fn packed(objects: &ObjectSet, count: usize, rng: &mut impl Rng) -> World {
     world
 }
 
-/// Uniform over all rotations: a 4-D Gaussian has no preferred direction.
+/// Uniform over all rotations, because a 4-D Gaussian is isotropic.
 fn random_rotation(rng: &mut impl Rng) -> UnitQuaternion<f64> {
     let [x, y, z, w] = std::array::from_fn(|_| StandardNormal.sample(rng));
     UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z))

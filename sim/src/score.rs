@@ -1,4 +1,4 @@
-//! The benchmark's figures.
+//! Figures of the benchmark.
 
 use std::time::Duration;
 
@@ -10,13 +10,13 @@ use crate::trial::Outcome;
 /// The benchmark's figures over all rounds.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
-    /// Rounds played.
+    /// Rounds.
     pub rounds: usize,
-    /// Objects that stood on the tables.
+    /// Objects at the start of the rounds.
     pub objects: usize,
-    /// Grasps executed.
+    /// Executed grasps.
     pub attempts: usize,
-    /// Objects lifted.
+    /// Lifted objects.
     pub successes: usize,
     /// Grasp success rate: successes / attempts.
     pub gsr: f64,
@@ -28,32 +28,32 @@ pub struct Summary {
     pub dr_interval: f64,
     /// Attempts that collided at the pre-grasp.
     pub blocked_at_pregrasp: usize,
-    /// Attempts that closed on nothing.
+    /// Empty grasps.
     pub closed_on_nothing: usize,
-    /// Attempts that lost the object in the lift.
+    /// Attempts that lost the object during the lift.
     pub lost_in_lift: usize,
-    /// Failures whose approach met something, so that the hand closed short of the grasp; they are among those above.
+    /// Failures in which the hand closed short of the grasp because of a contact. They are included in the three above.
     pub stopped_short: usize,
-    /// Rounds that ended because the table was empty.
+    /// Rounds that ended with an empty table.
     pub cleared: usize,
-    /// Rounds that ended because nothing was seen.
+    /// Rounds that ended because the cameras saw no object.
     pub nothing_seen: usize,
-    /// Rounds that ended because nothing was proposed.
+    /// Rounds that ended because the planner proposed no grasp.
     pub nothing_proposed: usize,
-    /// Rounds that ended after two failures in a row.
+    /// Rounds that ended after two consecutive failures.
     pub gave_up: usize,
-    /// Median time to fuse an observation's views, milliseconds.
+    /// Median fusion time of an observation, milliseconds.
     pub fusion_p50_ms: f64,
-    /// 95th percentile of the time to fuse, milliseconds.
+    /// 95th percentile of the fusion time, milliseconds.
     pub fusion_p95_ms: f64,
-    /// Median time to plan, milliseconds.
+    /// Median planning time, milliseconds.
     pub planning_p50_ms: f64,
-    /// 95th percentile of the time to plan, milliseconds.
+    /// 95th percentile of the planning time, milliseconds.
     pub planning_p95_ms: f64,
 }
 
 impl Summary {
-    /// Pools rounds, as the papers do.
+    /// Pools the rounds, as in the papers.
     #[must_use]
     pub fn of(rounds: &[Round]) -> Self {
         let attempts: Vec<Attempt> = rounds.iter().flat_map(|round| round.attempts.iter().copied()).collect();
@@ -97,7 +97,7 @@ impl Summary {
     }
 }
 
-/// A share and half of its 95 % interval (normal approximation).
+/// A proportion and half the width of its 95 % interval (normal approximation).
 fn proportion(part: usize, whole: usize) -> (f64, f64) {
     if whole == 0 {
         return (0.0, 0.0);
@@ -111,14 +111,14 @@ fn proportion(part: usize, whole: usize) -> (f64, f64) {
 pub struct Spread {
     /// Mean.
     pub mean: f64,
-    /// Sample standard deviation; none of one value.
+    /// Sample standard deviation; `None` for a single value.
     pub std: Option<f64>,
-    /// How many values.
+    /// Number of values.
     pub n: usize,
 }
 
 impl Spread {
-    /// Of these values; `None` of none.
+    /// The spread of these values; `None` without values.
     #[must_use]
     pub fn of(values: &[f64]) -> Option<Self> {
         let n = values.len() as f64;
@@ -136,7 +136,7 @@ impl Spread {
     }
 }
 
-/// Durations in order.
+/// Sorted durations, milliseconds.
 struct Milliseconds(Vec<f64>);
 
 impl Milliseconds {
@@ -146,7 +146,7 @@ impl Milliseconds {
         Self(sorted)
     }
 
-    /// The value that this share lies below; 0 of nothing.
+    /// The value below which this share lies; 0 without values.
     fn percentile(&self, share: f64) -> f64 {
         let rank = (share * self.0.len() as f64) as usize;
         self.0.get(rank.min(self.0.len().saturating_sub(1))).copied().unwrap_or(0.0)
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn percentiles_are_of_what_was_measured() {
+    fn percentiles_are_measured_values() {
         let durations: Vec<Duration> = (1..=100).rev().map(Duration::from_millis).collect();
         let sorted = Milliseconds::of(durations.iter());
         assert_eq!((sorted.percentile(0.5), sorted.percentile(0.95), sorted.percentile(1.0)), (51.0, 96.0, 100.0));

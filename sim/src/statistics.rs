@@ -1,4 +1,4 @@
-//! What is in a data set: how its labels are balanced, and over what.
+//! Statistics of a data set: the distribution of its labels.
 
 use std::collections::BTreeMap;
 
@@ -10,48 +10,48 @@ use serde::Serialize;
 use crate::TABLE_HEIGHT;
 use crate::export::Line;
 
-/// Grasps in bins over some quantity.
+/// A histogram of grasps or scenes.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Histogram {
-    /// What it is over, with its unit.
+    /// The quantity of the x axis, with its unit.
     pub quantity: &'static str,
-    /// What is counted in it.
+    /// What is counted.
     pub counted: &'static str,
-    /// Where the first bin begins.
+    /// Start of the first bin.
     pub start: f64,
     /// Width of a bin.
     pub step: f64,
-    /// Failures and successes in each bin; what lies outside is in the first or the last.
+    /// Failures and successes in each bin. The first and last bins include values outside the range.
     pub bins: Vec<Count>,
 }
 
-/// Grasps that were tried.
+/// Number of trials by outcome.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Count {
-    /// Those that failed.
+    /// Trials that failed.
     pub failures: u64,
-    /// Those that lifted an object.
+    /// Trials that lifted an object.
     pub successes: u64,
 }
 
-/// A data set in figures.
+/// Statistics of a data set.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Statistics {
-    /// Scenes.
+    /// Number of scenes.
     pub scenes: usize,
-    /// Observations of them.
+    /// Number of observations.
     pub volumes: usize,
-    /// Share of an observation's voxels near a surface that was seen, mean.
+    /// Mean share of an observation's voxels that are near an observed surface.
     pub observed: f64,
-    /// Grasps.
+    /// Number of grasps.
     pub grasps: Count,
-    /// Opening, of successes.
+    /// Opening of the successes.
     pub widths: Histogram,
     /// Height of the grasp frame above the table.
     pub heights: Histogram,
     /// Angle between the approach and straight down.
     pub approaches: Histogram,
-    /// Successes a scene: how many scenes have a share of so much.
+    /// Success rate of the scenes.
     pub shares: Histogram,
 }
 
@@ -76,13 +76,13 @@ impl Count {
         }
     }
 
-    /// All of them.
+    /// All trials.
     #[must_use]
     pub fn all(self) -> u64 {
         self.failures + self.successes
     }
 
-    /// Share of the successes; none of nothing.
+    /// Share of the successes; `None` without trials.
     #[must_use]
     pub fn share(self) -> Option<f64> {
         (self.all() > 0).then(|| self.successes as f64 / self.all() as f64)
@@ -90,7 +90,7 @@ impl Count {
 }
 
 impl Statistics {
-    /// Counts a data set, whose volumes are of the benchmark's workspace.
+    /// The statistics of a data set with the benchmark's workspace.
     #[must_use]
     pub fn of(dataset: &Dataset) -> Self {
         let voxel_size = WORKSPACE_SIZE / dataset.resolution().max(1) as f64;
@@ -101,8 +101,8 @@ impl Statistics {
             grasps: Count::default(),
             widths: Histogram::new("width, mm", "successes", MAX_OPENING * 1e3),
             heights: Histogram::new("height above the table, mm", "grasps", 200.0),
-            approaches: Histogram::new("approach off straight down, degrees", "grasps", 100.0),
-            shares: Histogram::new("successes of a scene, %", "scenes", 100.0),
+            approaches: Histogram::new("angle of the approach from straight down, degrees", "grasps", 100.0),
+            shares: Histogram::new("success rate of a scene, %", "scenes", 100.0),
         };
         for index in 0..dataset.len() {
             for look in 0..dataset.volumes(index) {
@@ -133,7 +133,7 @@ impl Statistics {
     }
 }
 
-/// Grasps by what they were tried on: by the objects' names without the seeds of our own.
+/// Trials by object name, without the seeds of procedural objects.
 #[must_use]
 pub fn by_object(lines: &[Line]) -> BTreeMap<String, Count> {
     let mut objects: BTreeMap<String, Count> = BTreeMap::new();

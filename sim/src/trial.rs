@@ -1,4 +1,4 @@
-//! One grasp, tried: pre-grasp, approach, close, lift.
+//! A trial of a grasp: pre-grasp, approach, close, lift.
 
 use std::f64::consts::FRAC_PI_3;
 use std::sync::LazyLock;
@@ -13,47 +13,47 @@ pub const PREGRASP_DISTANCE: f64 = 0.05;
 /// Height of the lift, metres.
 const LIFT: f64 = 0.1;
 
-/// Speed of the lift, m/s: the reference's hand makes 2 mm in 4 steps of 1/240 s.
+/// Speed of the lift, m/s: the reference's hand moves 2 mm in 4 steps of 1/240 s.
 const LIFT_SPEED: f64 = 0.12;
 
-/// Opening below which the hand holds nothing: a tenth of its greatest (VGN).
+/// Opening below which a grasp is empty: a tenth of the maximum opening (VGN).
 const EMPTY_WIDTH: f64 = 0.1 * grasp::MAX_OPENING;
 
-/// Steps between two looks at what the lift does, 50 ms.
+/// Steps between two checks during the lift, 50 ms.
 const LOOK: u32 = STEPS_PER_SECOND / 20;
 
 /// Step of the approach, metres.
 const APPROACH_STEP: f64 = 0.002;
 
-/// How far the hand is behind its target on its approach, metres: what Bullet's constraint leaves of steps of 2 mm.
+/// Lag of the hand behind its target on the approach, metres: the residual of Bullet's constraint for steps of 2 mm.
 const LAG: f64 = 0.0014;
 
-/// The way of the open hand from the pre-grasp to the grasp.
-static WAY: LazyLock<Vec<HandPart>> =
+/// The volume swept by the open hand from the pre-grasp to the grasp.
+static SWEPT_HAND: LazyLock<Vec<HandPart>> =
     LazyLock::new(|| OPEN_HAND.iter().map(|part| part.swept(PREGRASP_DISTANCE)).collect());
 
-/// What became of a grasp.
+/// The outcome of a trial.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Outcome {
-    /// The object was lifted; `width` is the opening after the lift, metres.
+    /// An object was lifted.
     Lifted {
-        /// What was lifted.
+        /// The lifted object.
         object: BodyId,
-        /// Opening, metres.
+        /// Opening after the lift, metres.
         width: f64,
     },
-    /// The open hand touched something where it appeared, and what it closed on there was not lifted.
+    /// The open hand was in contact at the pre-grasp, closed there and lifted nothing.
     BlockedAtPregrasp,
-    /// The open hand collided on its way to the grasp, where that counts as a failure.
+    /// The open hand collided on its approach; only for labels.
     BlockedOnApproach,
-    /// The fingers closed on nothing.
+    /// Empty grasp: no object was between the fingers.
     ClosedOnNothing,
-    /// What was held slipped out while it was lifted.
+    /// The object slipped out of the hand during the lift.
     LostInLift,
 }
 
 impl Outcome {
-    /// The outcome in a word, as reports have it.
+    /// The name of the outcome in reports.
     #[must_use]
     pub fn name(&self) -> &'static str {
         match self {
@@ -72,30 +72,30 @@ impl Outcome {
     }
 }
 
-/// Tries a grasp as training data is labelled: any contact on the way, of a hand that is swollen by `swell` metres a side,
-/// is a failure. `world` is left as it was.
+/// Tries a grasp for a label: any contact on the approach is a failure. The hand is enlarged by `swell` metres per side
+/// for the contact test. `world` is not changed.
 #[must_use]
 pub fn label(world: &World, grasp: &Isometry3<f64>, swell: f64) -> Outcome {
-    // One test of the swept hand stands for the pre-grasp and every step of the approach.
-    if world.is_near(&WAY, grasp, CONTACT_GAP + swell) {
+    // One test of the swept hand covers the pre-grasp and every step of the approach.
+    if world.is_near(&SWEPT_HAND, grasp, CONTACT_GAP + swell) {
         return Outcome::BlockedOnApproach;
     }
     close_and_lift(&mut world.clone(), grasp, grasp, Until::NothingIsHeld)
 }
 
-/// How much room the open hand has on its way to a grasp: the distance of the nearest object's mesh, at most `limit`,
+/// Clearance of the open hand between pre-grasp and grasp: the distance to the nearest object's mesh, at most `limit`,
 /// metres.
 #[must_use]
 pub fn clearance(world: &World, grasp: &Isometry3<f64>, limit: f64) -> f64 {
-    world.clearance(&WAY, grasp, limit)
+    world.clearance(&SWEPT_HAND, grasp, limit)
 }
 
-/// Executes a grasp as in evaluation: the hand closes where its approach met something, and how far from the grasp that
-/// was is the second answer, metres. A lifted object is still in the hand's place in `world`; the caller decides what
-/// becomes of it.
+/// Executes a grasp as in evaluation: on contact during the approach the hand closes at once. Returns the outcome and
+/// the distance from the grasp at which the hand closed, metres. A lifted object stays in `world`; the caller removes
+/// it.
 ///
-/// As in the reference, a hand that touches something where it appears closes there, and if it appears in something it is
-/// pushed out; only a failure is then called [`BlockedAtPregrasp`](Outcome::BlockedAtPregrasp).
+/// As in the reference, a hand in contact at the pre-grasp closes there, and a hand that overlaps an object or the
+/// table is pushed out. Only a failure then counts as [`BlockedAtPregrasp`](Outcome::BlockedAtPregrasp).
 pub fn execute(world: &mut World, grasp: &Isometry3<f64>) -> (Outcome, f64) {
     let at = |distance: f64| grasp * Translation3::new(0.0, 0.0, -distance);
     let steps = (PREGRASP_DISTANCE / APPROACH_STEP).round() as u32;
@@ -107,22 +107,22 @@ pub fn execute(world: &mut World, grasp: &Isometry3<f64>) -> (Outcome, f64) {
     }
 }
 
-/// From the grasp after so many steps of the approach.
+/// Distance from the grasp after this many steps of the approach, metres.
 fn distance_after(step: u32) -> f64 {
     PREGRASP_DISTANCE - f64::from(step) * APPROACH_STEP
 }
 
-/// How long a trial goes on.
+/// When a trial ends.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Until {
-    /// Until it has failed: only the outcome is asked for.
+    /// As soon as it has failed, because only the outcome is needed.
     NothingIsHeld,
-    /// As in the reference the hand is lifted whatever it holds. It moves what stands around, so that the next attempt
-    /// meets another scene, and now and then it catches something.
+    /// After the full motion, as in the reference, even with an empty hand. The motion can move other objects, which
+    /// changes the scene of the next attempt, and can catch an object.
     TheEnd,
 }
 
-/// Closes the hand at `start` and lifts it to where a lift from `grasp` ends.
+/// Closes the hand at `start` and lifts it to the end of a lift from `grasp`.
 fn close_and_lift(world: &mut World, start: &Isometry3<f64>, grasp: &Isometry3<f64>, until: Until) -> Outcome {
     let behind = start * Translation3::new(0.0, 0.0, -LAG);
     let mut gripper = Gripper::insert(world, &behind, start);
@@ -138,7 +138,7 @@ fn close_and_lift(world: &mut World, start: &Isometry3<f64>, grasp: &Isometry3<f
     outcome
 }
 
-/// Closes until the width is still for 50 ms, or 0.5 s at the longest. What is held then.
+/// Closes until the width is constant for 50 ms, for at most 0.5 s. Returns the held object.
 fn close(world: &mut World, gripper: &mut Gripper) -> Option<BodyId> {
     const STILL: f64 = 1e-5;
     let mut still_since = 0;
@@ -173,11 +173,11 @@ fn lift(
         gripper.close(world);
         world.step();
         if step % LOOK == 0 {
-            // The reference looks once, at the end; shut fingers will not hold anything any more.
+            // The reference checks only at the end. Closed fingers cannot hold an object later, so the trial ends here.
             if until == Until::NothingIsHeld && gripper.width(world) <= EMPTY_WIDTH {
                 return Outcome::LostInLift;
             }
-            // Nor will anything change for what hangs still in the hand with nothing before it.
+            // The outcome is also known if the object is still in the hand and the remaining path is free.
             let before = std::mem::replace(&mut carried, Carried::now(world, gripper));
             if let (Some(before), Some(now)) = (before, &carried)
                 && now.hangs_still(&before)
@@ -193,7 +193,7 @@ fn lift(
     }
 }
 
-/// Where an object is in the hand.
+/// Pose of the held object in the hand.
 struct Carried {
     object: BodyId,
     pose: Isometry3<f64>,
@@ -205,7 +205,7 @@ impl Carried {
         Some(Self { object, pose: gripper.pose(world).inv_mul(&world.pose(object)) })
     }
 
-    /// Whether what creeps now would not have crept 3 mm, or turned nine degrees, when the lift ends.
+    /// Whether the object is still: at this rate it creeps less than 3 mm and 9° until the end of the lift.
     fn hangs_still(&self, before: &Self) -> bool {
         const CREEP: f64 = 2e-4;
         const TURN: f64 = 1e-2;
@@ -218,7 +218,7 @@ fn holds(world: &World, gripper: &Gripper) -> Option<BodyId> {
     gripper.held(world).filter(|_| gripper.width(world) > EMPTY_WIDTH)
 }
 
-/// Back along the approach, or straight up where the approach is more than 60° off straight down.
+/// Direction of the lift: back along the approach, or straight up if the approach is more than 60° from straight down.
 fn retreat(grasp: &Isometry3<f64>) -> Vector3<f64> {
     let approach = grasp.rotation * Vector3::z();
     if approach.angle(&-Vector3::z()) > FRAC_PI_3 { Vector3::z() } else { -approach }

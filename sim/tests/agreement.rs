@@ -1,4 +1,4 @@
-//! The labels against another physics engine: trials that were replayed in MuJoCo (`mujoco/replay.py`).
+//! Agreement of labels with another physics engine: trials replayed in MuJoCo (`mujoco/replay.py`).
 
 use std::fs;
 
@@ -18,9 +18,9 @@ struct Scene {
 
 #[derive(Deserialize)]
 struct Point {
-    /// Of the first yaw.
+    /// Pose at the first yaw.
     pose: [f64; 7],
-    /// What became of each yaw: 0 blocked on the approach, 1 failed later, 2 lifted.
+    /// Outcome of each yaw: 0 blocked on the approach, 1 failed later, 2 lifted.
     mujoco: [u8; 5],
 }
 
@@ -29,7 +29,7 @@ fn isometry(&[x, y, z, qx, qy, qz, qw]: &[f64; 7]) -> Isometry3<f64> {
     Isometry3::from_parts(Translation3::new(x, y, z), rotation)
 }
 
-/// How often two engines say what: `table[ours][MuJoCo's]`.
+/// Contingency table of the outcomes: `table[ours][MuJoCo's]`.
 fn compare(scenes: &[Scene]) -> [[usize; 3]; 3] {
     let set = ObjectSet::procedural(Split::Train);
     let pairs: Vec<(usize, usize)> = scenes
@@ -40,11 +40,11 @@ fn compare(scenes: &[Scene]) -> [[usize; 3]; 3] {
                 let known = set.listed().iter().find(|known| known.name == *object);
                 world.add(known.expect("the stored scenes are of this set"), *scale, &isometry(pose));
             }
-            // What rests has contacts.
+            // The steps create the contacts of resting objects.
             (0..60).for_each(|_| world.step());
             let trial = move |point: &Point, yaw: usize| {
                 let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw as f64 * std::f64::consts::PI / 5.0);
-                // In MuJoCo a contact counts from no distance on.
+                // In MuJoCo contacts start at distance 0.
                 let ours = match label(&world, &(isometry(&point.pose) * turn), -CONTACT_GAP) {
                     Outcome::BlockedAtPregrasp | Outcome::BlockedOnApproach => 0,
                     Outcome::ClosedOnNothing | Outcome::LostInLift => 1,
@@ -61,7 +61,7 @@ fn compare(scenes: &[Scene]) -> [[usize; 3]; 3] {
 }
 
 #[test]
-fn another_engine_labels_alike() {
+fn labels_agree_with_mujoco() {
     let text = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/mujoco/trials.jsonl")).unwrap();
     let scenes: Vec<Scene> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let table = compare(&scenes);

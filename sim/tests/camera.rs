@@ -1,4 +1,4 @@
-//! The depth camera against scenes whose depth is known by formula.
+//! The depth camera against scenes with an analytic depth.
 
 use std::sync::Arc;
 
@@ -19,7 +19,7 @@ fn world(mesh: Mesh, pose: &Isometry3<f64>) -> World {
     world
 }
 
-/// Distances along a ray at which it meets the table and the inside of a cuboid centred at the origin of `pose`.
+/// Distances along a ray to its intersection with the table, a cuboid centred at `pose`, and a sphere.
 fn table(eye: &Point3<f64>, ray: &Vector3<f64>) -> f64 {
     let distance = (TABLE_HEIGHT - eye.z) / ray.z;
     if distance > 0.0 { distance } else { f64::INFINITY }
@@ -43,7 +43,7 @@ fn sphere(eye: &Point3<f64>, ray: &Vector3<f64>, centre: &Point3<f64>, radius: f
     if under_root < 0.0 { f64::INFINITY } else { (along - under_root.sqrt()) / norm }
 }
 
-/// Shares of the pixels that see it nearer than the table, and of those that are off by more than `error` metres.
+/// Shares of the pixels that show the object, and of those with a depth error above `error` metres.
 fn compare(world: &World, nearer: impl Fn(&Point3<f64>, &Vector3<f64>) -> f64, error: f64) -> (f64, f64) {
     let camera = Intrinsics::BENCHMARK;
     let (mut seen, mut wrong, mut all) = (0, 0, 0);
@@ -54,7 +54,7 @@ fn compare(world: &World, nearer: impl Fn(&Point3<f64>, &Vector3<f64>) -> f64, e
         let eye = view.camera_from_task.inverse() * Point3::origin();
         for (index, &depth) in view.depth.iter().enumerate() {
             let (u, v) = ((index % camera.width) as f64, (index / camera.width) as f64);
-            // Its third component is 1, so that lengths along it are depths.
+            // The third component is 1, so that lengths along the ray are depths.
             let ray = Vector3::new((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0);
             let ray = view.camera_from_task.rotation.inverse() * ray;
             let (object, table) = (nearer(&eye, &ray), table(&eye, &ray));
@@ -73,12 +73,12 @@ fn a_cuboid_on_the_table_has_its_depth() {
     let size = Vector3::new(0.08, 0.05, 0.12);
     let pose = Isometry3::new(Vector3::new(0.14, 0.17, TABLE_HEIGHT + 0.1), Vector3::new(0.3, -0.2, 0.8));
     let (seen, wrong) = compare(&world(Mesh::cuboid(size), &pose), |eye, ray| cuboid(eye, ray, &pose, &size), 1e-5);
-    assert!(seen > 0.02, "it fills {seen} of the images");
-    assert!(wrong < 1e-4, "{wrong} of the pixels are off by more than 0.01 mm; along an edge a few may be");
+    assert!(seen > 0.02, "the object covers {seen} of the images");
+    assert!(wrong < 1e-4, "{wrong} of the pixels have an error above 0.01 mm; only a few at the edges may");
 }
 
 #[test]
-fn a_sphere_has_its_depth_but_for_its_facets() {
+fn the_depth_of_a_sphere_is_right_except_for_its_facets() {
     let centre = Point3::new(0.16, 0.13, TABLE_HEIGHT + 0.05);
     let pose = Isometry3::translation(centre.x, centre.y, centre.z);
     let (seen, wrong) =
@@ -87,7 +87,7 @@ fn a_sphere_has_its_depth_but_for_its_facets() {
 }
 
 #[test]
-fn noise_is_of_the_size_that_is_stated() {
+fn noise_has_the_documented_magnitude() {
     let pose = Isometry3::translation(0.15, 0.15, TABLE_HEIGHT + 0.02);
     let world = world(Mesh::cuboid(Vector3::repeat(0.04)), &pose);
     let mut rng = ChaCha8Rng::seed_from_u64(1);
@@ -108,7 +108,7 @@ fn noise_is_of_the_size_that_is_stated() {
     // Gamma(1000, 0.001): mean 1, standard deviation 0.0316.
     assert!((mean - 1.0).abs() < 0.015 && (0.024..0.04).contains(&std), "factor {mean} ± {std}");
     let noisy: Vec<f64> = additive.iter().copied().filter(|&size| size > 1e-4).collect();
-    assert!((18..=42).contains(&noisy.len()), "{} of 60 images carry additive noise, half should", noisy.len());
-    // 5 mm on the coarse grid; between its points, bilinearly, two thirds of it in each direction on average.
+    assert!((18..=42).contains(&noisy.len()), "{} of 60 images have additive noise, about half must", noisy.len());
+    // 5 mm on the coarse grid. Bilinear interpolation reduces it by two thirds in each direction on average.
     assert!(noisy.iter().all(|size| (0.0028..0.0042).contains(size)), "{noisy:?}");
 }

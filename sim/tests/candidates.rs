@@ -1,4 +1,4 @@
-//! The classical planners and what their classifier learns from. `ORT_DYLIB_PATH` must name ONNX Runtime's library.
+//! The classical planners and the training data of their classifier. `ORT_DYLIB_PATH` must name ONNX Runtime's library.
 
 use std::fs;
 
@@ -37,7 +37,7 @@ fn plan(spec: &str, observation: &Observation) -> Vec<grasp::Grasp> {
 }
 
 #[test]
-fn what_is_written_depends_on_the_seed_and_not_on_the_threads() {
+fn candidates_depend_on_the_seed_and_not_on_the_threads() {
     let folder = tempfile::tempdir().unwrap();
     let made = |threads: usize, seed: u64| {
         let config = SceneConfig {
@@ -66,7 +66,7 @@ fn what_is_written_depends_on_the_seed_and_not_on_the_threads() {
 }
 
 #[test]
-fn shaf_grasps_what_is_highest_and_lifts_it() {
+fn shaf_proposes_high_grasps_that_lift() {
     let (world, mut rng) = benchmark().scene(0);
     let observation = benchmark().observe(&world, &mut rng).unwrap();
     let grasps = plan("shaf", &observation);
@@ -83,7 +83,7 @@ fn shaf_grasps_what_is_highest_and_lifts_it() {
 }
 
 #[test]
-fn a_classifier_drops_and_orders_candidates() {
+fn a_classifier_filters_and_ranks_candidates() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("gpd.onnx");
     grasp_models::gpd::gpd(3).write(&path).unwrap();
@@ -96,7 +96,7 @@ fn a_classifier_drops_and_orders_candidates() {
 }
 
 #[test]
-fn a_networks_proposals_are_ordered_by_their_height() {
+fn shaf_ranks_a_networks_proposals_by_height() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo/vgn-packed.onnx");
     let (world, mut rng) = benchmark().scene(1);
     let observation = benchmark().observe(&world, &mut rng).unwrap();
@@ -107,16 +107,16 @@ fn a_networks_proposals_are_ordered_by_their_height() {
 }
 
 #[test]
-fn a_file_of_another_kind_is_refused_by_name() {
+fn the_wrong_kind_of_network_is_refused_with_its_file_name() {
     let folder = tempfile::tempdir().unwrap();
     let classifier = folder.path().join("gpd.onnx");
     grasp_models::gpd::gpd(0).write(&classifier).unwrap();
     let network = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo/vgn-packed.onnx");
     let classifier = classifier.display();
     for (spec, file, expected) in [
-        (format!("gpd:{network}"), "vgn-packed.onnx", "a classifier reads `images`"),
-        (format!("shaf:{classifier}"), "gpd.onnx", "a grasp network reads `tsdf`"),
-        (classifier.to_string(), "gpd.onnx", "a grasp network reads `tsdf`"),
+        (format!("gpd:{network}"), "vgn-packed.onnx", "a classifier has the input `images`"),
+        (format!("shaf:{classifier}"), "gpd.onnx", "a grasp network has the input `tsdf`"),
+        (classifier.to_string(), "gpd.onnx", "a grasp network has the input `tsdf`"),
         ("gpd:nowhere.onnx".to_owned(), "nowhere.onnx", "No such file"),
     ] {
         let error = PlannerSpec::from(spec.as_str())

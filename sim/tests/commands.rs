@@ -1,4 +1,4 @@
-//! The commands of `grasp-sim` as a user types them. `ORT_DYLIB_PATH` must name ONNX Runtime's library.
+//! The commands of `grasp-sim`. `ORT_DYLIB_PATH` must name ONNX Runtime's library.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -15,7 +15,7 @@ use tempfile::TempDir;
 const SIM: &str = env!("CARGO_BIN_EXE_grasp-sim");
 const NETWORK: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo/vgn-packed.onnx");
 
-/// A folder to run commands in.
+/// A temporary working folder.
 struct Desk(TempDir);
 
 impl Desk {
@@ -39,18 +39,18 @@ impl Desk {
         String::from_utf8(output.stdout).unwrap()
     }
 
-    /// Runs what must fail, and gives what it says.
+    /// Runs a command that must fail, and returns its stderr.
     fn refused(&self, arguments: &str) -> String {
         let output = self.command(arguments).output().unwrap();
         assert!(!output.status.success(), "{arguments} should fail");
         stderr(&output)
     }
 
-    /// All there is in a packed folder: a scene's name, its volumes and its trials.
+    /// The content of a packed data set: each scene's name, volumes and trials.
     fn scenes(&self, name: &str) -> Vec<(String, Vec<Vec<u8>>, Vec<String>)> {
         let data = Dataset::open(&[self.path(name)]).unwrap();
         let scene = |index| {
-            let volumes = (0..data.volumes(index)).map(|look| data.volume(index, look).to_vec()).collect();
+            let volumes = (0..data.volumes(index)).map(|number| data.volume(index, number).to_vec()).collect();
             let trials =
                 data.trials(index).iter().map(|t| format!("{:.3?} {:.3} {}", t.position, t.width, t.success)).collect();
             (data.id(index), volumes, trials)
@@ -73,7 +73,7 @@ fn bytes_of(folder: &Path) -> u64 {
 }
 
 #[test]
-fn a_killed_run_goes_on_without_a_lost_or_doubled_scene() {
+fn a_killed_run_continues_without_lost_or_duplicate_scenes() {
     let desk = Desk::new();
     desk.run(&format!("{LABEL} --scenes 40 --out whole --export whole.jsonl"));
     let mut kills = 0;
@@ -87,7 +87,7 @@ fn a_killed_run_goes_on_without_a_lost_or_doubled_scene() {
         child.kill().unwrap();
         child.wait().unwrap();
     }
-    assert!(kills > 0, "it was never caught at work");
+    assert!(kills > 0, "no run was killed before its end");
     desk.run(&format!("{LABEL} --scenes 40 --out killed --export killed.jsonl"));
     let whole = desk.scenes("whole");
     assert!(whole.len() > 35);
@@ -110,9 +110,9 @@ fn the_same_seed_gives_the_same_bytes_on_any_number_of_threads() {
 }
 
 #[test]
-fn a_full_disk_is_said_and_what_was_written_stays() {
+fn a_full_disk_is_reported_and_written_scenes_stay() {
     let desk = Desk::new();
-    // A limit on the size of files stands for the disk's end. In blocks of 512 or 1,024 bytes, as the shell likes.
+    // A limit of the file size simulates a full disk. Its unit is 512 or 1,024 bytes, depending on the shell.
     let command = format!("trap '' XFSZ; ulimit -f 1000; exec {SIM} {LABEL} --scenes 30 --out full");
     let output = Command::new("sh").args(["-c", &command]).current_dir(&desk.0).output().unwrap();
     assert!(!output.status.success());
@@ -126,7 +126,7 @@ fn a_full_disk_is_said_and_what_was_written_stays() {
 }
 
 #[test]
-fn every_form_holds_the_same() {
+fn all_formats_contain_the_same_data() {
     let desk = Desk::new();
     let label = "label --scene pile --points 20 --scenes 6 --seed 2";
     for format in ["raw", "processed", "packed"] {
@@ -135,7 +135,7 @@ fn every_form_holds_the_same() {
     desk.run("convert --from processed --out from-processed");
     assert!(desk.scenes("packed") == desk.scenes("from-processed"));
     desk.run("convert --from raw --out from-raw");
-    // Grasps at the borders are dropped on the way from raw, and poses are f32 in its files.
+    // The conversion from raw drops grasps at the borders, and raw files store poses as f32.
     let (packed, fused) = (desk.scenes("packed"), desk.scenes("from-raw"));
     assert_eq!(packed.len(), fused.len());
     for ((_, before, _), (_, after, _)) in packed.iter().zip(&fused) {
@@ -158,14 +158,14 @@ fn an_export_can_be_replayed() {
         for object in &line.objects {
             assert!((0.7..=0.9).contains(&object.scale) && object.pose[2] > 0.05);
             let urdf = format!("objects/{}.urdf", object.object);
-            assert!(desk.path(&urdf).exists(), "{urdf} is not among what `objects --out` wrote");
+            assert!(desk.path(&urdf).exists(), "`objects --out` did not write {urdf}");
         }
         for (exported, trial) in line.trials.iter().zip(data.trials(index)) {
             let grasp = trial.grasp(0.3 / 40.0);
             assert_eq!(exported.label == 1, trial.success);
             let held = exported.yaws.contains(&1);
-            assert_eq!(exported.yaws[exported.yaw] == 1, held, "the yaw to learn held, if any did");
-            assert_eq!(exported.share > 0.0, held, "its first try is one of those that the share counts");
+            assert_eq!(exported.yaws[exported.yaw] == 1, held, "the labelled yaw succeeded, if any did");
+            assert_eq!(exported.share > 0.0, held, "the share includes the first try");
             assert_eq!(exported.share > 0.7, trial.success, "at most one of the tries of a success failed");
             assert_eq!((exported.share, exported.clearance), (trial.share, trial.clearance));
             assert!((exported.width - grasp.width).abs() < 1e-6);
@@ -174,7 +174,7 @@ fn an_export_can_be_replayed() {
             assert!(exported.object.is_some_and(|object| object < line.objects.len()));
         }
     }
-    // The very scenes again: what held as it was, holds.
+    // Replayed in the same scenes, grasps that succeeded without pose error succeed again.
     let all = lines.iter().map(|line| line.trials.len()).sum::<usize>();
     let replayed = desk.run("replay scenes.jsonl --objects objects --contact forbid --out replayed.jsonl");
     let report: Value = serde_json::from_str(replayed.trim()).unwrap();
@@ -188,8 +188,8 @@ fn an_export_can_be_replayed() {
 fn statistics_count_every_grasp_once() {
     let desk = Desk::new();
     desk.run("label --scene pile --points 25 --scenes 6 --seed 2 --out data --export scenes.jsonl");
-    let said = desk.run("stats data --export scenes.jsonl --out statistics");
-    assert!(said.contains("150 grasps"), "{said}");
+    let printed = desk.run("stats data --export scenes.jsonl --out statistics");
+    assert!(printed.contains("150 grasps"), "{printed}");
     let json: Value = serde_json::from_slice(&fs::read(desk.path("statistics/statistics.json")).unwrap()).unwrap();
     let sum =
         |bins: &Value, key: &str| bins.as_array().unwrap().iter().map(|bin| bin[key].as_u64().unwrap()).sum::<u64>();
@@ -209,7 +209,7 @@ fn statistics_count_every_grasp_once() {
 }
 
 #[test]
-fn a_benchmark_tells_of_every_attempt() {
+fn a_benchmark_reports_every_attempt() {
     let desk = Desk::new();
     let bench = format!("bench --planner random --planner {NETWORK} --rounds 1 --seeds 2 --seed 3");
     let lines = desk.run(&format!("{bench} --attempts attempts.jsonl --pictures pictures"));
@@ -233,7 +233,7 @@ fn a_benchmark_tells_of_every_attempt() {
         assert_eq!((ended, summary["seeds"]["gsr"]["n"].as_u64()), (2, Some(2)));
         assert!(summary["fusion_p50_ms"].as_f64().unwrap() > 0.0);
     }
-    assert!(attempts.iter().any(|attempt| attempt["object"].is_string()), "what was grasped at has a name");
+    assert!(attempts.iter().any(|attempt| attempt["object"].is_string()), "attempts name their objects");
     let pictures: Vec<_> = fs::read_dir(desk.path("pictures")).unwrap().collect();
     assert_eq!(pictures.len(), attempts.len(), "a picture for each attempt");
 
@@ -272,7 +272,7 @@ fn a_part_of_a_folder_is_every_fifth_object() {
         assert!(!(if index % 5 == 4 { &train } else { &validation }).contains(name), "{name}");
     }
     let refused = desk.command("bench --planner random --part validation").output().unwrap();
-    assert!(stderr(&refused).contains("--part takes a part of a folder"), "{}", stderr(&refused));
+    assert!(stderr(&refused).contains("--part needs a folder of URDF files"), "{}", stderr(&refused));
 }
 
 #[test]
@@ -285,15 +285,15 @@ fn the_first_failures_are_drawn_on_a_sheet() {
         (fs::read(desk.path(name)).unwrap(), stderr(&output))
     };
     let (sheet, said) = bench("first.png");
-    // Each round ends with two failures of the random planner: six in all at least, three in a row.
+    // Each of the three rounds ends with two failures of the random planner. The sheet has three pictures per row.
     assert!(sheet.starts_with(b"\x89PNG"));
     assert_eq!((&sheet[16..20], &sheet[20..24]), (&1440u32.to_be_bytes()[..], &720u32.to_be_bytes()[..]));
     assert_eq!(said.matches("first.png: seed 5, round").count(), 6, "{said}");
-    assert!(bench("second.png").0 == sheet, "however the rounds are dealt out");
+    assert!(bench("second.png").0 == sheet, "the sheet does not depend on the scheduling of the rounds");
 }
 
 #[test]
-fn every_planner_meets_the_same_scenes() {
+fn all_planners_get_the_same_scenes() {
     let desk = Desk::new();
     let objects = |planner: &str| -> Vec<u64> {
         let lines = desk.run(&format!("bench --planner {planner} --scene pile --rounds 3 --seed 9"));
@@ -303,12 +303,12 @@ fn every_planner_meets_the_same_scenes() {
 }
 
 #[test]
-fn scenes_are_looked_at_anew() {
+fn scenes_are_observed_again() {
     let desk = Desk::new();
     desk.run(&format!("{LABEL} --scenes 5 --out data"));
     let before = desk.scenes("data");
     desk.run("observe data --views random:1-2 --observations 2 --seed 4 --out same");
-    assert_eq!(desk.scenes("same"), before, "with the seed and the views of the labels nothing changes");
+    assert_eq!(desk.scenes("same"), before, "with the same seed and views nothing changes");
     desk.run("observe data --views random:1,circle --observations 3 --noise 0 --seed 9 --out other");
     let other = desk.scenes("other");
     assert_eq!(other.len(), before.len());
@@ -317,14 +317,14 @@ fn scenes_are_looked_at_anew() {
         assert!(volumes.len() == 3 && volumes.iter().all(|volume| !volumes_before.contains(volume)));
     }
 
-    // Looks may be looked at anew, too, and a run goes on where it stopped.
+    // Observed data sets can be observed again, and a completed run adds nothing.
     desk.run("observe other --views random:1-2 --observations 2 --seed 4 --out again");
     assert_eq!(desk.scenes("again"), before);
     let bytes = bytes_of(&desk.path("again"));
     desk.run("observe other --views random:1-2 --observations 2 --seed 4 --out again");
     assert_eq!(bytes_of(&desk.path("again")), bytes);
 
-    // A data set of another simulator: its first scene looks otherwise.
+    // A data set of another simulator: its first scene differs.
     let setup = fs::read_to_string(desk.path("data/setup.json")).unwrap();
     fs::write(desk.path("data/setup.json"), setup.replace("\"seed\": 4", "\"seed\": 5")).unwrap();
     let said = desk.refused("observe data --views side --out refused");
@@ -332,7 +332,7 @@ fn scenes_are_looked_at_anew() {
 }
 
 #[test]
-fn tables_are_played_once() {
+fn conditions_of_the_tables_run_once() {
     let desk = Desk::new();
     fs::create_dir(desk.path("zoo")).unwrap();
     fs::copy(NETWORK, desk.path("zoo/vgn-packed.onnx")).unwrap();
@@ -353,21 +353,21 @@ fn tables_are_played_once() {
     assert_eq!(missing(&desk), (0, all));
     assert_eq!(fs::read_to_string(desk.path("out/tables.md")).unwrap(), text);
 
-    // A run that was killed in the middle of a line, and a network that has changed.
+    // A log that ends in the middle of a line, and a changed network.
     let log = fs::read_to_string(desk.path("out/tables.jsonl")).unwrap();
     assert_eq!(log.lines().count(), all);
     fs::write(desk.path("out/tables.jsonl"), &log[..log.len() - 20]).unwrap();
     assert_eq!(missing(&desk), (1, all));
     let mut network = fs::read(NETWORK).unwrap();
-    // A field that ONNX does not know: another file, the same network.
+    // An unknown ONNX field: another file, the same network.
     network.extend([0xF8, 0x3F, 0x01]);
     fs::write(desk.path("zoo/vgn-packed.onnx"), network).unwrap();
     let (played, _) = missing(&desk);
-    assert!(played > 5 && played < all, "{played} of {all}: what does not depend on the network is kept");
+    assert!(played > 5 && played < all, "{played} of {all}: conditions without the network are kept");
 }
 
 #[test]
-fn mistakes_name_what_is_wrong() {
+fn errors_name_the_cause() {
     let desk = Desk::new();
     desk.run("label --scene pile --points 5 --scenes 3 --format processed --out half");
     for folder in ["empty", "urdf", "flat", "wide", "half/scenes"] {
@@ -410,9 +410,9 @@ fn mistakes_name_what_is_wrong() {
         let said = desk.refused(&arguments);
         assert!(said.contains(expected) && !said.contains("panicked"), "{arguments}: {said}");
     }
-    assert!(!desk.path("never").exists(), "nothing is begun that cannot go on");
+    assert!(!desk.path("never").exists(), "no output is created after an error");
 
-    // Half a data set: a scene whose file is missing, one that is no archive, a table that breaks off.
+    // A damaged data set: a truncated scene file, a missing scene file, a truncated table.
     let scene = fs::read_dir(desk.path("half/scenes")).unwrap().next().unwrap().unwrap().path();
     let name = scene.file_name().unwrap().to_str().unwrap().to_owned();
     let whole = fs::read(&scene).unwrap();
@@ -425,7 +425,7 @@ fn mistakes_name_what_is_wrong() {
     fs::write(desk.path("half/grasps.csv"), &table[..table.len() - 9]).unwrap();
     let said = desk.refused("convert --from half --out third");
     assert!(said.contains("half/grasps.csv, line 16"), "{said}");
-    // Labelling mends it: the last scene is made again.
+    // Labelling again repairs it: the last scene is generated again.
     desk.run("label --scene pile --points 5 --scenes 3 --format processed --out half");
     assert_eq!(fs::read_to_string(desk.path("half/grasps.csv")).unwrap(), table);
 }

@@ -1,4 +1,4 @@
-//! What the physics must get right: friction as Coulomb has it, rest without energy, and the same labels every time.
+//! The physics: Coulomb friction, rest, collision shapes, and reproducible labels.
 
 use std::f64::consts::PI;
 use std::sync::Arc;
@@ -42,7 +42,8 @@ fn from_above() -> Isometry3<f64> {
 fn a_cube_is_lifted() {
     let world = cube_on_table(0.2, 1.0);
     match trial::label(&world, &from_above(), 0.0) {
-        // The cube's collision shape is 1 mm larger on each side, and so is a finger's, which gives way.
+        // The collision shape of the cube is 1 mm larger on each side; that of a finger is larger, too, minus its
+        // softness.
         Outcome::Lifted { width, .. } => assert!((0.001..0.004).contains(&(width - CUBE)), "held at {width} m"),
         other => panic!("{other:?}"),
     }
@@ -55,7 +56,7 @@ fn a_frictionless_cube_slips() {
 }
 
 #[test]
-fn the_least_friction_that_holds_is_coulombs() {
+fn the_smallest_friction_that_holds_follows_coulombs_law() {
     // Two fingers of 20 N hold 0.4 kg × 9.81 m/s² from μ = 3.924 / 40 = 0.0981 on.
     let is_held = |friction: f64| {
         let mut world = cube_on_table(0.4, friction);
@@ -70,11 +71,11 @@ fn the_least_friction_that_holds_is_coulombs() {
         world.pose(world.objects()[0].id).translation.z > TABLE_HEIGHT + CUBE / 2.0 + 0.05
     };
     assert!(!is_held(0.095));
-    // The solver does not quite give the fingers all of their force.
+    // The fingers reach slightly less than their nominal force.
     assert!(is_held(0.12));
 }
 
-/// The engine's shapes are as large as they should be: seen along x, what a needle comes near to is the mesh's outline.
+/// The engine's shapes have the right size: a needle along x is near the shape exactly inside the mesh's outline.
 #[test]
 fn outlines_of_hulls_and_cylinders_are_those_of_their_meshes() {
     let needle = Mesh::cuboid(Vector3::new(4e-4, 4e-4, 0.3)).vertices;
@@ -93,7 +94,7 @@ fn outlines_of_hulls_and_cylinders_are_those_of_their_meshes() {
         world.add(&Arc::new(object), 1.0, &tilted);
         world.step();
         let outline: Vec<[f64; 2]> = mesh.vertices.iter().map(|p| tilted * p).map(|p| [p.y, p.z]).collect();
-        // How far outside a point is: the greatest over all directions of how far it is beyond the outline.
+        // Distance of a point outside the outline: the maximum over all directions of the distance beyond the outline.
         let outside = |y: f64, z: f64| {
             let beyond = |(sin, cos): (f64, f64)| {
                 let reach = outline.iter().map(|p| p[0] * cos + p[1] * sin).fold(f64::NEG_INFINITY, f64::max);
@@ -118,20 +119,20 @@ fn outlines_of_hulls_and_cylinders_are_those_of_their_meshes() {
 }
 
 #[test]
-fn contact_on_the_way_is_a_failure_only_when_labelling() {
-    // Both fingers over the cube: closed along x, it is 4 cm wide, but shifted by 3 cm a finger stands on it.
+fn contact_on_the_approach_is_a_failure_only_for_labels() {
+    // The cube is 4 cm wide. With a shift of 3 cm one finger is above it.
     let shifted = Translation3::new(0.0, 0.03, 0.0) * from_above();
     assert_eq!(trial::label(&cube_on_table(0.2, 1.0), &shifted, 0.0), Outcome::BlockedOnApproach);
     let (outcome, short_by) = trial::execute(&mut cube_on_table(0.2, 1.0), &shifted);
     assert_ne!(outcome, Outcome::BlockedOnApproach);
-    assert!((0.001..0.05).contains(&short_by), "the hand stops where the finger stands: {short_by}");
+    assert!((0.001..0.05).contains(&short_by), "the hand stops at the contact: {short_by}");
     let through_the_table = Translation3::new(0.0, 0.0, -0.02) * from_above();
     assert_eq!(trial::label(&cube_on_table(0.2, 1.0), &through_the_table, 0.0), Outcome::BlockedOnApproach);
 }
 
 #[test]
-fn a_swollen_hand_needs_room_on_its_way() {
-    // The fingers pass the cube at 20 mm on each side; shifted by 16 mm, one of them at 4 mm.
+fn an_enlarged_hand_needs_clearance_on_its_approach() {
+    // The fingers pass the cube at 20 mm on each side; with a shift of 16 mm one of them at 4 mm.
     let shifted = Translation3::new(0.0, 0.016, 0.0) * from_above();
     let world = cube_on_table(0.2, 1.0);
     assert!((trial::clearance(&world, &shifted, 0.02) - 0.004).abs() < 1e-4);
@@ -140,8 +141,8 @@ fn a_swollen_hand_needs_room_on_its_way() {
 }
 
 #[test]
-fn a_hand_that_appears_in_the_table_is_pushed_out() {
-    // Level, the fingers side by side above the table: half of the palm, which is 20 cm wide, is in it if it stands on edge.
+fn a_hand_that_overlaps_the_table_is_pushed_out() {
+    // A horizontal approach. The palm is 20 cm wide; on edge, half of it is in the table.
     let level = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), PI / 2.0);
     let on_edge = level * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), PI / 2.0);
     let far_from_the_cube = Translation3::new(0.05, 0.05, TABLE_HEIGHT + 0.06);
@@ -157,7 +158,7 @@ fn a_hundred_piles_come_to_rest_and_stay() {
     let objects = ObjectSet::procedural(Split::PileTest);
     (0..100).into_par_iter().for_each(|seed| {
         let mut world = generate(SceneKind::Pile, &objects, 5, &mut ChaCha8Rng::seed_from_u64(seed));
-        // What settles is given up after a while, so that it rests is not for granted.
+        // Generation gives up after a time limit, so that rest is not guaranteed.
         assert!(is_at_rest(&world), "seed {seed}");
         let poses = |world: &World| world.objects().iter().map(|body| world.pose(body.id)).collect::<Vec<_>>();
         let before = poses(&world);

@@ -113,7 +113,7 @@ class ClientTest(unittest.TestCase):
         index = np.ravel_multi_index((1, 2, 3), values.shape)
         for request, code, message in [
             (self.request(self.volume(values)), grpc.StatusCode.INVALID_ARGUMENT, f"volume.data[{index}] is NaN"),
-            (self.request(options=self.pb.Options(model="nobody")), grpc.StatusCode.NOT_FOUND, "there are mirror 1"),
+            (self.request(options=self.pb.Options(model="nobody")), grpc.StatusCode.NOT_FOUND, "available: mirror 1"),
         ]:
             with self.assertRaises(grpc.RpcError) as caught:
                 self.grasps.DetectGrasps(request)

@@ -1,7 +1,7 @@
 """client/cpp, built and run as its README says, against a real graspd.
 
     GRASPD=target/release/graspd GRASPD_MODELS=models/zoo ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
-    GRASPD_CPP=$(python3 deploy/native.py cpp) \\
+    GRASPD_CPP=$(python3 tests/tools.py cpp) \\
     python -m unittest discover --start-directory tests/python --pattern test_cpp.py
 """
 
@@ -149,9 +149,9 @@ class CppTest(unittest.TestCase):
         transposed = self.detect("--k", "135 0 0 0 135 0 79.5 59.5 1")
         self.assert_refused(transposed, "INVALID_ARGUMENT: views[0].camera.k is [135.0")
         self.assert_refused(self.detect("--k", "135 135"), '--k is "135 135", must be 9 numbers')
-        self.assert_refused(self.detect("--depth", "none.npy"), "none.npy cannot be read")
+        self.assert_refused(self.detect("--depth", "none.npy"), "cannot read none.npy")
         np.save(self.folder / "half.npy", np.ones((2, 2), np.float16))
-        self.assert_refused(self.detect("--depth", "half.npy"), "half.npy is no .npy file")
+        self.assert_refused(self.detect("--depth", "half.npy"), "half.npy is not a .npy file")
         np.save(self.folder / "bare.npy", picture().astype("<f4"))
         self.assert_refused(self.detect("--depth", "bare.npy"), '--corner is "", must be 3 numbers')
         usage = self.detect("--help")
@@ -199,7 +199,7 @@ class CppTest(unittest.TestCase):
         self.assertEqual(used, recommended)
 
     def test_what_is_installed_is_what_is_fetched(self):
-        source = Path(native.__file__).read_text()
+        source = (ROOT / "tests/tools.py").read_text()
         for package in set(INSTALL.split()[3:]) - {"g++"}:
             self.assertIn(f'"{package}"', source)
 

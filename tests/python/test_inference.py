@@ -1,7 +1,7 @@
 """NVIDIA's client of Triton, unchanged, against the Open Inference Protocol of graspd.
 
     GRASPD=target/release/graspd GRASPD_MODELS=models/zoo ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
-    $(python3 deploy/native.py python) -m unittest discover --start-directory tests/python --pattern test_inference.py
+    $(python3 tests/tools.py python) -m unittest discover --start-directory tests/python --pattern test_inference.py
 """
 
 import unittest
@@ -119,8 +119,8 @@ class InferenceTest(unittest.TestCase):
         double = self.tensor(VOLUMES.astype(np.float64), datatype="FP64")
         unknown = [InferRequestedOutput("grip")]
         for ask, status, said in [
-            (lambda: self.infer(VOLUMES, model="nobody"), "NOT_FOUND", "model_name is `nobody`"),
-            (lambda: self.infer(VOLUMES, model="shaf"), "NOT_FOUND", "there are vgn-packed"),
+            (lambda: self.infer(VOLUMES, model="nobody"), "NOT_FOUND", "model_name: `nobody` not found"),
+            (lambda: self.infer(VOLUMES, model="shaf"), "NOT_FOUND", "available: vgn-packed"),
             (lambda: self.infer(VOLUMES, model_version="7"), "NOT_FOUND", "vgn-packed 7"),
             (lambda: self.client.get_model_metadata("nobody"), "NOT_FOUND", "model_name"),
             (lambda: self.client.get_model_config("nobody"), "NOT_FOUND", "model_name"),

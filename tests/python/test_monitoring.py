@@ -1,7 +1,7 @@
 """deploy/prometheus and deploy/grafana, tried on a real Prometheus that watches a real graspd, asked in every way.
 
     GRASPD=target/release/graspd GRASPD_MODELS=models/zoo ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
-    GRASPD_PROMETHEUS=$(python3 deploy/native.py prometheus) GRASPD_PROMTOOL=$(python3 deploy/native.py promtool) \\
+    GRASPD_PROMETHEUS=$(python3 tests/tools.py prometheus) GRASPD_PROMTOOL=$(python3 tests/tools.py promtool) \\
     python -m unittest discover --start-directory tests/python --pattern test_monitoring.py
 """
 

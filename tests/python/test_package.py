@@ -1,7 +1,7 @@
 """The package client/python, installed into a fresh folder, against graspd.
 
     GRASPD=target/release/graspd GRASPD_MODELS=models/zoo ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
-    $(python3 deploy/native.py python) -m unittest discover --start-directory tests/python --pattern test_package.py
+    $(python3 tests/tools.py python) -m unittest discover --start-directory tests/python --pattern test_package.py
 """
 
 import asyncio
@@ -227,7 +227,7 @@ class MistakesTest(ServerTest):
             self.assertEqual(vars(pickle.loads(pickle.dumps(error))), vars(error))
 
     def test_a_model_that_is_not_there(self):
-        volume, there_are = scene.volume(*CAMERAS), "NOT_FOUND: .* there are vgn-packed [0-9.]+, .*gpd 1, shaf 1"
+        volume, there_are = scene.volume(*CAMERAS), "NOT_FOUND: .* available: vgn-packed [0-9.]+, .*gpd 1, shaf 1"
         for field, options in [
             ("options.model", graspd.Options(model="nobody")),
             ("options.version", graspd.Options(model="shaf", version="0")),
@@ -334,7 +334,7 @@ class TrackTest(ServerTest):
         bad = replace(good, camera_from_task=behind)
         with self.client.track() as tracking:
             for _ in range(2):
-                with self.assertRaisesRegex(graspd.InvalidArgument, r"views\[0\] is blind") as caught:
+                with self.assertRaisesRegex(graspd.InvalidArgument, r"views\[0\]: camera at") as caught:
                     tracking.add([bad], LOW)
                 self.assertEqual(caught.exception.field, "views[0]")
                 kept = tracking.add([good], LOW)
@@ -352,7 +352,7 @@ class TrackTest(ServerTest):
                 tracking.add(seen, LOW)
                 time.sleep(0.5)
                 for _ in range(2):
-                    with self.assertRaisesRegex(graspd.Aborted, "no request came"):
+                    with self.assertRaisesRegex(graspd.Aborted, "no request for"):
                         tracking.add(seen, LOW)
 
 
@@ -584,7 +584,7 @@ class WireTest(unittest.TestCase):
 
     def test_errors_of_streams_name_the_field_if_it_is_one(self):
         for field in [None, "options.model"]:
-            error = grasp_pb2.Error(code=grpc.StatusCode.NOT_FOUND.value[0], message="there is no such", field=field)
+            error = grasp_pb2.Error(code=grpc.StatusCode.NOT_FOUND.value[0], message="not found", field=field)
             told = wire.outcome(grasp_pb2.DetectGraspsStreamResponse(request_id="mine", error=error))
             wanted = graspd.NotFound(grpc.StatusCode.NOT_FOUND, error.message, field, request_id="mine")
             self.assertEqual((type(told), vars(told)), (type(wanted), vars(wanted)))

@@ -1,8 +1,8 @@
 """The page that graspd shows to people, in a real browser that watches a real server.
 
     GRASPD=target/release/graspd GRASPD_MODELS=models/zoo ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
-    GRASPD_CHROMIUM=$(python3 deploy/native.py chromium) \\
-    $(python3 deploy/native.py python) -m unittest discover --start-directory tests/python --pattern test_page.py
+    GRASPD_CHROMIUM=$(python3 tests/tools.py chromium) \\
+    $(python3 tests/tools.py python) -m unittest discover --start-directory tests/python --pattern test_page.py
 
 GRASPD_SCREENSHOTS names a folder for pictures of it, GRASPD_PAGE a file to try in place of the page in the binary.
 """
@@ -385,7 +385,7 @@ class PageTest(unittest.TestCase):
         conditions = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
         self.browser.call("Network.emulateNetworkConditions", offline=True, **conditions)
         self.ask("meanwhile")
-        self.browser.eventually("document.querySelector('#connection').innerText.includes('trying again')")
+        self.browser.eventually("document.querySelector('#connection').innerText.includes('retrying')")
         self.browser.call("Network.emulateNetworkConditions", offline=False, **conditions)
         self.shows("meanwhile")
         self.browser.eventually("document.querySelector('#connection').innerText.includes('live')")
@@ -399,7 +399,7 @@ class PageTest(unittest.TestCase):
         self.browser.open(f"http://{server.http}/")
         self.shows("the last")
         server.stop()
-        self.browser.eventually("document.querySelector('#connection').innerText.includes('trying again')")
+        self.browser.eventually("document.querySelector('#connection').innerText.includes('retrying')")
         self.shows("the last")
         self.browser.screenshot("gone")
         self.browser.open("about:blank")

@@ -2,7 +2,7 @@
 
     GRASPD=target/release/graspd GRASP_SIM=target/release/grasp-sim GRASPD_MODELS=models/zoo \\
     ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
-    $(python3 deploy/native.py python) -m unittest discover --start-directory tests/python --pattern test_pybullet.py
+    $(python3 tests/tools.py python) -m unittest discover --start-directory tests/python --pattern test_pybullet.py
 """
 
 import atexit
@@ -128,7 +128,7 @@ class CubeTest(unittest.TestCase):
         self.assertEqual(planner.plan(camera.observe(self.world, camera.side())).grasps, [])
 
     def test_mistakes_are_told(self):
-        with self.assertRaisesRegex(FileNotFoundError, "no file nowhere.urdf"):
+        with self.assertRaisesRegex(FileNotFoundError, "nowhere.urdf not found"):
             self.world.add("nowhere.urdf", Pose())
         wrong = self.urdf.with_name("wrong.urdf")
         wrong.write_text("cube")
@@ -258,11 +258,11 @@ class CommandTest(unittest.TestCase):
 
     def test_mistakes_are_told(self):
         for arguments, wanted in [
-            ("--objects bin", "--objects is bin: there is no .urdf file"),
+            ("--objects bin", "--objects is bin: it has no .urdf file"),
             ("--objects objects --views top", "must be side, side:DEGREES"),
             ("--objects objects --planner grpc", "must be random or grpc:HOST:PORT"),
-            ("--objects objects --threshold 2", "must be above 0 and at most 1"),
-            ("--objects objects --hand no.urdf", "there is no file no.urdf"),
+            ("--objects objects --threshold 2", "must be greater than 0 and at most 1"),
+            ("--objects objects --hand no.urdf", "no.urdf not found"),
         ]:
             with self.subTest(arguments), self.assertRaisesRegex(AssertionError, re.escape(wanted)):
                 self.run_sh(f"python3 sim/pybullet/clear.py --rounds 1 {arguments}")

@@ -1,10 +1,10 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use grasp_models::Metadata;
 use grasp_models::onnx::{
     AttributeProto, Dimension, GraphProto, ModelProto, NodeProto, OperatorSetIdProto, TensorProto, ValueInfoProto,
 };
-use grasp_models::{Metadata, ValueConvention};
 
 /// Voxels along an edge of what the test models read.
 pub const RESOLUTION: usize = 16;
@@ -164,7 +164,6 @@ impl TestModel {
             version: self.version.clone(),
             resolution: self.resolution,
             voxel_size: grasp::WORKSPACE_SIZE / self.resolution as f64,
-            value_convention: ValueConvention::Vgn,
             voxel_origin: grasp::VoxelOrigin::Corner,
             camera_azimuth: self.camera_azimuth,
             provenance: BTreeMap::from([("data".to_owned(), "none".to_owned())]),

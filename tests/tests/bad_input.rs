@@ -97,10 +97,10 @@ async fn the_resolution_must_be_one_that_a_model_takes() {
     let mut case = Case::new().await;
     let mut other = request();
     other.volume = Some(encode(&blobs(20, Isometry3::identity(), &[[5, 5, 5]]), DataType::F32, ""));
-    let taken = "the models that could answer take 16 (mirror 1), 24 (second 1)";
+    let taken = "supported: 16 (mirror 1), 24 (second 1)";
     case.refused(other.clone(), Code::InvalidArgument, &format!("volume.resolution is 20, {taken}")).await;
     other.options = Some(pb::Options { model: "mirror".to_owned(), ..Default::default() });
-    let taken = "the models that could answer take 16 (mirror 1)";
+    let taken = "supported: 16 (mirror 1)";
     case.refused(other, Code::InvalidArgument, &format!("volume.resolution is 20, {taken}")).await;
     for resolution in [0, 257, u32::MAX] {
         let message = format!("volume.resolution is {resolution}, must be from 1 to 256");
@@ -148,11 +148,11 @@ async fn the_voxel_size_must_be_the_models() {
         let message = format!("volume.voxel_size is {size}, must be a positive number of metres");
         case.refused_volume(|v| v.voxel_size = size, &message).await;
     }
-    let message = "volume.voxel_size is 18.75, the model mirror 1 takes 0.01875 m, to one in a thousand";
+    let message = "volume.voxel_size is 18.75, must be 0.01875 m (±0.1 %) for the model mirror 1";
     case.refused_volume(|v| v.voxel_size = 18.75, message).await;
     for factor in [0.9985, 1.0015] {
         let size = 0.01875 * factor;
-        let message = format!("volume.voxel_size is {size}, the model mirror 1 takes 0.01875 m, to one in a thousand");
+        let message = format!("volume.voxel_size is {size}, must be 0.01875 m (±0.1 %) for the model mirror 1");
         case.refused_volume(|v| v.voxel_size = size, &message).await;
     }
     let mut request = request();
@@ -199,16 +199,16 @@ async fn the_pose_must_be_finite_with_a_unit_quaternion() {
 #[tokio::test]
 async fn the_model_and_its_version_must_be_loaded() {
     let mut case = Case::new().await;
-    let there = "there is no such; there are mirror 1, second 1, shaf 1";
+    let there = "not found; available: mirror 1, second 1, shaf 1";
     let ask = |model: &str, version: &str| {
         asking(pb::Options { model: model.to_owned(), version: version.to_owned(), ..Default::default() })
     };
-    case.refused(ask("vgn", ""), Code::NotFound, &format!("options.model is `vgn`, {there}")).await;
+    case.refused(ask("vgn", ""), Code::NotFound, &format!("options.model: `vgn` {there}")).await;
     // A name is never a path.
     let path = "../mirror-1.onnx";
-    case.refused(ask(path, ""), Code::NotFound, &format!("options.model is `{path}`, {there}")).await;
-    case.refused(ask("mirror", "2"), Code::NotFound, &format!("options.version is `mirror 2`, {there}")).await;
-    let message = "options.version is `1`, which needs a `model` that it is a version of";
+    case.refused(ask(path, ""), Code::NotFound, &format!("options.model: `{path}` {there}")).await;
+    case.refused(ask("mirror", "2"), Code::NotFound, &format!("options.version: `mirror 2` {there}")).await;
+    let message = "options.version is `1`, which requires options.model";
     case.refused(ask("", "1"), Code::InvalidArgument, message).await;
 }
 
@@ -224,8 +224,8 @@ async fn the_parameters_must_be_in_range() {
         case.refused(bad, Code::InvalidArgument, &format!("options.force {needed}")).await;
     }
     let bad = pb::DetectGraspsRequest { request_id: "x".repeat(257), ..request() };
-    case.refused(bad, Code::InvalidArgument, "request_id is 257 bytes long, at most 256 are taken").await;
-    case.refused_volume(|v| v.frame_id = "x".repeat(300), "volume.frame_id is 300 bytes long, at most 256 are taken")
+    case.refused(bad, Code::InvalidArgument, "request_id is 257 bytes long, must be at most 256").await;
+    case.refused_volume(|v| v.frame_id = "x".repeat(300), "volume.frame_id is 300 bytes long, must be at most 256")
         .await;
 }
 

@@ -129,14 +129,14 @@ fn mistakes_are_explained() {
     let file = files[0].to_str().unwrap();
     assert!(refused(&["detect", "nowhere.npy"]).contains("nowhere.npy: No such file"));
     let error = refused(&["detect", file, "--model", "vgn"]);
-    assert!(error.contains("NotFound: options.model is `vgn`, there is no such; there are mirror 1"), "{error}");
+    assert!(error.contains("NotFound: options.model: `vgn` not found; available: mirror 1"), "{error}");
     let error = refused(&["detect", file, "--server", "127.0.0.1:1"]);
-    assert!(error.contains("cannot reach graspd at 127.0.0.1:1"), "{error}");
+    assert!(error.contains("cannot connect to graspd at 127.0.0.1:1"), "{error}");
     let whole = folder.path().join("i64.npy");
     write(&whole, npyz::Order::C, (0..RESOLUTION.pow(3) as i64).map(|_| 1_i64));
-    assert!(refused(&["detect", whole.to_str().unwrap()]).contains("f64, f32, f16 or u8 is needed"));
+    assert!(refused(&["detect", whole.to_str().unwrap()]).contains("use f64, f32, f16 or u8"));
     let error = refused(&["detect", file, "--voxel-size", "7.5"]);
-    assert!(error.contains("volume.voxel_size is 7.5, the model mirror 1 takes 0.01875 m"), "{error}");
+    assert!(error.contains("volume.voxel_size is 7.5, must be 0.01875 m"), "{error}");
 }
 
 /// Flags that cannot be given together, or not alone.
@@ -149,7 +149,7 @@ fn wrong_combinations_are_refused_before_anything_is_read() {
     };
     assert!(refused("a.npy --camera-position 0,0,0 --intrinsics k.npy").contains("cannot be used with"));
     assert!(refused("a.npy --camera-position 0,0,0 --voxel-size 0.01").contains("cannot be used with"));
-    assert!(refused("a.npy --camera-position 0,0").contains("3 numbers with commas between them are needed"));
+    assert!(refused("a.npy --camera-position 0,0").contains("must be 3 numbers separated by commas"));
     assert!(refused("a.npy --frame-from-cloud pose.npy").contains("--camera-position <X,Y,Z>"));
     assert!(refused("a.npy --palm 0,0,0,1,1,1").contains("--gripper <OPENING,DEPTH,WIDTH,BREADTH>"));
     assert!(refused("a.npy --origin parent").contains("--parent-from-grasp <FILE>"));
@@ -255,7 +255,7 @@ fn what_cannot_be_answered_ends_no_watch_and_a_camera_that_moves_is_noticed() {
         .unwrap();
     let mut complaint = String::new();
     BufReader::new(watch.stderr.as_mut().unwrap()).read_line(&mut complaint).unwrap();
-    assert!(complaint.contains("views[0] is blind") && complaint.contains("waiting"), "{complaint}");
+    assert!(complaint.contains("views[0]: camera at") && complaint.contains("waiting"), "{complaint}");
     // The images stay the same; that the camera stands elsewhere is what changes.
     poses(stand);
     let output = watch.wait_with_output().unwrap();
@@ -385,7 +385,7 @@ fn depth_images_are_read_in_every_form() {
     let output = run(&server, &["detect", &flags[0], "--intrinsics", &flags[3]]);
     assert!(text(&output.stderr).contains("depth images need --camera-from-task or --frame-from-camera"));
     let output = run(&server, &command(&["detect"], &[&flags[..1], &flags[2..]].concat()));
-    assert!(text(&output.stderr).contains("holds 2 poses for 1 images"), "{}", text(&output.stderr));
+    assert!(text(&output.stderr).contains("2 poses in the file for 1 images"), "{}", text(&output.stderr));
 }
 
 /// What the same cameras see as point clouds: in the cameras' own frames, and in that of the task.
@@ -453,16 +453,16 @@ fn point_clouds_are_read_in_every_form() {
     let (cloud, poses) = (own[2].as_str(), own[5].as_str());
     let here = ["--camera-position", "0,0,0"];
     let error = refused(&["detect", cloud]);
-    assert!(error.contains("N×N×N is needed; points need --camera-position"), "{error}");
+    assert!(error.contains("a volume must be N×N×N; for a point cloud add --camera-position"), "{error}");
     let error = refused(&[&["detect", cloud][..], &here, &["--frame-from-cloud", poses]].concat());
-    assert!(error.contains("holds 2 poses for 1 point clouds"), "{error}");
+    assert!(error.contains("2 poses in the file for 1 point clouds"), "{error}");
     let error = refused(&[&["detect", cloud][..], &here, &here].concat());
     assert!(error.contains("is given 2 times for 1 point clouds"), "{error}");
     let error = refused(&[&["detect", cloud][..], &["--camera-position", "0.1,0.1,0.1"]].concat());
     assert!(error.contains("views[0]") && error.contains("check camera_position"), "{error}");
     let (_folder, volumes) = files();
     let error = refused(&[&["detect", volumes[0].to_str().unwrap()][..], &here].concat());
-    assert!(error.contains("N×3 is needed"), "{error}");
+    assert!(error.contains("a point cloud must be N×3"), "{error}");
 }
 
 #[test]

@@ -15,8 +15,8 @@ fn volume() -> Volume {
 }
 
 fn voxels(dropped: &Dropped) -> usize {
-    let Dropped { below_threshold, mask, width, border, suppressed, over_limit, .. } = *dropped;
-    (below_threshold + mask + width + border + suppressed + over_limit) as usize
+    let Dropped { below_threshold, mask, width, suppressed, over_limit, .. } = *dropped;
+    (below_threshold + mask + width + suppressed + over_limit) as usize
 }
 
 fn assert_same(got: &[Proposal], wanted: &[Grasp]) {

@@ -39,7 +39,7 @@ async fn what_does_not_fit_the_queue_is_refused_at_once_and_the_rest_is_answered
             Ok(detection) => assert_eq!(detection.grasps.len(), 1),
             Err(Error::Refused { code, message, retry_after, .. }) => {
                 assert_eq!(*code, Code::ResourceExhausted, "{message}");
-                assert!(message.starts_with("the model `slow` has 2 requests waiting"), "{message}");
+                assert!(message.starts_with("the queue of the model `slow` is full (2 requests)"), "{message}");
                 assert!(!retry_after.expect("a hint").is_zero());
             }
             Err(error) => panic!("{error}"),

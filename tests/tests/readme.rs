@@ -1,4 +1,4 @@
-//! Every command of the README, in its order, as someone new would type it.
+//! Every command of the README and of docs/training.md, in their order, in one folder.
 
 use std::fs;
 use std::net::TcpListener;
@@ -9,25 +9,28 @@ use grasp_tests::{grasp, grasp_sim, graspd};
 
 const ROOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
 
-/// The lines of the README's blocks of one language, in order.
-fn blocks(language: &str) -> Vec<String> {
-    let readme = fs::read_to_string(format!("{ROOT}/README.md")).unwrap();
+/// The pages whose commands run here, in this order.
+const PAGES: [&str; 2] = ["README.md", "docs/training.md"];
+
+/// The blocks of one language in these pages, in order.
+fn blocks(pages: &[&str], language: &str) -> Vec<String> {
     let fence = format!("```{language}\n");
-    readme.split(&fence).skip(1).map(|rest| rest.split("```").next().unwrap().to_owned()).collect()
+    let of_page = |page: &&str| -> Vec<String> {
+        let text = fs::read_to_string(format!("{ROOT}/{page}")).unwrap();
+        text.split(&fence).skip(1).map(|rest| rest.split("```").next().unwrap().to_owned()).collect()
+    };
+    pages.iter().flat_map(of_page).collect()
 }
 
-/// What other recipes run: `make` itself, and training, which its own crate's tests run from this same page. And what needs
-/// a Docker engine.
+/// Commands that other recipes run: `make` itself, and training, which the tests of `grasp-train` run from the same page.
 fn is_run_elsewhere(line: &str) -> bool {
-    ["make ", "cargo ", "docker ", "export PATH", "export LIBTORCH", "grasp-train "]
-        .iter()
-        .any(|prefix| line.starts_with(prefix))
+    ["make ", "cargo ", "export PATH", "export LIBTORCH", "grasp-train "].iter().any(|prefix| line.starts_with(prefix))
 }
 
 #[test]
 fn every_make_target_of_the_readme_exists() {
     let makefile = fs::read_to_string(format!("{ROOT}/Makefile")).unwrap();
-    let lines = blocks("sh").join("\n");
+    let lines = blocks(&["README.md", "CONTRIBUTING.md", "docs/performance.md"], "sh").join("\n");
     let targets: Vec<&str> =
         lines.lines().filter_map(|line| line.strip_prefix("make ")?.split_whitespace().next()).collect();
     assert!(targets.len() >= 3, "{targets:?}");
@@ -46,7 +49,8 @@ fn every_command_of_the_readme_works() {
     let [grpc, http] = [50051, 9090].map(|_| TcpListener::bind("127.0.0.1:0").unwrap());
     let [grpc, http] = [grpc, http].map(|listener| listener.local_addr().unwrap().port().to_string());
     let mut script = String::from("set -eu\n");
-    for line in blocks("sh").iter().flat_map(|block| block.lines()).filter(|line| !is_run_elsewhere(line)) {
+    let lines = blocks(&PAGES, "sh");
+    for line in lines.iter().flat_map(|block| block.lines()).filter(|line| !is_run_elsewhere(line)) {
         if line.starts_with("graspd ") {
             // Whoever types this waits for `ready` before the next line.
             script += &format!("{} > server.log\n", line.trim_end_matches('&'));
@@ -60,7 +64,7 @@ fn every_command_of_the_readme_works() {
             script += &format!("echo '$ {}'\n{line}\n", line.replace('\'', ""));
         }
     }
-    script += &format!("cat > client.py <<'END'\n{}END\n", blocks("python").concat());
+    script += &format!("cat > client.py <<'END'\n{}END\n", blocks(&PAGES, "python").concat());
     script += "PYTHONPATH=site $GRASPD_PYTHON client.py\n";
     script += "trap - EXIT; kill $server; wait $server\n";
     let script = script.replace("50051", &grpc).replace("9090", &http);

@@ -129,7 +129,7 @@ async fn only_bearers_of_a_token_are_answered_and_tokens_change_at_sighup() {
                 tokio::task::yield_now().await;
             }
         };
-        timeout(Duration::from_secs(60), taken).await.expect("the file is read anew");
+        timeout(Duration::from_secs(60), taken).await.expect("the file is reloaded");
     }
     fs::remove_file(&file).unwrap();
     server.reload().unwrap();
@@ -156,9 +156,9 @@ fn half_a_configuration_is_refused() {
             vec!["--tls-cert", "/no/such.pem", "--tls-key", &key],
             "--tls-cert (GRASPD_TLS_CERT) /no/such.pem: No such file",
         ),
-        (vec!["--token-file", "/dev/null"], "--token-file (GRASPD_TOKEN_FILE) /dev/null holds no token"),
+        (vec!["--token-file", "/dev/null"], "--token-file (GRASPD_TOKEN_FILE) /dev/null contains no token"),
         (vec!["--stall-timeout", "soon"], "--stall-timeout (GRASPD_STALL_TIMEOUT) is `soon`"),
-        (vec!["--stall-timeout", "0"], "--stall-timeout (GRASPD_STALL_TIMEOUT) is 0, nobody could say a word"),
+        (vec!["--stall-timeout", "0"], "--stall-timeout (GRASPD_STALL_TIMEOUT) is 0, must be greater than 0"),
         (vec!["--drain-timeout", "1e19"], "--drain-timeout (GRASPD_DRAIN_TIMEOUT) is `1e19`"),
     ] {
         let output = Command::new(graspd()).args(&flags).output().unwrap();
@@ -176,5 +176,5 @@ fn half_a_configuration_is_refused() {
         .unwrap();
     assert_eq!(output.status.code(), Some(1));
     let text = String::from_utf8(output.stderr).unwrap();
-    assert!(text.contains("the certificate, its key or the clients' CA cannot be used"), "{text}");
+    assert!(text.contains("cannot use the files of --tls-cert, --tls-key and --tls-client-ca"), "{text}");
 }

@@ -61,13 +61,13 @@ async fn a_bad_view_costs_neither_the_stream_nor_the_volume() {
     let mut tracking = client.track(Workspace::default()).await.unwrap();
     let first = tracking.add(std::slice::from_ref(&good), low()).await.unwrap();
     let (status, message) = code(tracking.add(&[bad], low()).await);
-    assert!(status == Code::InvalidArgument && message.starts_with("views[0] is blind"), "{message}");
+    assert!(status == Code::InvalidArgument && message.starts_with("views[0]: camera at"), "{message}");
     let again = tracking.add(&[], low()).await.unwrap();
     assert_eq!(again.grasps, first.grasps);
     let other = DetectOptions { model: "other".to_owned(), ..low().detect };
     let (status, message) = code(tracking.add(&[], Options { detect: other, ..Options::default() }).await);
     assert_eq!(status, Code::InvalidArgument);
-    assert!(message.starts_with("options.model is `other`, which reads another volume"), "{message}");
+    assert!(message.starts_with("options.model is `other`, which requires a different grid"), "{message}");
     assert_eq!(tracking.add(&[], low()).await.unwrap().grasps, first.grasps);
 
     // By hand: the library always sends a workspace first.
@@ -166,7 +166,7 @@ async fn as_many_volumes_are_kept_as_were_allowed_and_none_for_ever() {
 
     server.wait_for(TRACKED, 0.0).await;
     let (status, message) = code(tracking.add(&views, low()).await);
-    assert!(status == Code::Aborted && message.contains("no request came for 300ms"), "{message}");
+    assert!(status == Code::Aborted && message.contains("no request for 300ms"), "{message}");
     let mut tracking = client.track(Workspace::default()).await.unwrap();
     assert!(tracking.add(&views, low()).await.is_ok(), "its place is free again");
 }

@@ -8,32 +8,32 @@ use rand::seq::index;
 use super::Cloud;
 use crate::{Hand, SurfacePoint};
 
-/// How candidates are looked for; the defaults are those of GPD's code.
+/// Parameters of the candidate search. The defaults are those of GPD's code.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Params {
-    /// The hand that must fit.
+    /// The hand that is fitted.
     pub hand: Hand,
-    /// Extents along the closing axis that are worth grasping, metres.
+    /// Range of object extents along the closing axis, metres.
     pub aperture: RangeInclusive<f64>,
-    /// Points of the cloud at which hands are fitted.
+    /// Number of sample points at which the hand is fitted.
     pub samples: usize,
-    /// Radius around a sample within which normals make its local frame, metres.
+    /// Radius of the neighbourhood whose normals define the local frame of a sample, metres.
     pub frame_radius: f64,
-    /// Rotations about the curvature axis, evenly over half a turn.
+    /// Number of rotations about the axis of least curvature, evenly over half a turn.
     pub rotations: usize,
-    /// Placements across the closing axis, evenly over the opening.
+    /// Number of offsets along the closing axis, evenly over the opening.
     pub placements: usize,
-    /// How far the fingertips reach past the sample at first, metres (GPD: `init_bite`).
+    /// Distance by which the fingertips initially pass the sample, metres (GPD: `init_bite`).
     pub bite: f64,
-    /// Step by which the hand is pushed further, metres.
+    /// Step by which the hand is moved forward, metres.
     pub deepening: f64,
-    /// No corner of the hand may be lower than this, metres above z = 0 of the cloud's frame: the table, which is not
-    /// in the cloud.
+    /// Smallest height of any corner of the hand, metres above z = 0 of the cloud's frame. The table is not in the
+    /// cloud.
     pub lowest: f64,
 }
 
 impl Params {
-    /// GPD's, for a hand that may not go below `lowest`.
+    /// GPD's parameters for a hand that stays above `lowest` (metres).
     #[must_use]
     pub fn above(lowest: f64) -> Self {
         Self {
@@ -50,37 +50,37 @@ impl Params {
     }
 }
 
-/// A place where the hand fits around a part of the cloud.
+/// A pose at which the hand fits around a part of the cloud.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Candidate {
-    /// `T_task_grasp`: z the approach, ±y the closing axis, origin at the finger base.
+    /// `T_task_grasp`: z is the approach, ±y the closing axis, the origin is at the finger base.
     pub pose: Isometry3<f64>,
-    /// Extent along the closing axis of what was seen between the fingers, metres.
+    /// Extent along the closing axis of the points between the fingers, metres.
     pub width: f64,
-    /// The sample it was fitted at.
+    /// The sample point, task frame, metres.
     pub point: Point3<f64>,
 }
 
-/// Fits the hand at random points of the cloud: at each, at every rotation, in the middle one of the placements that
-/// are free, pushed as far as it goes. The same cloud and state of `rng` give the same candidates.
+/// Fits the hand at random sample points of the cloud. For each sample and rotation the result is the middle one of the
+/// free offsets, moved forward as far as possible. The same cloud and state of `rng` give the same candidates.
 #[must_use]
 pub fn candidates(cloud: &Cloud, params: &Params, rng: &mut impl Rng) -> Vec<Candidate> {
     by_sample(cloud, params, rng).flatten().collect()
 }
 
-/// The same, fitted as they are asked for: those of one sample after the other. It takes long where much was seen and the
-/// hand is large, and who waits for it may go.
+/// Like [`candidates`], lazily, one item per sample, so that the caller can stop early. The search is slow for large
+/// clouds and hands.
 pub fn by_sample(cloud: &Cloud, params: &Params, rng: &mut impl Rng) -> impl Iterator<Item = Vec<Candidate>> {
     let points = cloud.points();
     let samples = index::sample(rng, points.len(), params.samples.min(points.len()));
     samples.into_iter().map(|sample| fit_at(cloud, params, &points[sample]))
 }
 
-/// The candidates at one sample.
+/// The candidates of one sample.
 fn fit_at(cloud: &Cloud, params: &Params, sample: &SurfacePoint) -> Vec<Candidate> {
     let Params { hand, rotations, .. } = params;
     let (normal, axis) = local_frame(cloud, params, sample);
-    // Whatever the fingers can meet, however the hand is turned and placed.
+    // All points that the fingers can reach with any rotation and offset.
     let near: Vec<Point3<f64>> =
         cloud.within(sample.position, hand.outer_diameter + hand.depth).map(|point| point.position).collect();
     let rotation = |turn: usize| {
@@ -92,19 +92,19 @@ fn fit_at(cloud: &Cloud, params: &Params, sample: &SurfacePoint) -> Vec<Candidat
     (0..*rotations).filter_map(|turn| fit(cloud, params, &near, &sample.position, rotation(turn))).collect()
 }
 
-/// The normal and the axis of least curvature around a sample: normals vary least along the latter.
+/// The normal and the axis of least curvature at a sample. Along this axis normals vary least.
 fn local_frame(cloud: &Cloud, params: &Params, sample: &SurfacePoint) -> (Vector3<f64>, Vector3<f64>) {
     let normals = cloud.within(sample.position, params.frame_radius).map(|point| point.normal);
     let eigen = normals.map(|normal| normal * normal.transpose()).sum::<Matrix3<f64>>().symmetric_eigen();
     let column = |index: usize| -> Vector3<f64> { eigen.eigenvectors.column(index).into() };
     let normal = column(eigen.eigenvalues.imax());
     let normal = if normal.dot(&sample.normal) < 0.0 { -normal } else { normal };
-    // On a plane every direction across is as good, so it must be one across.
+    // On a plane the smallest eigenvalue is degenerate, so the axis is made orthogonal to the normal.
     let axis = column(eigen.eigenvalues.imin());
     (normal, (axis - normal * axis.dot(&normal)).normalize())
 }
 
-/// The hand at one rotation, if it fits at all.
+/// The candidate of one rotation, if the hand fits.
 fn fit(
     cloud: &Cloud,
     params: &Params,
@@ -117,7 +117,7 @@ fn fit(
         let origin = sample + rotation * Vector3::new(0.0, offset, bite - hand.depth);
         Isometry3::from_parts(Translation3::from(origin), rotation)
     };
-    // Only what is as high as the fingers are broad can come between them or in their way.
+    // Only points within the breadth of the fingers can be between them or collide with them.
     let to_sample = rotation.inverse();
     let slice: Vec<Point3<f64>> = near
         .iter()
@@ -150,7 +150,7 @@ fn fit(
     params.aperture.contains(&width).then(|| Candidate { pose: pose(offset, bite), width, point: *sample })
 }
 
-/// The palm is broader than the fingers: other things can be in its way than in theirs.
+/// The palm is wider than the fingers, so it is checked against the whole cloud.
 fn palm_is_free(cloud: &Cloud, hand: &Hand, pose: &Isometry3<f64>) -> bool {
     cloud.points().iter().all(|point| !hand.palm_meets(&pose.inverse_transform_point(&point.position)))
 }
@@ -164,7 +164,7 @@ mod tests {
 
     const TABLE: f64 = 0.05;
 
-    /// A box of 40 × 120 × 80 mm that stands on the table, all but its bottom seen, a point a millimetre.
+    /// A box of 40 × 120 × 80 mm on the table, one point per millimetre on all faces but the bottom.
     fn standing_box() -> Vec<SurfacePoint> {
         let (lower, upper) = (Point3::new(0.13, 0.09, TABLE), Point3::new(0.17, 0.21, TABLE + 0.08));
         let mut points = Vec::new();
@@ -195,28 +195,28 @@ mod tests {
     }
 
     #[test]
-    fn a_box_is_closed_on_across_its_narrow_side() {
+    fn a_box_is_grasped_across_its_narrow_side() {
         let (_, found) = of(standing_box(), 1);
         assert!(found.len() > 50, "{} candidates", found.len());
         let across = |c: &&Candidate| (c.pose.rotation * Vector3::y()).x.abs() > 0.9;
         let count = found.iter().filter(across).count();
         assert!(count > found.len() / 3, "{count} of {} close along x, the side of 40 mm", found.len());
-        assert!(found.iter().filter(across).any(|c| (c.width - 0.04).abs() < 0.004), "the width is the box's");
+        assert!(found.iter().filter(across).any(|c| (c.width - 0.04).abs() < 0.004), "the width is that of the box");
         let along = found.iter().filter(|c| (c.pose.rotation * Vector3::y()).y.abs() > 0.98);
-        // 120 mm do not fit into the hand; only a corner could come between its fingers.
+        // The long side of 120 mm does not fit into the hand, only a corner does.
         assert!(along.clone().all(|c| c.width < 0.07));
-        assert!(found.iter().any(|c| (c.pose.rotation * Vector3::z()).z < -0.95), "one comes from above");
+        assert!(found.iter().any(|c| (c.pose.rotation * Vector3::z()).z < -0.95), "one approaches from above");
     }
 
     #[test]
-    fn no_candidate_goes_through_the_table_or_the_object() {
+    fn no_candidate_collides_with_the_table_or_the_object() {
         let (cloud, found) = of(standing_box(), 2);
         let Params { hand, aperture, .. } = Params::above(TABLE);
         for candidate in &found {
             assert!(hand.lowest_point(&candidate.pose) >= TABLE);
             let mut points = cloud.points().iter().map(|p| candidate.pose.inverse_transform_point(&p.position));
             assert!(points.clone().all(|point| !hand.finger_meets(&point) && !hand.palm_meets(&point)));
-            assert!(points.any(|point| hand.holds(&point)), "something is between the fingers");
+            assert!(points.any(|point| hand.holds(&point)), "a point is between the fingers");
             assert!(aperture.contains(&candidate.width));
         }
         let params = Params::above(TABLE + 0.06);
@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn the_fingertips_pass_the_sample_by_the_bite_at_least() {
+    fn the_fingertips_pass_the_sample_by_at_least_the_bite() {
         let (_, found) = of(standing_box(), 3);
         let params = Params::above(TABLE);
         for candidate in &found {
@@ -244,13 +244,13 @@ mod tests {
     }
 
     #[test]
-    fn a_wide_plane_and_an_empty_cloud_give_none() {
+    fn a_wide_plane_and_an_empty_cloud_give_no_candidates() {
         let at = |i: i32, j: i32| Point3::new(f64::from(i) * 2e-3, f64::from(j) * 2e-3, 0.1);
         let plane = (0..150).flat_map(|i| (0..150).map(move |j| at(i, j)));
         let plane = plane.map(|position| SurfacePoint { position, normal: Vector3::z() }).collect();
         let (_, found) = of(plane, 6);
         let inner = |c: &&Candidate| (0.08..0.22).contains(&c.point.x) && (0.08..0.22).contains(&c.point.y);
-        assert_eq!(found.iter().filter(inner).count(), 0, "nothing to close on away from its borders");
+        assert_eq!(found.iter().filter(inner).count(), 0, "no candidates away from the borders of the plane");
         assert!(of(vec![], 6).1.is_empty());
     }
 }

@@ -4,33 +4,34 @@ use nalgebra::{Matrix3, Point3, Vector3};
 
 use crate::SurfacePoint;
 
-/// Edge of the voxels that a cloud is thinned to, metres (GPD's code: `voxel_size`).
+/// Edge of the voxels to which a cloud is downsampled, metres (GPD's code: `voxel_size`).
 pub const VOXEL_SIZE: f64 = 0.003;
 
-/// Radius of the neighbourhood that a normal is taken from, metres (GPD's code: `normals_radius`).
+/// Radius of the neighbourhood from which a normal is estimated, metres (GPD's code: `normals_radius`).
 pub const NORMALS_RADIUS: f64 = 0.03;
 
-/// The most points that are kept. What lies on a table has a few thousand; noise, or a checkerboard, would have a
-/// hundred times as many, each with a neighbourhood of thousands.
+/// Largest number of points. Objects on a table have a few thousand. Noise can have a hundred times as many, each with
+/// thousands of neighbours.
 const MAX_POINTS: usize = 20_000;
 
-/// A point cloud with one point a voxel of [`VOXEL_SIZE`], or as much larger ones as it takes to have no more than
-/// 20,000, and normals that look at the camera. Task frame, metres.
+/// A downsampled point cloud with normals towards the camera. Task frame, metres. It has one point per voxel of
+/// [`VOXEL_SIZE`], or of a larger size that limits the cloud to 20,000 points.
 #[derive(Clone, Debug)]
 pub struct Cloud {
     points: Vec<SurfacePoint>,
-    /// Indices into `points`, by the cell of [`CELL`] they lie in.
+    /// Indices into `points` by cell of size [`CELL`].
     cells: HashMap<[i64; 3], Vec<usize>>,
 }
 
-/// Edge of the cells that neighbours are looked up in: a normal's neighbourhood touches 27 of them.
+/// Edge of the cells of the neighbour search, metres: a normal's neighbourhood touches 27 of them.
 const CELL: f64 = NORMALS_RADIUS;
 
 impl Cloud {
-    /// Thins `points` to the means of their voxels, and takes each normal from the plane through the neighbourhood.
+    /// Downsamples `points` to the means of their voxels and estimates each normal from the plane through its
+    /// neighbourhood.
     ///
-    /// The normals of `points` need only point to the side that was seen, such as [towards the
-    /// camera](crate::DepthImage::points). The order of the points does not matter, but for rounding.
+    /// The normals of `points` only decide the sign of the estimated normals; directions [towards the
+    /// camera](crate::DepthImage::points) are enough. The order of the points only affects rounding.
     pub fn new(points: impl IntoIterator<Item = SurfacePoint>) -> Self {
         let one = |SurfacePoint { position, normal }| Sum { positions: position.coords, normals: normal, count: 1.0 };
         let mut edge = VOXEL_SIZE;
@@ -58,7 +59,7 @@ impl Cloud {
         cloud
     }
 
-    /// The points, by voxel.
+    /// The points, ordered by voxel.
     #[must_use]
     pub fn points(&self) -> &[SurfacePoint] {
         &self.points
@@ -69,7 +70,7 @@ impl Cloud {
         let lower = cell_of(&(centre - Vector3::repeat(radius)), CELL);
         let upper = cell_of(&(centre + Vector3::repeat(radius)), CELL);
         let wanted: f64 = lower.iter().zip(upper).map(|(&lower, upper)| (upper - lower + 1) as f64).product();
-        // A large hand reaches over more cells than there are points.
+        // For a large radius, scanning all points is cheaper than visiting all cells.
         let all = wanted > self.points.len() as f64;
         let cells = (lower[0]..=upper[0])
             .flat_map(move |x| (lower[1]..=upper[1]).flat_map(move |y| (lower[2]..=upper[2]).map(move |z| [x, y, z])));
@@ -83,7 +84,7 @@ impl Cloud {
             .filter(move |point| (point.position - centre).norm_squared() <= radius * radius)
     }
 
-    /// The direction in which the neighbourhood varies least, on the side that was seen.
+    /// The direction of least variance of the neighbourhood, on the observed side.
     fn normal_at(&self, point: &SurfacePoint) -> Vector3<f64> {
         let (mut sum, mut squares, mut count) = (Vector3::zeros(), Matrix3::zeros(), 0.0);
         for neighbour in self.within(point.position, NORMALS_RADIUS) {
@@ -101,7 +102,7 @@ impl Cloud {
     }
 }
 
-/// What lies in a voxel.
+/// Sums over the points of a voxel.
 #[derive(Default)]
 struct Sum {
     positions: Vector3<f64>,
@@ -115,7 +116,7 @@ impl Sum {
     }
 }
 
-/// By voxel, in their order, so that the same points give the same cloud.
+/// Sums by voxel, in a fixed order so that the same points give the same cloud.
 fn thinned(points: impl Iterator<Item = Sum>, edge: f64) -> BTreeMap<[i64; 3], Sum> {
     let mut voxels: BTreeMap<[i64; 3], Sum> = BTreeMap::new();
     for point in points {
@@ -135,7 +136,7 @@ fn cell_of(point: &Point3<f64>, edge: f64) -> [i64; 3] {
 mod tests {
     use super::*;
 
-    /// A plane through the origin, sampled every millimetre, seen from above.
+    /// A plane through the origin, one point per millimetre, seen from above.
     fn plane(slope: f64) -> Vec<SurfacePoint> {
         let at = |i: i32, j: i32| Point3::new(f64::from(i) * 1e-3, f64::from(j) * 1e-3, slope * f64::from(i) * 1e-3);
         let points = (-60..60).flat_map(|i| (-60..60).map(move |j| at(i, j)));
@@ -143,12 +144,12 @@ mod tests {
     }
 
     #[test]
-    fn a_plane_has_its_normal_on_the_side_that_was_seen() {
+    fn normals_of_a_plane_point_to_the_observed_side() {
         for slope in [0.0, 0.5] {
             let cloud = Cloud::new(plane(slope));
             let expected = Vector3::new(-slope, 0.0, 1.0).normalize();
             let inner = cloud.points().iter().filter(|point| point.position.coords.norm() < 0.02);
-            // The mean of a voxel lies on the plane, but its neighbourhood is not quite even.
+            // The neighbourhood of a voxel mean is not quite symmetric.
             assert!(inner.clone().count() > 100 && inner.clone().all(|point| point.normal.dot(&expected) > 0.999));
         }
         let below = plane(0.0).into_iter().map(|point| SurfacePoint { normal: -point.normal, ..point });
@@ -164,7 +165,7 @@ mod tests {
     #[test]
     fn neighbours_are_those_within_the_radius() {
         let cloud = Cloud::new(plane(0.2));
-        // The last reaches over more cells than there are points.
+        // The last one covers more cells than there are points.
         for (centre, radius) in
             [(Point3::origin(), 0.01), (Point3::new(0.02, -0.03, 0.0), 0.07), (Point3::new(0.5, 0.0, 0.0), 0.46)]
         {
@@ -176,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_is_thinned_to_what_can_be_looked_at() {
+    fn noise_is_downsampled_to_the_point_limit() {
         let at = |i: usize| Point3::from([i / 10_000, i / 100 % 100, i % 100].map(|c| c as f64 * VOXEL_SIZE));
         let cloud = Cloud::new((0..1_000_000).map(|i| SurfacePoint { position: at(i), normal: Vector3::z() }));
         let count = cloud.points().len();
@@ -184,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn one_point_alone_keeps_its_direction() {
+    fn a_single_point_keeps_its_normal() {
         let point = SurfacePoint { position: Point3::new(0.1, 0.1, 0.1), normal: Vector3::y() };
         assert_eq!(Cloud::new([point]).points(), [point]);
         assert!(Cloud::new([]).points().is_empty());

@@ -5,22 +5,22 @@ use super::{Candidate, Cloud, VOXEL_SIZE};
 /// Pixels along an edge of an image.
 pub const IMAGE_SIZE: usize = 60;
 
-/// Channels: for each of three projections, three of normals and one of depth.
+/// Channels of an image: three for normals and one for depth in each of three projections.
 ///
-/// GPD knows images of 3, 12 and 15 channels. The last three of 15 are the shadow of what was seen, which needs rays
-/// through voxels for every candidate; 12 show the shape from every side without them.
+/// GPD defines images of 3, 12 and 15 channels. The 15-channel image adds shadows, which need ray casting for every
+/// candidate; 12 channels show the shape from all sides without them.
 pub const CHANNELS: usize = 12;
 
-/// What is shown: the space between the fingers, a centimetre past their tips, and a finger's breadth on each side.
-/// Smallest and largest coordinates in the grasp frame, metres (GPD: `image_height`, `image_outer_diameter`,
-/// `image_depth`).
+/// Region of the image: between the fingers, 1 cm beyond the fingertips, and one finger breadth on each side. Smallest
+/// and largest coordinates in the grasp frame, metres (GPD: `image_height`, `image_outer_diameter`, `image_depth`).
 const REGION: [[f64; 3]; 2] = [[-0.02, -0.05, 0.0], [0.02, 0.05, 0.06]];
 
-/// What a candidate's hand would close on, as the classifier sees it.
+/// The surface between the fingers of a candidate, as input of the classifier.
 ///
-/// The points in the hand's region are projected along x, y and z of the grasp frame. The four channels of a projection
-/// are the absolute components of the normals along x, y, z and the nearness, 1 for the smallest coordinate along the
-/// projection and 0 for the largest: means over the points of a pixel, 0 where there are none. A point covers its voxel.
+/// The points of the region are projected along x, y and z of the grasp frame. Each projection has four channels: the
+/// absolute components of the normals along x, y and z, and the nearness, which is 1 at the smallest coordinate along
+/// the projection and 0 at the largest. A pixel holds the mean over its points, 0 without points. A point covers the
+/// area of its voxel.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Image {
     pixels: Vec<u8>,
@@ -38,14 +38,14 @@ impl Image {
         Self { pixels }
     }
 
-    /// `[CHANNELS, IMAGE_SIZE, IMAGE_SIZE]`, 255 for 1.
+    /// Pixels, `[CHANNELS, IMAGE_SIZE, IMAGE_SIZE]`; 255 stands for 1.
     #[must_use]
     pub fn pixels(&self) -> &[u8] {
         &self.pixels
     }
 }
 
-/// A point of the region, scaled to the unit cube, with the absolute components of its normal.
+/// A point of the region in unit cube coordinates, with the absolute components of its normal.
 struct Point {
     position: [f64; 3],
     normal: [f32; 3],
@@ -65,7 +65,8 @@ fn in_region(cloud: &Cloud, pose: &Isometry3<f64>) -> Vec<Point> {
     .collect()
 }
 
-/// Appends the four channels of the projection along `axis`; rows and columns are the other two axes in their order.
+/// Appends the four channels of the projection along `axis`. Rows and columns are the other two axes in ascending
+/// order.
 fn project(points: &[Point], axis: usize, pixels: &mut Vec<u8>) {
     let plane = [[1, 2], [0, 2], [0, 1]][axis];
     let mut sums = vec![[0.0_f32; 5]; IMAGE_SIZE * IMAGE_SIZE];
@@ -85,7 +86,7 @@ fn project(points: &[Point], axis: usize, pixels: &mut Vec<u8>) {
     }
 }
 
-/// The pixels of an axis of `length` metres that a voxel around `position`, in [0, 1), covers.
+/// The pixels that a voxel centred at `position`, in [0, 1), covers along an axis of `length` metres.
 fn covered(position: f64, length: f64) -> std::ops::Range<usize> {
     let half = VOXEL_SIZE / length / 2.0;
     let pixel = |position: f64| (position.clamp(0.0, 1.0) * IMAGE_SIZE as f64) as usize;
@@ -105,7 +106,7 @@ mod tests {
         Candidate { pose: Isometry3::identity(), width: 0.04, point: Point3::origin() }
     }
 
-    /// The two faces of a slab that the fingers would press, 4 cm apart, and its end.
+    /// The two faces of a slab between the fingers, 4 cm apart.
     fn slab() -> Cloud {
         let mut points = Vec::new();
         for (i, j) in (-30..=30).flat_map(|i| (0..=30).map(move |j| (i, j))) {
@@ -118,37 +119,37 @@ mod tests {
     }
 
     #[test]
-    fn an_image_has_its_shape_and_shows_what_is_there() {
+    fn an_image_shows_the_surfaces_between_the_fingers() {
         let image = Image::of(&slab(), &candidate());
         assert_eq!(image.pixels().len(), CHANNELS * AREA);
         let channel = |index: usize| &image.pixels()[index * AREA..][..AREA];
-        // Seen along x: rows are y, columns are z; the faces are two lines at y = ±0.02.
+        // Projection along x: rows are y, columns are z; the faces are two lines at y = ±0.02.
         let normals_along_y = channel(1);
         let row = |y: f64| ((y + 0.05) / 0.1 * IMAGE_SIZE as f64) as usize;
         let column = |z: f64| (z / 0.06 * IMAGE_SIZE as f64) as usize;
         for y in [-0.0199, 0.0199] {
             assert!(normals_along_y[row(y) * IMAGE_SIZE + column(0.045)] > 250, "the normal is along y");
         }
-        assert_eq!(normals_along_y[row(0.0) * IMAGE_SIZE + column(0.045)], 0, "nothing is inside");
-        assert_eq!(normals_along_y[row(0.02) * IMAGE_SIZE + column(0.01)], 0, "nothing is near the palm");
+        assert_eq!(normals_along_y[row(0.0) * IMAGE_SIZE + column(0.045)], 0, "the slab is empty inside");
+        assert_eq!(normals_along_y[row(0.02) * IMAGE_SIZE + column(0.01)], 0, "no surface near the palm");
         assert!(channel(0).iter().all(|&value| value < 30), "no normal is along x");
     }
 
     #[test]
-    fn a_symmetric_object_looks_the_same_to_the_hand_turned_by_half() {
+    fn a_symmetric_object_gives_a_similar_image_after_half_a_turn() {
         let turned = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI);
         let cloud = slab();
         let [here, there] = [Isometry3::identity(), Isometry3::from_parts(Default::default(), turned)]
             .map(|pose| Image::of(&cloud, &Candidate { pose, ..candidate() }));
         let lit = |image: &Image| image.pixels().iter().map(|&value| f64::from(value)).sum::<f64>();
         let difference: f64 = here.pixels().iter().zip(there.pixels()).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
-        // The voxels of the cloud are not symmetric themselves.
+        // The voxel grid of the cloud is not symmetric.
         assert!(difference < 0.3 * lit(&here), "{difference} of {}", lit(&here));
         assert!((lit(&here) / lit(&there) - 1.0).abs() < 0.05);
     }
 
     #[test]
-    fn what_is_outside_the_region_is_not_shown() {
+    fn points_outside_the_region_are_not_shown() {
         let far = |position| SurfacePoint { position, normal: Vector3::z() };
         let points = [Point3::new(0.0, 0.06, 0.03), Point3::new(0.03, 0.0, 0.03), Point3::new(0.0, 0.0, -0.01)];
         let image = Image::of(&Cloud::new(points.map(far)), &candidate());

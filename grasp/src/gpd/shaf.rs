@@ -2,15 +2,14 @@ use nalgebra::Vector3;
 
 use super::Candidate;
 
-/// Heights closer than this are the same, metres: a candidate on a flat top is not preferred for the noise of a point.
+/// Size of a height band, metres. Within a band, noise in height does not change the order.
 const BAND: f64 = 0.01;
 
-/// Orders candidates as SHAF does, the simple high-point heuristic that GIGA's paper compares with: the grasp of the
-/// highest object point first.
+/// Orders candidates as SHAF, the highest-point heuristic that GIGA's paper compares with: grasps at the highest object
+/// points first.
 ///
-/// In its pure geometric form here the object point is the sample at which the hand was fitted. Points less than a
-/// centimetre apart in height, counted from the highest, are equally high; of their candidates the one whose approach
-/// is nearest to straight down comes first.
+/// The object point of a candidate is its sample point. Heights are counted from the highest point down in bands of 1
+/// cm. Within a band, the candidate whose approach is closest to straight down comes first.
 pub fn highest_first(candidates: &mut [Candidate]) {
     let top = candidates.iter().map(|candidate| candidate.point.z).fold(f64::MIN, f64::max);
     let band = |candidate: &Candidate| ((top - candidate.point.z) / BAND).floor();
@@ -31,7 +30,7 @@ mod tests {
     }
 
     #[test]
-    fn the_highest_comes_first_and_of_equals_the_one_from_above() {
+    fn the_highest_comes_first_and_at_equal_height_the_steepest() {
         let (low, high_tilted, high) = (candidate(0.10, 0.0), candidate(0.155, 1.0), candidate(0.15, 0.2));
         let mut all = [low, high_tilted, high];
         highest_first(&mut all);

@@ -1,8 +1,8 @@
-//! Candidates of GPD that were tried, for its classifier: an `.npz` file of
+//! Tried candidates of GPD, the training data of its classifier: an `.npz` file with
 //!
 //! - `images`, u8 `[n, CHANNELS, IMAGE_SIZE, IMAGE_SIZE]`, 255 for 1;
 //! - `labels`, u8 `[n]`, 1 for a success;
-//! - `scenes`, u64 `[n]`, the number of each one's scene.
+//! - `scenes`, u64 `[n]`, the scene number of each candidate.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -20,51 +20,51 @@ const PIXELS: usize = CHANNELS * IMAGE_SIZE * IMAGE_SIZE;
 
 const EXPECTED: &str = "`images` u8 [n, 12, 60, 60], `labels` u8 [n] of 0 and 1, and `scenes` u64 [n], as `grasp-sim candidates` writes them";
 
-/// Candidates, all in memory.
+/// Candidates in memory.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Candidates {
-    /// What the hand would close on: an image of [`CHANNELS`] after the other.
+    /// The images of the candidates, [`CHANNELS`] × [`IMAGE_SIZE`] × [`IMAGE_SIZE`] bytes each.
     pub images: Vec<u8>,
-    /// Whether each succeeded.
+    /// Whether each candidate succeeded.
     pub labels: Vec<bool>,
-    /// The number of each one's scene.
+    /// Scene number of each candidate.
     pub scenes: Vec<u64>,
 }
 
 impl Candidates {
-    /// Adds one of scene number `scene`.
+    /// Adds a candidate of scene `scene`.
     pub fn push(&mut self, scene: u64, image: &Image, success: bool) {
         self.images.extend_from_slice(image.pixels());
         self.labels.push(success);
         self.scenes.push(scene);
     }
 
-    /// Adds all of `others`.
+    /// Adds all candidates of `others`.
     pub fn append(&mut self, mut others: Self) {
         self.images.append(&mut others.images);
         self.labels.append(&mut others.labels);
         self.scenes.append(&mut others.scenes);
     }
 
-    /// How many there are.
+    /// Number of candidates.
     #[must_use]
     pub fn len(&self) -> usize {
         self.labels.len()
     }
 
-    /// Whether there are none.
+    /// Whether there are no candidates.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.labels.is_empty()
     }
 
-    /// How many of them succeeded.
+    /// Number of successes.
     #[must_use]
     pub fn successes(&self) -> usize {
         self.labels.iter().filter(|&&label| label).count()
     }
 
-    /// Writes them; the file appears when it is whole, and the same candidates are the same bytes.
+    /// Writes a file. It appears only when it is complete; the same candidates give the same bytes.
     ///
     /// # Errors
     /// [`DataError`] names the file.
@@ -85,7 +85,7 @@ impl Candidates {
     /// Reads a file.
     ///
     /// # Errors
-    /// [`DataError`] names the file, and what of it cannot be used.
+    /// [`DataError`] names the file and its invalid array.
     pub fn read(path: &Path) -> Result<Self, DataError> {
         let wrong = |reason| DataError::Scene { path: path.to_owned(), reason, expected: EXPECTED };
         let mut archive = NpzArchive::open(path).at(path)?;
@@ -94,10 +94,10 @@ impl Candidates {
         let (_, scenes) = read_array::<u64>(&mut archive, "scenes").at(path)?;
         let count = labels.len();
         if shape[1..] != [CHANNELS as u64, IMAGE_SIZE as u64, IMAGE_SIZE as u64] || images.len() != count * PIXELS {
-            return Err(wrong(format!("`images` is {shape:?} and there are {count} labels")));
+            return Err(wrong(format!("the shape of `images` is {shape:?} for {count} labels")));
         }
         if scenes.len() != count || count == 0 {
-            return Err(wrong(format!("there are {count} labels and {} scenes", scenes.len())));
+            return Err(wrong(format!("there are {count} labels and {} scene numbers", scenes.len())));
         }
         if let Some(label) = labels.iter().find(|&&label| label > 1) {
             return Err(wrong(format!("a label is {label}")));
@@ -113,7 +113,7 @@ fn write_array<T: AutoSerialize>(
     values: impl Iterator<Item = T>,
 ) -> io::Result<()> {
     archive.zip_writer().start_file(file_name_from_array_name(name), without_time())?;
-    // Without a buffer every pixel would be a call to the compressor, which took about as long as the trials.
+    // Buffered, because a call to the compressor for every pixel takes about as long as the trials.
     let mut file = io::BufWriter::with_capacity(1 << 16, archive.zip_writer());
     let mut array = npyz::WriteOptions::new().default_dtype().shape(shape).writer(&mut file).begin_nd()?;
     array.extend(values)?;
@@ -127,7 +127,7 @@ fn read_array<T: Deserialize>(
 ) -> io::Result<(Vec<u64>, Vec<T>)> {
     let file = archive.zip_archive().by_name(&file_name_from_array_name(name));
     let file = file.map_err(|error| io::Error::other(format!("`{name}`: {error}")))?;
-    // Without a buffer every pixel would be a call to the decompressor.
+    // Buffered, to avoid a call to the decompressor for every pixel.
     let array = NpyFile::new(io::BufReader::with_capacity(1 << 16, file))?;
     Ok((array.shape().to_vec(), array.into_vec()?))
 }
@@ -142,16 +142,16 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read() {
+    fn candidates_round_trip() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("candidates.npz");
         two().write(&path).unwrap();
         assert_eq!(Candidates::read(&path).unwrap(), two());
-        assert_eq!(fs::read_dir(&folder).unwrap().count(), 1, "nothing partial is left");
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 1, "no partial file remains");
     }
 
     #[test]
-    fn an_error_names_the_file_and_what_it_holds() {
+    fn an_error_names_the_file_and_the_invalid_array() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("candidates.npz");
         let refused = |candidates: Candidates| {
@@ -159,7 +159,7 @@ mod tests {
             Candidates::read(&path).unwrap_err().to_string()
         };
         let text = refused(Candidates { scenes: vec![7], ..two() });
-        assert!(text.contains("candidates.npz: there are 2 labels and 1 scenes; it must hold"), "{text}");
+        assert!(text.contains("candidates.npz: there are 2 labels and 1 scene numbers; it must hold"), "{text}");
         assert!(refused(Candidates::default()).contains("0 labels"));
         let missing = Candidates::read(&folder.path().join("no.npz")).unwrap_err().to_string();
         assert!(missing.contains("no.npz"), "{missing}");

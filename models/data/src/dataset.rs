@@ -7,22 +7,22 @@ use crate::error::{At, DataError};
 use crate::table::Unit;
 use crate::{Scene, Trial, edge_of, packed, processed};
 
-/// In which of the three forms a folder is.
+/// The format of a folder.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Form {
-    /// VGN's depth images.
+    /// Depth images and grasps in metres, as VGN and GIGA have them.
     Raw,
-    /// VGN's volumes.
+    /// Volumes and grasps in voxels, as VGN and GIGA have them.
     Processed,
-    /// Ours.
+    /// The packed format of graspd.
     Packed,
 }
 
 impl Form {
-    /// What a folder holds.
+    /// Detects the format of a folder.
     ///
     /// # Errors
-    /// [`DataError`] when it cannot be read, or is no data set.
+    /// [`DataError`] if it cannot be read or is not a data set.
     pub fn of(folder: &Path) -> Result<Self, DataError> {
         fs::metadata(folder).at(folder)?;
         if packed::is_packed(folder) {
@@ -36,11 +36,11 @@ impl Form {
     }
 }
 
-/// Scenes of one resolution to learn from: packed folders are mapped, processed ones read into memory.
+/// Scenes of one resolution for training. Packed folders are mapped into memory, processed ones are read.
 pub struct Dataset {
     resolution: usize,
     sources: Vec<Source>,
-    /// Which source, and which scene of it.
+    /// Index of the source, and index of the scene in it.
     scenes: Vec<(usize, usize)>,
 }
 
@@ -50,10 +50,10 @@ enum Source {
 }
 
 impl Dataset {
-    /// Opens folders, processed or packed, as one data set.
+    /// Opens processed or packed folders as one data set.
     ///
     /// # Errors
-    /// [`DataError`] names the file that cannot be used.
+    /// [`DataError`] names the invalid file.
     pub fn open(folders: &[PathBuf]) -> Result<Self, DataError> {
         let mut dataset = Self::none();
         for folder in folders {
@@ -63,7 +63,7 @@ impl Dataset {
                 Form::Raw => {
                     return Err(DataError::Scene {
                         path: folder.clone(),
-                        reason: "it holds depth images, which are fused first: `grasp-sim convert`".to_owned(),
+                        reason: "the folder holds depth images: fuse them first with `grasp-sim convert`".to_owned(),
                         expected: "volumes",
                     });
                 }
@@ -74,19 +74,19 @@ impl Dataset {
             dataset.add(source).map_err(|reason| DataError::Scene {
                 path: folder.clone(),
                 reason,
-                expected: "volumes of the same size as the others",
+                expected: "volumes of the same resolution as the other scenes",
             })?;
         }
         Ok(dataset)
     }
 
-    /// No scenes at all.
+    /// An empty data set.
     #[must_use]
     pub fn none() -> Self {
         Self { resolution: 0, sources: Vec::new(), scenes: Vec::new() }
     }
 
-    /// Scenes that are in memory already; `None` unless all their volumes are cubes of one size.
+    /// A data set of scenes in memory; `None` unless all their volumes are cubes of one resolution.
     #[must_use]
     pub fn of(scenes: Vec<Scene>) -> Option<Self> {
         let mut dataset = Self::none();
@@ -99,7 +99,7 @@ impl Dataset {
         for scene in 0..source.len() {
             let resolution = source.resolution(scene)?;
             if self.resolution != 0 && resolution != self.resolution {
-                return Err(format!("it has {resolution}³ voxels, what came before {}³", self.resolution));
+                return Err(format!("a volume has {resolution}³ voxels, the volumes before have {}³", self.resolution));
             }
             self.resolution = resolution;
             self.scenes.push((index, scene));
@@ -108,11 +108,11 @@ impl Dataset {
         Ok(())
     }
 
-    /// Takes in the scenes that were added to packed folders since; says how many. Scenes are in the order of their
-    /// folders, so that all that follow a folder which grew have another index then.
+    /// Adds scenes that were appended to packed folders since, and returns their number. Scenes are ordered by folder,
+    /// so scenes of later folders change their index.
     ///
     /// # Errors
-    /// [`DataError`] names the file that is damaged.
+    /// [`DataError`] names the damaged file.
     pub fn refresh(&mut self) -> Result<usize, DataError> {
         let before = self.scenes.len();
         for source in &mut self.sources {
@@ -125,14 +125,14 @@ impl Dataset {
         Ok(self.scenes.len() - before)
     }
 
-    /// How many scenes of each folder there are.
+    /// Number of scenes of each folder.
     #[must_use]
     pub fn sizes(&self) -> Vec<usize> {
         let count = |index| self.scenes.iter().filter(|(source, _)| *source == index).count();
         (0..self.sources.len()).map(count).collect()
     }
 
-    /// Keeps so many scenes of each folder, the first, until the next [`refresh`](Self::refresh).
+    /// Keeps only the first scenes of each folder, as many as `sizes` gives, until the next [`refresh`](Self::refresh).
     pub fn limit(&mut self, sizes: &[usize]) {
         let kept = self.sources.iter().zip(sizes).enumerate();
         self.scenes = kept
@@ -140,19 +140,19 @@ impl Dataset {
             .collect();
     }
 
-    /// N: voxels along an edge of every volume.
+    /// N: voxels along an edge of each volume.
     #[must_use]
     pub fn resolution(&self) -> usize {
         self.resolution
     }
 
-    /// How many scenes there are.
+    /// Number of scenes.
     #[must_use]
     pub fn len(&self) -> usize {
         self.scenes.len()
     }
 
-    /// Whether there are none.
+    /// Whether there are no scenes.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.scenes.is_empty()
@@ -168,7 +168,7 @@ impl Dataset {
         }
     }
 
-    /// In how many volumes scene `index` was observed.
+    /// Number of volumes of scene `index`.
     #[must_use]
     pub fn volumes(&self, index: usize) -> usize {
         let (source, scene) = self.scenes[index];
@@ -178,17 +178,18 @@ impl Dataset {
         }
     }
 
-    /// One of them: `[N, N, N]`, z fastest, as bytes of which [`value`](crate::value) tells the meaning.
+    /// Volume `observation` of scene `index`: `[N, N, N]`, z fastest, as bytes that [`value`](crate::value) converts to
+    /// values.
     #[must_use]
-    pub fn volume(&self, index: usize, look: usize) -> &[u8] {
+    pub fn volume(&self, index: usize, observation: usize) -> &[u8] {
         let (source, scene) = self.scenes[index];
         match &self.sources[source] {
-            Source::Packed(reader) => reader.volume(scene, look),
-            Source::Memory(scenes) => &scenes[scene].volumes[look],
+            Source::Packed(reader) => reader.volume(scene, observation),
+            Source::Memory(scenes) => &scenes[scene].volumes[observation],
         }
     }
 
-    /// The grasps of scene `index`, in voxels.
+    /// The trials of scene `index`, in voxels.
     #[must_use]
     pub fn trials(&self, index: usize) -> Vec<Trial> {
         let (source, scene) = self.scenes[index];
@@ -198,7 +199,7 @@ impl Dataset {
         }
     }
 
-    /// How many grasps some scenes have, and how many of those succeeded.
+    /// Number of trials in `scenes`, and number of successes among them.
     #[must_use]
     pub fn grasps(&self, scenes: &[usize]) -> (usize, usize) {
         scenes.iter().fold((0, 0), |(all, successes), &scene| {
@@ -207,14 +208,14 @@ impl Dataset {
         })
     }
 
-    /// Sixteen hexadecimal digits that change when the name of a scene or a grasp of it does, and with the order of the
-    /// scenes. Their volumes, a thousand times as much, are left out: who makes them anew tries other grasps, too.
+    /// A hash of 16 hexadecimal digits over the names, trials and order of the scenes. The volumes are a thousand times
+    /// larger and are left out: a data set with other volumes also has other trials.
     #[must_use]
     pub fn fingerprint(&self) -> String {
         let mut hash = Sha256::new();
         for scene in 0..self.len() {
             let (id, trials) = (self.id(scene), self.trials(scene));
-            // With their lengths, so that no two data sets are the same bytes.
+            // Lengths are hashed too, so that different data sets do not give the same bytes.
             hash.update((id.len() as u64).to_le_bytes());
             hash.update(&id);
             hash.update((trials.len() as u64).to_le_bytes());
@@ -231,8 +232,8 @@ impl Dataset {
         hash.finalize().iter().take(8).map(|byte| format!("{byte:02x}")).collect()
     }
 
-    /// Indices of the scenes to learn from and of those held out: about `fraction` of them, chosen by a hash of the
-    /// scene's name, so that a scene stays on its side when others are added.
+    /// Indices of the training scenes and of the held-out scenes, about `fraction` of all. A hash of the scene's name
+    /// decides, so that a scene keeps its side when others are added.
     #[must_use]
     pub fn split(&self, fraction: f64) -> (Vec<usize>, Vec<usize>) {
         (0..self.len()).partition(|&index| {
@@ -259,7 +260,7 @@ impl Source {
                 let edge = voxels.first().and_then(|&first| edge_of(first));
                 let same = voxels.iter().all(|&count| count == voxels[0]);
                 edge.filter(|_| same)
-                    .ok_or_else(|| format!("scene {} has volumes of {voxels:?} voxels", scenes[scene].id))
+                    .ok_or_else(|| format!("the volumes of scene {} have {voxels:?} voxels", scenes[scene].id))
             }
         }
     }

@@ -3,7 +3,7 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-/// What is wrong with a data set; always names the file.
+/// Why a data set cannot be read or written. Every error names the file.
 #[derive(Debug, Error)]
 pub enum DataError {
     /// A file cannot be read or written.
@@ -11,10 +11,10 @@ pub enum DataError {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the file system.
         source: io::Error,
     },
-    /// A line of `grasps.csv` cannot be understood.
+    /// A line of `grasps.csv` is invalid.
     #[error("{}, line {line}: {reason}; the columns must be {columns}", path.display())]
     Row {
         /// The file.
@@ -26,53 +26,53 @@ pub enum DataError {
         /// The format's columns.
         columns: &'static str,
     },
-    /// A scene's file cannot be used.
+    /// The file of a scene is invalid.
     #[error("{}: {reason}; it must hold {expected}", path.display())]
     Scene {
         /// The file.
         path: PathBuf,
         /// What is wrong.
         reason: String,
-        /// What the format asks for.
+        /// What the format requires.
         expected: &'static str,
     },
     /// A packed file is damaged.
-    #[error("{}: {reason} at byte {offset}; delete the file, its scenes can be labelled again into another folder", path.display())]
+    #[error("{}: {reason} at byte {offset}; delete the file and label its scenes again into another folder", path.display())]
     Damaged {
         /// The file.
         path: PathBuf,
-        /// Where.
+        /// Offset of the error, bytes.
         offset: u64,
         /// What is wrong.
         reason: String,
     },
-    /// A folder holds no data set, or nothing in it.
+    /// A folder holds no data set or an empty one.
     #[error(
         "{}: holds no grasps; a data set is a folder with scenes-*.pack, or with grasps.csv and scenes/",
         .0.display()
     )]
     Empty(PathBuf),
-    /// The folder holds data of another recipe.
+    /// The folder holds data of another setup.
     #[error("{} was written with other settings ({found}); use another folder, or the same settings", path.display())]
     OtherSetup {
-        /// The setup file.
+        /// The setup file, or the folder.
         path: PathBuf,
-        /// What it holds.
+        /// Its content.
         found: String,
     },
     /// Two folders hold the same scene.
-    #[error("{} holds scene {id}, which {} holds too", second.display(), first.display())]
+    #[error("scene {id} is in {} and in {}; merge only one of them", first.display(), second.display())]
     Twice {
-        /// The scene.
+        /// Name of the scene.
         id: String,
-        /// A folder.
+        /// The first folder.
         first: PathBuf,
-        /// Another.
+        /// The second folder.
         second: PathBuf,
     },
 }
 
-/// Adds the file to an error.
+/// Adds the path of the file to an error.
 pub(crate) trait At<T> {
     fn at(self, path: &Path) -> Result<T, DataError>;
 }

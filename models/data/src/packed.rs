@@ -1,22 +1,22 @@
-//! The packed form: a few large files that only ever grow.
+//! The packed format: a few large append-only files.
 //!
-//! A folder holds `setup.json` and `scenes-NNNNN.pack`. A file is a header, 16 bytes (`graspack`, the version 3 and N as
-//! little-endian u32), and records one after the other, each a scene:
+//! A folder holds `setup.json` and `scenes-NNNNN.pack`. A file is a header of 16 bytes (`graspack`, the version 3 and N
+//! as little-endian u32), followed by records, one per scene:
 //!
-//! | bytes | what |
+//! | bytes | content |
 //! |---|---|
-//! | 4 | length of what follows the checksum |
-//! | 4 | its CRC-32 |
-//! | 8 | the scene's number |
-//! | 4, 4 | how many trials, how many volumes |
-//! | 41 a trial | position (voxels), quaternion x y z w, width (voxels): eight f32; a byte, bit 0: a success, bit k: turned by k · 36° about its approach it is one too; the share of the tries that held and the clearance (metres): two f32 |
-//! | N³ a volume | [`quantise`]d values, `[x][y][z]` |
+//! | 4 | length of the content after the checksum |
+//! | 4 | CRC-32 of that content |
+//! | 8 | number of the scene |
+//! | 4, 4 | number of trials, number of volumes |
+//! | 41 per trial | position (voxels), quaternion x y z w, width (voxels): eight f32; one byte, bit 0: success, bit k: the grasp yawed by k · 36° is a success too; success rate of the tries and clearance (metres): two f32 |
+//! | N³ per volume | [`quantise`]d values, `[x][y][z]` |
 //!
-//! In versions 1 and 2 a trial has 33 bytes, without the share and the clearance: all tries of a success held, and the
-//! clearance is not known. In version 1 no turns are known either. A folder may hold files of several versions.
+//! In versions 1 and 2 a trial has 33 bytes, without success rate and clearance: the rate is 1 for a success and 0 for
+//! a failure, and the clearance is unknown. Version 1 has no yaws either. A folder may hold files of several versions.
 //!
-//! All numbers are little-endian. A record that is not complete yet, at the end of a file, is not there for a reader. A
-//! run that goes on after it was cut off starts a new file, so that a file that someone has mapped never shrinks.
+//! All numbers are little-endian. Readers ignore an incomplete record at the end of a file. A run that continues after
+//! an interruption starts a new file, so that a file that is mapped by a reader never shrinks.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions};
@@ -32,26 +32,26 @@ use crate::{Setup, Trial, edge_of, quantise};
 const MAGIC: &[u8; 8] = b"graspack";
 const VERSION: u32 = 3;
 const HEADER: usize = 16;
-/// Length and checksum, before a record's content.
+/// Bytes of the length and the checksum before a record's content.
 const PREFIX: usize = 8;
-/// A trial as it is written, and as it was before the share and the clearance were kept.
+/// Bytes of a trial in the current version, and in versions 1 and 2.
 const TRIAL: usize = 41;
 const SHORT_TRIAL: usize = 33;
 
-/// Size at which the writer begins the next file.
+/// Size at which the writer starts the next file, bytes.
 const FILE_SIZE: u64 = 1 << 30;
 
 /// Writes scenes in the order of their numbers.
 pub struct Writer {
     folder: PathBuf,
     next: Option<u64>,
-    /// The file that is written, its name, and its size.
+    /// The open file, its path and its size.
     file: Option<(File, PathBuf, u64)>,
     record: Vec<u8>,
 }
 
 impl Writer {
-    /// Opens a folder, new or left by an earlier run of the same `setup`.
+    /// Opens a folder, which is new or was written by an earlier run of the same `setup`.
     ///
     /// # Errors
     /// [`DataError`] names the file.
@@ -63,16 +63,16 @@ impl Writer {
         Ok(Self { folder: folder.to_owned(), next, file: None, record: Vec::new() })
     }
 
-    /// The scene to go on with, if any was written before.
+    /// The number of the next scene, if the folder has scenes already.
     #[must_use]
     pub fn next(&self) -> Option<u64> {
         self.next
     }
 
-    /// Appends a scene in one write: its volumes, each `[N, N, N]` in [0, 1], and its trials.
+    /// Appends a scene in one write: its volumes, each `[N, N, N]` in [0, 1], and its trials in voxels.
     ///
     /// # Errors
-    /// [`DataError`] names the file; nothing written before is lost.
+    /// [`DataError`] names the file. Earlier scenes are not lost.
     pub fn append(&mut self, number: u64, volumes: &[Vec<f32>], trials: &[Trial]) -> Result<(), DataError> {
         let quantised: Vec<Vec<u8>> = volumes.iter().map(|volume| quantise(volume)).collect();
         self.append_quantised(number, &quantised, trials)
@@ -110,7 +110,7 @@ impl Writer {
             Some(open) if !full => open,
             _ => self.begin_file(edge)?,
         };
-        // A failure leaves no file open, hence nothing is ever written behind half a record.
+        // After a failure no file stays open, so nothing is ever appended after an incomplete record.
         file.write_all(&self.record).at(&path)?;
         self.file = Some((file, path, size + self.record.len() as u64));
         self.next = Some(number + 1);
@@ -126,7 +126,7 @@ impl Writer {
     }
 }
 
-/// The packed files of a folder, in the order in which they were begun.
+/// The packed files of a folder, oldest first.
 fn files(folder: &Path) -> Result<Vec<PathBuf>, DataError> {
     let mut files = Vec::new();
     for entry in fs::read_dir(folder).at(folder)? {
@@ -140,19 +140,19 @@ fn files(folder: &Path) -> Result<Vec<PathBuf>, DataError> {
     Ok(files)
 }
 
-/// A name for the next file.
+/// Path of the next file.
 fn next_file(folder: &Path) -> Result<PathBuf, DataError> {
     let last = files(folder)?.pop();
     let number = last.and_then(|path| path.file_stem()?.to_str()?.strip_prefix("scenes-")?.parse::<u32>().ok());
     Ok(folder.join(format!("scenes-{:05}.pack", number.map_or(0, |number| number + 1))))
 }
 
-/// Whether a folder is of this form.
+/// Whether a folder has this format.
 pub(crate) fn is_packed(folder: &Path) -> bool {
     files(folder).is_ok_and(|files| !files.is_empty())
 }
 
-/// The complete scenes of a folder, mapped into memory.
+/// A reader of the complete scenes of a folder, mapped into memory.
 pub struct Reader {
     folder: PathBuf,
     parts: Vec<Part>,
@@ -163,27 +163,27 @@ struct Part {
     path: PathBuf,
     map: Mmap,
     edge: usize,
-    /// Bytes of a trial.
+    /// Bytes per trial.
     trial: usize,
     /// End of the last complete record.
     end: usize,
 }
 
-/// Where a scene is: all checked when it was found.
+/// Location of a scene, validated.
 struct Location {
     part: usize,
     number: u64,
     trials: usize,
     volumes: usize,
-    /// Where the trials begin.
+    /// Offset of the trials.
     start: usize,
 }
 
 impl Reader {
-    /// Opens a folder, which may still be written to.
+    /// Opens a folder. Its writer may still be running.
     ///
     /// # Errors
-    /// [`DataError`] names the file that is damaged, or is none of ours.
+    /// [`DataError`] names the file that is damaged or not a packed file.
     pub fn open(folder: &Path) -> Result<Self, DataError> {
         let mut reader = Self::new(folder);
         reader.refresh()?;
@@ -194,10 +194,10 @@ impl Reader {
         Self { folder: folder.to_owned(), parts: Vec::new(), scenes: Vec::new() }
     }
 
-    /// Looks for scenes that were written since; says how many.
+    /// Finds scenes that were appended since, and returns their number.
     ///
     /// # Errors
-    /// As [`open`](Self::open); what was read before remains.
+    /// As [`open`](Self::open). Scenes that were read before stay available.
     pub fn refresh(&mut self) -> Result<usize, DataError> {
         let before = self.scenes.len();
         for (index, path) in files(&self.folder)?.into_iter().enumerate() {
@@ -210,7 +210,7 @@ impl Reader {
             let (edge, trial) = check_header(&path, &map)?;
             let end = known.map_or(HEADER, |part| part.end);
             let mut part = Part { path, map, edge, trial, end };
-            // The records before stay where they are.
+            // Offsets of earlier records stay valid.
             self.scenes.extend(part.read_on(index)?);
             match self.parts.get_mut(index) {
                 Some(known) => *known = part,
@@ -220,13 +220,13 @@ impl Reader {
         Ok(self.scenes.len() - before)
     }
 
-    /// How many scenes there are.
+    /// Number of scenes.
     #[must_use]
     pub fn len(&self) -> usize {
         self.scenes.len()
     }
 
-    /// Whether there are none.
+    /// Whether there are no scenes.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.scenes.is_empty()
@@ -244,19 +244,19 @@ impl Reader {
         self.scenes[index].number
     }
 
-    /// How many volumes scene `index` has.
+    /// Number of volumes of scene `index`.
     #[must_use]
     pub fn volumes(&self, index: usize) -> usize {
         self.scenes[index].volumes
     }
 
-    /// Volume `look` of scene `index`, [`quantise`]d.
+    /// Volume `observation` of scene `index`, [`quantise`]d.
     #[must_use]
-    pub fn volume(&self, index: usize, look: usize) -> &[u8] {
+    pub fn volume(&self, index: usize, observation: usize) -> &[u8] {
         let scene = &self.scenes[index];
         let part = &self.parts[scene.part];
         let size = part.edge.pow(3);
-        &part.map[scene.start + scene.trials * part.trial + look * size..][..size]
+        &part.map[scene.start + scene.trials * part.trial + observation * size..][..size]
     }
 
     /// The trials of scene `index`.
@@ -268,7 +268,7 @@ impl Reader {
     }
 }
 
-/// A trial of either length.
+/// Parses a trial of either length.
 fn trial(bytes: &[u8]) -> Trial {
     let [x, y, z, qx, qy, qz, qw, width] = std::array::from_fn(|i| f64::from(f32_at(bytes, 4 * i)));
     let success = bytes[32] & 1 != 0;
@@ -288,7 +288,7 @@ fn trial(bytes: &[u8]) -> Trial {
 }
 
 impl Part {
-    /// The records from `end` on, which moves behind them.
+    /// Reads the complete records after `end`, and moves `end` behind them.
     fn read_on(&mut self, part: usize) -> Result<Vec<Location>, DataError> {
         let mut scenes = Vec::new();
         while let Some(prefix) = self.map.get(self.end..self.end + PREFIX) {
@@ -300,14 +300,16 @@ impl Part {
                 DataError::Damaged { path, offset, reason }
             };
             if crc32fast::hash(content) != checksum {
-                return Err(damaged("the checksum of a scene does not fit it".to_owned()));
+                return Err(damaged("the checksum of a scene does not match".to_owned()));
             }
             let [trials, volumes] = match content.get(8..16) {
                 Some(counts) => [u32_at(counts, 0), u32_at(counts, 4)].map(|count| count as usize),
                 None => return Err(damaged(format!("a scene of {length} bytes is too short"))),
             };
             if length != 16 + trials * self.trial + volumes * self.edge.pow(3) {
-                return Err(damaged(format!("{trials} trials and {volumes} volumes do not make {length} bytes")));
+                return Err(damaged(format!(
+                    "a scene of {trials} trials and {volumes} volumes cannot have {length} bytes"
+                )));
             }
             let number = u64::from(u32_at(content, 0)) | u64::from(u32_at(content, 4)) << 32;
             scenes.push(Location { part, number, trials, volumes, start: start + 16 });
@@ -317,7 +319,7 @@ impl Part {
     }
 }
 
-/// The edge of a file's volumes, and the bytes of its trials.
+/// Edge of the volumes of a file, and bytes per trial.
 fn check_header(path: &Path, bytes: &[u8]) -> Result<(usize, usize), DataError> {
     let damaged = |reason: String| DataError::Damaged { path: path.to_owned(), offset: 0, reason };
     if &bytes[..8] != MAGIC {
@@ -326,18 +328,18 @@ fn check_header(path: &Path, bytes: &[u8]) -> Result<(usize, usize), DataError> 
     let trial = match u32_at(bytes, 8) {
         1 | 2 => SHORT_TRIAL,
         VERSION => TRIAL,
-        version => return Err(damaged(format!("version {version}, this program reads up to {VERSION}"))),
+        version => return Err(damaged(format!("the version is {version}, must be from 1 to {VERSION}"))),
     };
     Ok((u32_at(bytes, 12) as usize, trial))
 }
 
 #[expect(
     unsafe_code,
-    reason = "sound while the file does not shrink: a writer only appends, and never to a file it did not begin"
+    reason = "sound because the file does not shrink: a writer only appends, and only to files that it created"
 )]
 fn map(path: &Path) -> Result<Mmap, DataError> {
     let file = File::open(path).at(path)?;
-    // SAFETY: see above.
+    // SAFETY: see the reason above.
     unsafe { Mmap::map(&file) }.at(path)
 }
 
@@ -349,11 +351,10 @@ fn f32_at(bytes: &[u8], offset: usize) -> f32 {
     f32::from_bits(u32_at(bytes, offset))
 }
 
-/// Copies the packed files of several folders, made by the same recipe on several machines, into one.
+/// Copies the packed files of several folders with the same setup into one folder, and returns the number of scenes.
 ///
 /// # Errors
-/// [`DataError`] names the folder that was made otherwise, or holds a scene that another holds too; `into` is then as it
-/// was.
+/// [`DataError`] names a folder with another setup, or two folders with the same scene. `into` is not changed then.
 pub fn merge(folders: &[PathBuf], into: &Path) -> Result<usize, DataError> {
     let mut seen = BTreeMap::new();
     let mut setup: Option<Setup> = None;
@@ -378,13 +379,13 @@ pub fn merge(folders: &[PathBuf], into: &Path) -> Result<usize, DataError> {
     let Some(setup) = setup else { return Err(DataError::Empty(into.to_owned())) };
     setup.claim(into)?;
     if is_packed(into) {
-        let found = "it holds scenes already".to_owned();
+        let found = "the folder already holds scenes".to_owned();
         return Err(DataError::OtherSetup { path: into.to_owned(), found });
     }
     for folder in folders {
         for source in files(folder)? {
             let path = next_file(into)?;
-            // Under another name until it is complete.
+            // Copied under another name and renamed when complete.
             let partial = path.with_extension("partial");
             fs::copy(&source, &partial).at(&partial)?;
             fs::rename(&partial, &path).at(&path)?;

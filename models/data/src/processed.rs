@@ -1,8 +1,8 @@
 //! The processed format of VGN and GIGA:
 //!
 //! - `setup.json`: [`Setup`];
-//! - `grasps.csv`: `scene_id,qx,qy,qz,qw,i,j,k,width,label,share,clearance`, a row a trial; i, j, k = position / voxel
-//!   size, width in voxels, clearance in metres; VGN and GIGA have neither `share` nor `clearance`, see [`Trial`];
+//! - `grasps.csv`: `scene_id,qx,qy,qz,qw,i,j,k,width,label,share,clearance`, one row per trial; i, j, k = position /
+//!   voxel size, width in voxels, clearance in metres; VGN and GIGA have no `share` and no `clearance`, see [`Trial`];
 //! - `scenes/ID.npz`: `grid`, `[1, N, N, N]` f32, the observed volume.
 
 use std::fs;
@@ -27,7 +27,8 @@ pub struct Writer {
 }
 
 impl Writer {
-    /// Opens a folder, new or left by an earlier run of the same `setup`, whose last scene is made again.
+    /// Opens a folder, which is new or was written by an earlier run of the same `setup`. The last scene of that run is
+    /// written again.
     ///
     /// # Errors
     /// [`DataError`] names the file.
@@ -39,16 +40,17 @@ impl Writer {
         Ok(Self { scenes, table, next })
     }
 
-    /// The scene to go on with, if any was written before.
+    /// The number of the next scene, if the folder has scenes already.
     #[must_use]
     pub fn next(&self) -> Option<u64> {
         self.next
     }
 
-    /// Appends a scene: its volume first, `[N, N, N]` in [0, 1], then its trials, so that what the table names is there.
+    /// Appends a scene: its volume, `[N, N, N]` in [0, 1], then its trials in voxels. In this order the table never
+    /// names a missing scene.
     ///
     /// # Errors
-    /// [`DataError`] names the file; nothing written before is lost.
+    /// [`DataError`] names the file. Earlier scenes are not lost.
     pub fn append(&mut self, id: &str, volume: &[f32], trials: &[Trial]) -> Result<(), DataError> {
         let path = self.scenes.join(format!("{id}.npz"));
         let partial = path.with_extension("npz.partial");
@@ -61,7 +63,7 @@ impl Writer {
 /// Reads every scene of a folder.
 ///
 /// # Errors
-/// [`DataError`] names the file, and the line, that cannot be used.
+/// [`DataError`] names the invalid file and its line.
 pub fn read(folder: &Path) -> Result<Vec<Scene>, DataError> {
     let trials = table::read(folder, Unit::Voxels)?.into_iter().collect::<Vec<_>>();
     trials
@@ -74,7 +76,8 @@ pub fn read(folder: &Path) -> Result<Vec<Scene>, DataError> {
 }
 
 fn write_volume(path: &Path, values: &[f32]) -> io::Result<()> {
-    let edge = edge_of(values.len()).ok_or_else(|| io::Error::other(format!("{} is no cube", values.len())))? as u64;
+    let edge = edge_of(values.len())
+        .ok_or_else(|| io::Error::other(format!("{} values are not a cube", values.len())))? as u64;
     let mut archive = NpzWriter::create(path)?;
     let array = archive.array("grid", without_time())?;
     let mut grid = array.default_dtype().shape(&[1, edge, edge, edge]).begin_nd()?;
@@ -85,7 +88,7 @@ fn write_volume(path: &Path, values: &[f32]) -> io::Result<()> {
 fn read_volume(path: &Path) -> Result<Vec<f32>, DataError> {
     let wrong = |reason| DataError::Scene { path: path.to_owned(), reason, expected: EXPECTED };
     let mut archive = NpzArchive::open(path).at(path)?;
-    let grid = archive.by_name("grid").at(path)?.ok_or_else(|| wrong("it holds no `grid`".to_owned()))?;
+    let grid = archive.by_name("grid").at(path)?.ok_or_else(|| wrong("the array `grid` is missing".to_owned()))?;
     let shape = grid.shape().to_vec();
     match shape[..] {
         [1, x, y, z] if x == y && y == z && x > 0 && grid.order() == npyz::Order::C => {}
@@ -93,7 +96,7 @@ fn read_volume(path: &Path) -> Result<Vec<f32>, DataError> {
     }
     let values = grid.into_vec::<f32>().at(path)?;
     if let Some(value) = values.iter().find(|value| !(0.0..=1.0).contains(*value)) {
-        return Err(wrong(format!("`grid` holds {value}")));
+        return Err(wrong(format!("a value of `grid` is {value}")));
     }
     Ok(values)
 }

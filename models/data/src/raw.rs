@@ -1,10 +1,10 @@
 //! The raw format of VGN and GIGA:
 //!
 //! - `setup.json`: [`Setup`], with the camera's intrinsics;
-//! - `grasps.csv`: `scene_id,qx,qy,qz,qw,x,y,z,width,label,share,clearance`, a row a trial, lengths in metres; VGN and
-//!   GIGA have neither `share` nor `clearance`, see [`Trial`];
-//! - `scenes/ID.npz`: `depth_imgs` `[n, height, width]` f32, metres, 0 where nothing was seen, and `extrinsics` `[n, 7]`,
-//!   `T_camera_task` as qx, qy, qz, qw, tx, ty, tz.
+//! - `grasps.csv`: `scene_id,qx,qy,qz,qw,x,y,z,width,label,share,clearance`, one row per trial, lengths in metres;
+//!   VGN and GIGA have no `share` and no `clearance`, see [`Trial`];
+//! - `scenes/ID.npz`: `depth_imgs` `[n, height, width]` f32, metres, 0 without a measurement, and `extrinsics`
+//!   `[n, 7]`, `T_camera_task` as qx, qy, qz, qw, tx, ty, tz.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -21,10 +21,10 @@ use crate::{Setup, Trial, without_time};
 
 const EXPECTED: &str = "`depth_imgs`, f32 [n, height, width], and `extrinsics`, [n, 7]";
 
-/// A depth image and where it was taken from.
+/// A depth image with its camera pose.
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
-    /// Metres along the optical axis, row by row, 0 where nothing was seen.
+    /// Metres along the optical axis, row by row; 0 where there is no measurement.
     pub depth: Vec<f32>,
     /// `T_camera_task`.
     pub camera_from_task: Isometry3<f64>,
@@ -39,7 +39,8 @@ pub struct Writer {
 }
 
 impl Writer {
-    /// Opens a folder, new or left by an earlier run of the same `setup`, whose last scene is made again.
+    /// Opens a folder, which is new or was written by an earlier run of the same `setup`. The last scene of that run is
+    /// written again.
     ///
     /// # Errors
     /// [`DataError`] names the file.
@@ -51,16 +52,16 @@ impl Writer {
         Ok(Self { scenes, table, next, image: [setup.intrinsic.height, setup.intrinsic.width] })
     }
 
-    /// The scene to go on with, if any was written before.
+    /// The number of the next scene, if the folder has scenes already.
     #[must_use]
     pub fn next(&self) -> Option<u64> {
         self.next
     }
 
-    /// Appends a scene: its views first, then its trials, in metres, so that what the table names is there.
+    /// Appends a scene: its views, then its trials in metres. In this order the table never names a missing scene.
     ///
     /// # Errors
-    /// [`DataError`] names the file; nothing written before is lost.
+    /// [`DataError`] names the file. Earlier scenes are not lost.
     pub fn append(&mut self, id: &str, views: &[View], trials: &[Trial]) -> Result<(), DataError> {
         let path = self.scenes.join(format!("{id}.npz"));
         let partial = path.with_extension("npz.partial");
@@ -70,7 +71,8 @@ impl Writer {
     }
 }
 
-/// A folder's table, from which its scenes are read one by one: together they are larger than a memory.
+/// A reader of a folder. The table is in memory; views are read scene by scene, because all of them may exceed the
+/// memory.
 pub struct Reader {
     folder: PathBuf,
     setup: Setup,
@@ -81,13 +83,13 @@ impl Reader {
     /// Opens a folder.
     ///
     /// # Errors
-    /// [`DataError`] names the file, and the line, that cannot be used.
+    /// [`DataError`] names the invalid file and its line.
     pub fn open(folder: &Path) -> Result<Self, DataError> {
         let setup = Setup::read(folder)?;
         Ok(Self { folder: folder.to_owned(), setup, trials: table::read(folder, Unit::Metres)? })
     }
 
-    /// What it says of itself.
+    /// The setup of the folder.
     #[must_use]
     pub fn setup(&self) -> &Setup {
         &self.setup
@@ -109,12 +111,12 @@ impl Reader {
         let mut archive = NpzArchive::open(&path).at(&path)?;
         let mut array = |name: &str| {
             let found = archive.by_name(name).at(&path)?;
-            let array = found.ok_or_else(|| wrong(format!("it holds no `{name}`")))?;
+            let array = found.ok_or_else(|| wrong(format!("the array `{name}` is missing")))?;
             let shape = array.shape().to_vec();
             if array.order() != npyz::Order::C {
-                return Err(wrong(format!("`{name}` is stored column by column")));
+                return Err(wrong(format!("`{name}` is stored in Fortran order")));
             }
-            // VGN stores both in f32, its users' tools some in f64.
+            // VGN stores both arrays as f32; some tools write f64.
             let values = match array.dtype().descr().trim_matches('\'') {
                 "<f8" => array.into_vec::<f64>().at(&path)?.into_iter().map(|value| value as f32).collect(),
                 _ => array.into_vec::<f32>().at(&path)?,
@@ -129,7 +131,7 @@ impl Reader {
         }
         if shape != [views as u64, height as u64, width as u64] {
             return Err(wrong(format!(
-                "`depth_imgs` has shape {shape:?}, for {views} poses of a {width}×{height} camera"
+                "`depth_imgs` has shape {shape:?}, but there are {views} poses of a {width}×{height} camera"
             )));
         }
         let images = depth.chunks_exact(height * width).map(<[f32]>::to_vec);
@@ -150,7 +152,7 @@ impl Reader {
 
 fn write_views(path: &Path, views: &[View], [height, width]: [usize; 2]) -> io::Result<()> {
     let mut archive = NpzWriter::create(path)?;
-    // Deflated, as numpy.savez_compressed does: a depth image shrinks to a tenth.
+    // Compressed, like numpy.savez_compressed: a depth image shrinks to a tenth.
     let options = || without_time().compression_method(npyz::zip::CompressionMethod::Deflated);
     let count = views.len() as u64;
     let array = archive.array("depth_imgs", options())?;

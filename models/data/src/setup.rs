@@ -7,61 +7,61 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::{At, DataError};
 
-/// `setup.json`: what VGN's code wants to know of a data set, and how ours was made.
+/// `setup.json`: the parameters that VGN's code reads, and the provenance of the data.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Setup {
     /// Edge of the workspace, metres.
     pub size: f64,
     /// The depth camera.
     pub intrinsic: Intrinsic,
-    /// Greatest opening of the hand, metres.
+    /// Largest opening of the hand, metres.
     pub max_opening_width: f64,
     /// Length of the fingers, metres.
     pub finger_depth: f64,
-    /// Everything it takes to make the same data again; data of others have none.
+    /// Parameters to reproduce the data; absent in data of other tools.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub provenance: Option<Provenance>,
 }
 
-/// The depth camera as VGN writes it.
+/// The depth camera in VGN's format.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Intrinsic {
-    /// Pixels a row.
+    /// Pixels per row.
     pub width: usize,
     /// Rows.
     pub height: usize,
-    /// The 3×3 matrix, row by row: fx 0 cx, 0 fy cy, 0 0 1.
+    /// Intrinsic matrix, row by row: fx 0 cx, 0 fy cy, 0 0 1. Pixels.
     #[serde(rename = "K")]
     pub k: [f64; 9],
 }
 
-/// What decides every byte of a data set that `grasp-sim label` writes.
+/// The parameters that determine every byte of a data set that `grasp-sim label` writes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Provenance {
-    /// `pile` or `packed`.
+    /// Scenario: `pile` or `packed`.
     pub scene: String,
-    /// `train` or `test`, our own objects, or the folder they came from.
+    /// Objects: the built-in `train` or `test`, or the folder of the objects.
     pub objects: String,
-    /// Grasp points a scene.
+    /// Grasp points per scene.
     pub points: usize,
-    /// Where the scenes were looked at from.
+    /// Camera views of the scenes.
     pub views: String,
-    /// Observations of each scene.
+    /// Observations per scene.
     #[serde(alias = "looks")]
     pub observations: usize,
-    /// Share of the observations whose depth images carried the benchmark's noise.
+    /// Fraction of the observations with the benchmark's depth noise.
     pub noise: f64,
-    /// Seed of the data set; scene numbers select its streams.
+    /// Seed of the data set. Each scene number selects a random stream.
     pub seed: u64,
-    /// Seed of the observations, if they were not made with the labels.
+    /// Seed of the observations, if they were not generated with the labels.
     #[serde(default, alias = "look_seed", skip_serializing_if = "Option::is_none")]
     pub observation_seed: Option<u64>,
-    /// Version of the simulator: another may give other labels.
+    /// Version of the simulator. Labels can differ between versions.
     pub version: String,
 }
 
 impl Setup {
-    /// The benchmark's workspace, camera and hand.
+    /// The setup with the benchmark's workspace, camera and hand.
     #[must_use]
     pub fn benchmark(provenance: Provenance) -> Self {
         let Intrinsics { width, height, fx, fy, cx, cy } = Intrinsics::BENCHMARK;
@@ -74,24 +74,24 @@ impl Setup {
         }
     }
 
-    /// The camera.
+    /// The intrinsics of the camera.
     #[must_use]
     pub fn intrinsics(&self) -> Intrinsics {
         let Intrinsic { width, height, k: [fx, _, cx, _, fy, cy, ..] } = self.intrinsic;
         Intrinsics { width, height, fx, fy, cx, cy }
     }
 
-    /// Reads a folder's.
+    /// Reads the setup of a folder.
     ///
     /// # Errors
-    /// [`DataError::Io`] when there is none, or it is none.
+    /// [`DataError::Io`] if the file is missing or invalid.
     pub fn read(folder: &Path) -> Result<Self, DataError> {
         let path = folder.join("setup.json");
         let text = fs::read_to_string(&path).at(&path)?;
         serde_json::from_str(&text).at(&path)
     }
 
-    /// Writes it into a folder, which is made; a folder that has one already must have the same.
+    /// Writes the setup into a folder, which is created if needed. An existing setup must be equal.
     ///
     /// # Errors
     /// [`DataError`] names the file.

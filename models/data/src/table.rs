@@ -1,5 +1,6 @@
-//! `grasps.csv`: a row a trial, the same in both of VGN's formats but for the unit of its lengths. Columns are found by
-//! their names. VGN's and GIGA's tables have no `share` and no `clearance`, which is in metres in both formats.
+//! `grasps.csv`: one row per trial. Both formats of VGN have the same columns and differ in the unit of lengths.
+//! Columns are found by name. The tables of VGN and GIGA have no `share` and no `clearance`; the clearance is in metres
+//! in both formats.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -15,7 +16,7 @@ use crate::{MAX_CLEARANCE, Trial};
 
 pub(crate) const FILE: &str = "grasps.csv";
 
-/// In which unit a table's positions and widths are.
+/// The unit of a table's positions and widths.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Unit {
     Metres,
@@ -23,7 +24,7 @@ pub(crate) enum Unit {
 }
 
 impl Unit {
-    /// As it is written.
+    /// The header that the writer writes.
     fn header(self) -> &'static str {
         match self {
             Self::Metres => "scene_id,qx,qy,qz,qw,x,y,z,width,label,share,clearance",
@@ -31,7 +32,7 @@ impl Unit {
         }
     }
 
-    /// What every table has.
+    /// The columns that every table must have.
     fn required(self) -> impl Iterator<Item = &'static str> {
         self.header().split(',').filter(|column| !["share", "clearance"].contains(column))
     }
@@ -49,28 +50,28 @@ impl Unit {
         }
     }
 
-    /// The unit of a folder's table by its header.
+    /// The unit of a folder's table, from its header.
     pub(crate) fn of(folder: &Path) -> Option<Self> {
         let mut reader = csv::Reader::from_path(folder.join(FILE)).ok()?;
         let header = reader.headers().ok()?;
         [Self::Metres, Self::Voxels].into_iter().find(|unit| unit.missing(header).is_none())
     }
 
-    /// A column that a table must have and has not.
+    /// A required column that is missing.
     fn missing(self, header: &csv::StringRecord) -> Option<&'static str> {
         self.required().find(|&column| header.iter().all(|found| found != column))
     }
 }
 
-/// Writes scenes in the order of their numbers, so that a run that was cut off goes on where it stopped.
+/// Writes scenes in the order of their numbers, so that an interrupted run can continue.
 pub(crate) struct TableWriter {
     path: PathBuf,
     file: File,
 }
 
 impl TableWriter {
-    /// Opens a folder's table, new or left by an earlier run, whose last scene may be unfinished: it is dropped, and its
-    /// number returned, from which to go on.
+    /// Opens a folder's table, which is new or was written by an earlier run. The last scene of that run may be
+    /// incomplete: its rows are removed and its number is returned, as the next scene to write.
     pub(crate) fn open(folder: &Path, unit: Unit) -> Result<(Self, Option<u64>), DataError> {
         let path = folder.join(FILE);
         let mut file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path).at(&path)?;
@@ -86,7 +87,7 @@ impl TableWriter {
         Ok((Self { path, file }, last))
     }
 
-    /// Appends a scene's trials, in the table's unit, in one write.
+    /// Appends the trials of a scene, in the unit of the table, in one write.
     pub(crate) fn append(&mut self, id: &str, trials: &[Trial]) -> Result<(), DataError> {
         let mut rows = String::new();
         for Trial { position: p, rotation, width, success, share, clearance, .. } in trials {
@@ -102,27 +103,25 @@ impl TableWriter {
     }
 }
 
-/// Rows as they are written now must not follow those of an earlier version, which are shorter.
+/// Rows of the current version must not follow the shorter rows of an earlier version.
 fn check_columns(path: &Path, unit: Unit) -> Result<(), DataError> {
     let mut header = String::new();
     BufReader::new(File::open(path).at(path)?).read_line(&mut header).at(path)?;
     if header.trim_end() == unit.header() {
         return Ok(());
     }
-    let reason = format!(
-        "the table was begun with other columns than `{}`, which cannot be added to it: write into another folder",
-        unit.header()
-    );
+    let reason = format!("the header must be `{}` to append rows: write into another folder", unit.header());
     Err(DataError::Row { path: path.to_owned(), line: 1, reason, columns: unit.columns() })
 }
 
-/// Length of the table without the rows of its last scene, which may be unfinished, and that scene's number.
+/// Length of the table without the rows of its last scene, which may be incomplete, and the number of that scene.
 fn last_scene(table: &File) -> io::Result<(u64, Option<u64>)> {
     let mut reader = BufReader::new(table);
     let mut line = String::new();
     let (mut offset, mut start, mut last) = (0, 0, None);
     while reader.read_line(&mut line)? > 0 {
-        // A row without its end may be cut anywhere, even in its scene's number: it goes with the scene before it.
+        // A row without a line end may be cut off anywhere, even in the scene number, so it counts as part of the
+        // previous scene.
         if line.ends_with('\n')
             && let Some(number) = line.split(',').next().and_then(|id| id.parse::<u64>().ok())
             && last != Some(number)
@@ -157,19 +156,19 @@ struct Row {
     clearance: Option<f32>,
 }
 
-/// A column may be missing, but where it is there, so is its value: an empty one is of a row that was cut off.
+/// The column may be missing, but not a value in it: an empty value belongs to a row that was cut off.
 fn number<'de, D: Deserializer<'de>>(value: D) -> Result<Option<f32>, D::Error> {
     f32::deserialize(value).map(Some)
 }
 
-/// Reads a folder's table: the trials of each scene, in the table's unit.
+/// Reads the trials of each scene from a folder's table, in the unit of the table.
 pub(crate) fn read(folder: &Path, unit: Unit) -> Result<BTreeMap<String, Vec<Trial>>, DataError> {
     let path = folder.join(FILE);
     let wrong = |line, reason| DataError::Row { path: path.clone(), line, reason, columns: unit.columns() };
     let mut reader = csv::Reader::from_reader(File::open(&path).at(&path)?);
     let header = reader.headers().map_err(|error| wrong(1, error.to_string()))?;
     if let Some(column) = unit.missing(header) {
-        return Err(wrong(1, format!("there is no column `{column}`")));
+        return Err(wrong(1, format!("the column `{column}` is missing")));
     }
     let mut trials: BTreeMap<String, Vec<Trial>> = BTreeMap::new();
     // The header is line 1.

@@ -1,4 +1,4 @@
-//! What is written is read again, whatever happened in between.
+//! Round trips of the three formats, with interruptions and damaged files.
 
 use std::fs;
 use std::path::Path;
@@ -37,10 +37,12 @@ fn trials(number: u64) -> Vec<Trial> {
 }
 
 fn volumes(number: u64) -> Vec<Vec<f32>> {
-    (0..2).map(|look| (0..N.pow(3)).map(|i| ((i as u64 + look + number) % 256) as f32 / 255.0).collect()).collect()
+    (0..2)
+        .map(|observation| (0..N.pow(3)).map(|i| ((i as u64 + observation + number) % 256) as f32 / 255.0).collect())
+        .collect()
 }
 
-/// Trials as they are after a round trip through f32.
+/// Compares trials after a round trip through f32.
 fn assert_same(read: &[Trial], written: &[Trial]) {
     assert_eq!(read.len(), written.len());
     for (read, written) in read.iter().zip(written) {
@@ -61,7 +63,7 @@ fn pack(folder: &Path, numbers: impl IntoIterator<Item = u64>) {
 }
 
 #[test]
-fn packed_scenes_are_read_as_they_were_written() {
+fn packed_scenes_round_trip() {
     let folder = tempfile::tempdir().unwrap();
     pack(folder.path(), [0, 1, 3]);
     assert_eq!(Form::of(folder.path()).unwrap(), Form::Packed);
@@ -70,16 +72,17 @@ fn packed_scenes_are_read_as_they_were_written() {
     for (index, number) in [0, 1, 3].into_iter().enumerate() {
         assert_eq!(dataset.id(index), format!("{number:08}"));
         assert_same(&dataset.trials(index), &trials(number));
-        assert_eq!(dataset.trials(index)[0].turns, 0b1_0010, "which other forms do not keep");
+        assert_eq!(dataset.trials(index)[0].turns, 0b1_0010, "only the packed format stores yaws");
         assert_eq!(dataset.volumes(index), 2);
-        for (look, volume) in volumes(number).iter().enumerate() {
-            let read: Vec<f32> = dataset.volume(index, look).iter().map(|&byte| grasp_data::value(byte)).collect();
+        for (observation, volume) in volumes(number).iter().enumerate() {
+            let read: Vec<f32> =
+                dataset.volume(index, observation).iter().map(|&byte| grasp_data::value(byte)).collect();
             assert_eq!(read, *volume);
         }
     }
 }
 
-/// A file with one scene, as an earlier version wrote it: nothing follows the flags of a trial.
+/// A file with one scene in an earlier version, whose trials end after the flags.
 fn of_version(version: u8, bytes: &[u8], trials: usize) -> Vec<u8> {
     let (header, record) = bytes.split_at(16);
     let (counts, rest) = record[8..].split_at(16);
@@ -93,7 +96,7 @@ fn of_version(version: u8, bytes: &[u8], trials: usize) -> Vec<u8> {
 }
 
 #[test]
-fn earlier_versions_of_the_packed_form_are_read_too() {
+fn earlier_versions_of_the_packed_format_are_read() {
     for (version, turns) in [(1, 0), (2, 0b1_0010)] {
         let folder = tempfile::tempdir().unwrap();
         let written: Vec<Trial> = trials(0).into_iter().map(|trial| Trial { turns, ..trial }).collect();
@@ -101,7 +104,7 @@ fn earlier_versions_of_the_packed_form_are_read_too() {
         let path = folder.path().join("scenes-00000.pack");
         let bytes = fs::read(&path).unwrap();
         fs::write(&path, of_version(version, &bytes, 2)).unwrap();
-        // A run that goes on writes the version of today.
+        // A continued run writes the current version.
         pack(folder.path(), [0, 1]);
         let dataset = Dataset::open(&[folder.path().to_owned()]).unwrap();
         let share = |success| if success { 1.0 } else { 0.0 };
@@ -115,7 +118,7 @@ fn earlier_versions_of_the_packed_form_are_read_too() {
 }
 
 #[test]
-fn a_data_set_with_other_shares_or_clearances_is_another() {
+fn the_fingerprint_covers_shares_and_clearances() {
     let fingerprint = |change: fn(&mut Trial)| {
         let mut trials = trials(0);
         change(&mut trials[0]);
@@ -128,7 +131,7 @@ fn a_data_set_with_other_shares_or_clearances_is_another() {
 }
 
 #[test]
-fn a_packed_run_cut_off_anywhere_goes_on_without_a_lost_or_doubled_scene() {
+fn an_interrupted_packed_run_continues_without_lost_or_duplicate_scenes() {
     let whole = tempfile::tempdir().unwrap();
     pack(whole.path(), [0, 1, 3]);
     let bytes = fs::read(whole.path().join("scenes-00000.pack")).unwrap();
@@ -140,7 +143,11 @@ fn a_packed_run_cut_off_anywhere_goes_on_without_a_lost_or_doubled_scene() {
         let reader = packed::Reader::open(folder.path()).unwrap();
         let numbers: Vec<u64> = (0..reader.len()).map(|index| reader.number(index)).collect();
         assert_eq!(numbers, [0, 1, 3], "cut after {length} bytes");
-        assert_eq!(fs::read(folder.path().join("scenes-00000.pack")).unwrap(), bytes[..length], "no file is changed");
+        assert_eq!(
+            fs::read(folder.path().join("scenes-00000.pack")).unwrap(),
+            bytes[..length],
+            "the existing file does not change"
+        );
     }
 }
 
@@ -156,7 +163,7 @@ fn scenes_are_read_while_they_are_written() {
         assert_eq!(dataset.refresh().unwrap(), 1);
     }
     drop(writer);
-    // A second run writes a second file.
+    // A second run starts a second file.
     pack(folder.path(), 0..6);
     assert_eq!(dataset.refresh().unwrap(), 2);
     assert_eq!((dataset.len(), dataset.sizes()), (6, vec![6]));
@@ -175,12 +182,12 @@ fn a_damaged_file_is_named() {
     pack(folder.path(), [0, 1]);
     let path = folder.path().join("scenes-00000.pack");
     let good = fs::read(&path).unwrap();
-    for (at, said) in [(0, "does not begin with"), (8, "version"), (600, "checksum")] {
+    for (at, expected) in [(0, "does not begin with"), (8, "version"), (600, "checksum")] {
         let mut bad = good.clone();
         bad[at] ^= 0x10;
         fs::write(&path, bad).unwrap();
         let error = packed::Reader::open(folder.path()).err().unwrap().to_string();
-        assert!(error.contains("scenes-00000.pack") && error.contains(said), "{error}");
+        assert!(error.contains("scenes-00000.pack") && error.contains(expected), "{error}");
     }
 }
 
@@ -198,7 +205,7 @@ fn ranges_of_scenes_are_merged() {
     let again = folder.path().join("again");
     let error = packed::merge(&[a.clone(), b.clone(), a.clone()], &again).unwrap_err();
     assert!(matches!(&error, DataError::Twice { id, .. } if id == "00000000"), "{error}");
-    assert!(!again.exists(), "nothing is written before all is known to fit");
+    assert!(!again.exists(), "nothing is written before all folders are checked");
 
     let mut other = setup();
     other.provenance.as_mut().unwrap().seed = 2;
@@ -208,7 +215,7 @@ fn ranges_of_scenes_are_merged() {
 }
 
 #[test]
-fn a_processed_run_cut_off_anywhere_goes_on_without_a_lost_or_doubled_scene() {
+fn an_interrupted_processed_run_continues_without_lost_or_duplicate_scenes() {
     let folder = tempfile::tempdir().unwrap();
     let write = || {
         let mut writer = processed::Writer::open(folder.path(), &setup()).unwrap();
@@ -224,7 +231,7 @@ fn a_processed_run_cut_off_anywhere_goes_on_without_a_lost_or_doubled_scene() {
     let first =
         "00000000,0.0000000,0.0000000,0.0000000,1.0000000,1.500000,2.000000,0.000000,3.250000,1,0.750000,0.012500\n";
     assert!(whole.starts_with(&format!("{header}{first}")), "{whole}");
-    // In a row, between two, or in a scene's number.
+    // Cut in a row, between rows, or in a scene number.
     for length in header.len()..whole.len() {
         fs::write(&table, &whole[..length]).unwrap();
         write();
@@ -237,7 +244,7 @@ fn a_processed_run_cut_off_anywhere_goes_on_without_a_lost_or_doubled_scene() {
 }
 
 #[test]
-fn raw_scenes_are_read_as_they_were_written() {
+fn raw_scenes_round_trip() {
     let folder = tempfile::tempdir().unwrap();
     let setup = setup();
     let pixels = setup.intrinsic.width * setup.intrinsic.height;
@@ -249,7 +256,7 @@ fn raw_scenes_are_read_as_they_were_written() {
     let views = [view(0.5), view(0.25)];
     writer.append("00000007", &views, &trials(7)).unwrap();
     drop(writer);
-    assert_eq!(raw::Writer::open(folder.path(), &setup).unwrap().next(), Some(7), "the last scene is made again");
+    assert_eq!(raw::Writer::open(folder.path(), &setup).unwrap().next(), Some(7), "the last scene is written again");
     raw::Writer::open(folder.path(), &setup).unwrap().append("00000007", &views, &trials(7)).unwrap();
 
     assert_eq!(Form::of(folder.path()).unwrap(), Form::Raw);
@@ -267,7 +274,7 @@ fn raw_scenes_are_read_as_they_were_written() {
 }
 
 #[test]
-fn another_recipe_is_refused() {
+fn a_folder_with_another_setup_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     setup().claim(folder.path()).unwrap();
     let mut other = setup();
@@ -277,7 +284,7 @@ fn another_recipe_is_refused() {
 }
 
 #[test]
-fn what_cannot_be_read_is_named() {
+fn invalid_files_and_lines_are_named() {
     let folder = tempfile::tempdir().unwrap();
     let error = || Dataset::open(&[folder.path().to_owned()]).err().unwrap().to_string();
     assert!(error().contains("holds no grasps"), "{}", error());
@@ -287,7 +294,7 @@ fn what_cannot_be_read_is_named() {
     let table = folder.path().join("grasps.csv");
     let good = fs::read_to_string(&table).unwrap();
     let line = good.lines().nth(2).unwrap();
-    for (bad, said) in [
+    for (bad, expected) in [
         (line.replace("00000001,", "00000009,"), "00000009.npz"),
         ("00000001,0,0,0,1,1,2,3,4,2,1,0".to_owned(), "line 4: label is 2"),
         ("00000001,0,0,0,0.5,1,2,3,4,1,1,0".to_owned(), "line 4: the quaternion has length 0.5"),
@@ -301,17 +308,17 @@ fn what_cannot_be_read_is_named() {
         ("00000001,0,0,0".to_owned(), "line 4:"),
     ] {
         fs::write(&table, format!("{good}{bad}\n")).unwrap();
-        assert!(error().contains(said), "{bad}: {}", error());
+        assert!(error().contains(expected), "{bad}: {}", error());
     }
     fs::write(&table, good.lines().next().unwrap()).unwrap();
     assert!(error().contains("holds no grasps"), "{}", error());
     fs::write(&table, &good).unwrap();
-    fs::write(folder.path().join("scenes/00000001.npz"), "no archive").unwrap();
+    fs::write(folder.path().join("scenes/00000001.npz"), "not an archive").unwrap();
     assert!(error().contains("00000001.npz"), "{}", error());
 }
 
 #[test]
-fn columns_are_found_by_their_names_and_share_and_clearance_may_be_missing() {
+fn columns_are_found_by_name_and_share_and_clearance_are_optional() {
     let folder = tempfile::tempdir().unwrap();
     let mut writer = processed::Writer::open(folder.path(), &setup()).unwrap();
     writer.append("00000001", &volumes(1)[0], &trials(1)).unwrap();
@@ -321,7 +328,7 @@ fn columns_are_found_by_their_names_and_share_and_clearance_may_be_missing() {
         let trials = Dataset::open(&[folder.path().to_owned()]).map(|dataset| dataset.trials(0));
         trials.map(|trials| trials.iter().map(|trial| (trial.share, trial.clearance)).collect::<Vec<_>>())
     };
-    // As VGN and GIGA write.
+    // As written by VGN and GIGA.
     let old = "scene_id,qx,qy,qz,qw,i,j,k,width,label\n00000001,0,0,0,1,1,2,3,4,1\n00000001,0,0,0,1,1,2,3,4,0\n";
     assert_eq!(read(old).unwrap(), [(1.0, 0.0), (0.0, 0.0)]);
     let one = "label,share,scene_id,qx,qy,qz,qw,more,i,j,k,width\n1,0.25,00000001,0,0,0,1,7,1,2,3,4\n";
@@ -330,18 +337,18 @@ fn columns_are_found_by_their_names_and_share_and_clearance_may_be_missing() {
     assert_eq!(read(other).unwrap(), [(1.0, 0.01)]);
     assert!(read(&other.replace("width", "wide")).unwrap_err().to_string().contains("holds no grasps"));
 
-    // Rows of today do not follow a header of before.
+    // Rows of the current version are not appended to a table with an older header.
     let old = format!("{old}00000002,0,0,0,1,1,2,3,4,1\n");
     fs::write(&table, &old).unwrap();
     let Err(DataError::Row { line: 1, reason, .. }) = processed::Writer::open(folder.path(), &setup()) else {
-        panic!("a table of other columns is gone on with")
+        panic!("a table with other columns must be refused")
     };
     assert!(reason.contains("write into another folder"), "{reason}");
     assert_eq!(fs::read_to_string(&table).unwrap(), old, "nothing is lost");
 }
 
 #[test]
-fn scenes_stay_on_their_side_of_the_split() {
+fn scenes_keep_their_side_of_the_split() {
     let folders: Vec<_> = (0..2).map(|_| tempfile::tempdir().unwrap()).collect();
     pack(folders[0].path(), 0..200);
     pack(folders[1].path(), 0..400);

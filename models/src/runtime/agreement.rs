@@ -1,4 +1,4 @@
-//! Whether a fast way to run a network still gives its answers.
+//! Compares the outputs of a backend with those of the reference.
 
 use grasp::{Maps, Volume};
 use nalgebra::Isometry3;
@@ -6,15 +6,15 @@ use nalgebra::Isometry3;
 use super::{Network, batch_sizes};
 use crate::RuntimeError;
 
-/// What outputs may differ by, from those of ONNX Runtime's own kernels in f32, on [`sample`].
+/// Allowed differences from the outputs of ONNX Runtime's CPU kernels in f32, on [`sample`].
 ///
-/// bf16 moves the quality of the networks of the zoo by 0.01 at most; a provider that computed something else, or that
-/// lost an operator, is off by far more than this.
+/// In bf16 the quality of the zoo's networks differs by at most 0.01. A provider that loses an operator or computes
+/// another function exceeds these limits by far.
 const QUALITY: Limit = Limit { mean: 0.01, largest: 0.2 };
-/// Voxels.
+/// In voxels.
 const WIDTH: Limit = Limit { mean: 0.1, largest: 4.0 };
-/// Half the square of the distance between two quaternions, or one and the other's negative: 1 − |r·r*| for unit ones.
-/// Where a network does not care how a hand is turned, the last bit may turn it.
+/// Half the squared distance between two quaternions, up to sign: 1 − |r·r*| for unit quaternions. For symmetric
+/// objects, rounding can flip the rotation, so only the mean is limited.
 const ROTATION: Limit = Limit { mean: 0.02, largest: 1.0 };
 
 struct Limit {
@@ -22,7 +22,7 @@ struct Limit {
     largest: f32,
 }
 
-/// Says what differs by more than it may, if anything does, in batches of the sizes up to `max_batch`.
+/// Describes the first difference beyond the limits, if any, for the batch sizes up to `max_batch`.
 pub(super) fn difference(
     network: &mut Network,
     max_batch: usize,
@@ -34,7 +34,7 @@ pub(super) fn difference(
     let expected = expected.maps(0);
     for size in batch_sizes(max_batch) {
         let got = network.infer(&vec![&volume; size])?;
-        // The last, which has the others before it.
+        // The last volume of the batch, to detect errors in batching.
         if let Some(what) = apart(&got.maps(size - 1), &expected) {
             return Ok(Some(if size == 1 { what } else { format!("in a batch of {size}, {what}") }));
         }
@@ -52,11 +52,11 @@ fn apart(got: &Maps, expected: &Maps) -> Option<String> {
     differences.into_iter().find_map(|(name, differences, limit)| {
         let mean = differences.iter().sum::<f32>() / differences.len().max(1) as f32;
         let largest = differences.iter().copied().fold(0.0, f32::max);
-        // So that what is not a number is no agreement.
+        // Written so that NaN fails.
         let agrees = mean <= limit.mean && largest <= limit.largest;
         (!agrees).then(|| {
             format!(
-                "`{name}` differs by {mean:.4} on average and {largest:.4} at most, where {} and {} are allowed",
+                "`{name}` differs by {mean:.4} on average (limit {}) and by at most {largest:.4} (limit {})",
                 limit.mean, limit.largest
             )
         })
@@ -75,10 +75,10 @@ fn turned(got: &Maps, expected: &Maps) -> Vec<f32> {
     (0..voxels).map(apart).collect()
 }
 
-/// A ball and a post on a table, as a camera from above would see them.
+/// A ball and a post on a table, as seen by a camera from above.
 pub(super) fn sample(resolution: usize, voxel_size: f64) -> Volume {
     let size = resolution as f64;
-    // In shares of the edge.
+    // In units of the edge.
     let distance = |x: f64, y: f64, z: f64| {
         let table = z - 0.17;
         let ball = ((x - 0.35).powi(2) + (y - 0.4).powi(2) + (z - 0.3).powi(2)).sqrt() - 0.13;

@@ -4,91 +4,92 @@ use std::str::FromStr;
 use ort::ep::{self, ArbitrarilyConfigurableExecutionProvider, ExecutionProvider, ExecutionProviderDispatch};
 use thiserror::Error;
 
-/// What computes a network: one of ONNX Runtime's execution providers.
+/// An execution provider of ONNX Runtime.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Provider {
     /// ONNX Runtime's own kernels.
     Cpu,
     /// OpenVINO on the CPU.
     OpenVino,
-    /// An NVIDIA card.
+    /// CUDA on an NVIDIA GPU.
     Cuda,
-    /// An NVIDIA card, by way of an engine that is built for it when the model is loaded.
+    /// TensorRT on an NVIDIA GPU, with an engine that is built when the model is loaded.
     TensorRt,
 }
 
-/// The numbers that a network is computed in, as far as its provider may choose: sums are never shorter than f32.
+/// Numeric precision of inference. Sums are always accumulated in at least f32.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Precision {
     /// 32 bits.
     Fp32,
-    /// 16 bits, as wide a range as 32, three digits.
+    /// 16 bits with the range of f32 and three significant digits.
     Bf16,
-    /// 16 bits, up to 65504, four digits.
+    /// 16 bits, up to 65504, with four significant digits.
     Fp16,
-    /// 8 bits, in the scales that the file brings (`grasp-train export --precision int8`).
+    /// 8 bits, with the scales in the file (`grasp-train export --precision int8`).
     Int8,
 }
 
-/// What a network is run by, and in which numbers.
+/// A provider and a precision.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Backend {
-    /// Which provider.
+    /// Provider.
     pub provider: Provider,
-    /// Which precision.
+    /// Precision.
     pub precision: Precision,
 }
 
-/// Why a network cannot be run as was asked.
+/// Why the requested backend cannot run a network.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum BackendError {
-    /// The library has no such provider.
+    /// The library was built without the provider.
     #[error(
-        "this ONNX Runtime has no provider `{wanted}`, it has {}; set ORT_DYLIB_PATH to a build that does \
-         (the wheels onnxruntime-openvino, onnxruntime-gpu)",
+        "provider `{wanted}` not found in this ONNX Runtime; available: {}; set ORT_DYLIB_PATH to a build that has it \
+         (Python wheels onnxruntime-openvino, onnxruntime-gpu)",
         list(there)
     )]
     Provider {
-        /// What was asked for.
+        /// The requested value.
         wanted: Provider,
-        /// What there is.
+        /// The available providers.
         there: Vec<Provider>,
     },
-    /// The provider does not compute in these numbers, here.
-    #[error("the provider `{provider}` does not compute in {wanted} on this machine, it can do {}", list(there))]
+    /// The provider does not support the precision on this machine.
+    #[error("provider `{provider}` does not support {wanted} on this machine; available: {}", list(there))]
     Precision {
-        /// Which.
+        /// The provider.
         provider: Provider,
-        /// What was asked for.
+        /// The requested value.
         wanted: Precision,
-        /// What it can do.
+        /// The available precisions.
         there: Vec<Precision>,
     },
-    /// 8 bits need scales, which the file does not hold.
-    #[error("the model is no int8 model; `grasp-train export --precision int8` makes one of it")]
+    /// The file has no scales for 8 bits.
+    #[error("the model is not an int8 model; convert it with `grasp-train export --precision int8`")]
     NotInt8,
-    /// The file's scales cannot be taken out again.
-    #[error("the model is an int8 model, it cannot be computed in {0}; serve the file that it was exported from")]
+    /// An int8 file cannot run in another precision.
+    #[error("the model is an int8 model and cannot run in {0}; serve the file that it was exported from")]
     Int8(Precision),
 }
 
-/// What this machine and this library can do.
+/// Capabilities of the machine and of the library.
 #[derive(Clone, Debug)]
 pub(crate) struct Machine {
-    /// In the order in which they are tried, the fastest first.
+    /// Providers in the order in which they are tried, fastest first.
     pub providers: Vec<Provider>,
-    /// Whether the CPU multiplies bf16.
+    /// Whether the CPU has bf16 instructions.
     pub bf16: bool,
 }
 
 impl Machine {
-    /// This one. The library lists what it was built with; whether a card is there shows when a session is made.
+    /// Detects the capabilities. The library lists the providers it was built with; whether a GPU is present only shows
+    /// when a session is created.
     pub fn here() -> Self {
         let providers = Provider::FASTEST_FIRST.into_iter().filter(|provider| provider.is_available()).collect();
         Self { providers, bf16: has_bf16() }
     }
 
-    /// The ways to run a model, the first to be tried first; one that was asked for is the only one.
+    /// The backends to try for a model, in order. An explicit choice is the only one.
     pub fn backends(
         &self,
         provider: Option<Provider>,
@@ -120,7 +121,7 @@ impl Machine {
         }
     }
 
-    /// The fastest first.
+    /// Precisions of a provider, fastest first.
     fn precisions(&self, provider: Provider) -> Vec<Precision> {
         match provider {
             Provider::TensorRt => vec![Precision::Fp16, Precision::Bf16, Precision::Fp32],
@@ -130,7 +131,7 @@ impl Machine {
     }
 }
 
-/// Without it OpenVINO would take the hint and compute in f32. Processors with AMX have it, too.
+/// Without these instructions OpenVINO ignores the bf16 hint and computes in f32. Processors with AMX have them too.
 fn has_bf16() -> bool {
     #[cfg(target_arch = "x86_64")]
     return std::arch::is_x86_feature_detected!("avx512bf16");
@@ -151,7 +152,7 @@ impl Provider {
         listed.unwrap_or(false)
     }
 
-    /// Its name.
+    /// Name in options and responses.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -166,7 +167,7 @@ impl Provider {
 impl Precision {
     const ALL: [Self; 4] = [Self::Fp32, Self::Bf16, Self::Fp16, Self::Int8];
 
-    /// Its name.
+    /// Name in options and responses.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -179,11 +180,11 @@ impl Precision {
 }
 
 impl Backend {
-    /// ONNX Runtime's own kernels in f32, which every other way is measured by.
+    /// ONNX Runtime's CPU kernels in f32: the reference for all other backends.
     pub const REFERENCE: Self = Self { provider: Provider::Cpu, precision: Precision::Fp32 };
 
-    /// What is registered with a session of so many threads. A provider that cannot be registered is an error: ONNX
-    /// Runtime would otherwise go on without it and tell nobody.
+    /// The provider to register with a session of `threads` threads. A failed registration is an error; by default ONNX
+    /// Runtime would silently fall back to the CPU.
     pub(crate) fn dispatch(self, threads: usize) -> Option<ExecutionProviderDispatch> {
         let provider = match self.provider {
             Provider::Cpu => return None,
@@ -208,7 +209,7 @@ impl Backend {
     }
 }
 
-/// A name, or `auto`, which leaves the choice to the machine.
+/// An explicit choice, or `auto` (`None`).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Choice<T>(pub Option<T>);
 
@@ -247,9 +248,9 @@ impl fmt::Display for Precision {
     }
 }
 
-/// No such name.
+/// The name is unknown.
 #[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
-#[error("it must be {0}")]
+#[error("must be {0}")]
 pub struct NameError(&'static str);
 
 impl FromStr for Provider {
@@ -306,7 +307,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_asked_for_is_the_only_choice() {
+    fn an_explicit_choice_is_the_only_one() {
         let here = machine(OPENVINO, true);
         assert_eq!(names(here.backends(Some(Provider::Cpu), None, false)), ["cpu fp32"]);
         assert_eq!(names(here.backends(Some(Provider::OpenVino), Some(Precision::Fp32), false)), ["openvino fp32"]);
@@ -316,20 +317,21 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_had_is_refused_with_what_can() {
+    fn unavailable_backends_are_refused_with_the_available_ones() {
         let here = machine(OPENVINO, false);
-        let said = |provider, precision, is_int8| here.backends(provider, precision, is_int8).unwrap_err().to_string();
-        let cuda = said(Some(Provider::Cuda), None, false);
-        assert!(cuda.contains("no provider `cuda`, it has openvino, cpu"), "{cuda}");
-        let bf16 = said(Some(Provider::OpenVino), Some(Precision::Bf16), false);
-        assert!(bf16.contains("does not compute in bf16") && bf16.contains("fp32"), "{bf16}");
-        assert!(said(None, Some(Precision::Fp16), false).contains("fp16"));
-        assert!(said(None, Some(Precision::Int8), false).contains("export --precision int8"));
-        assert!(said(None, Some(Precision::Bf16), true).contains("int8 model"));
+        let message =
+            |provider, precision, is_int8| here.backends(provider, precision, is_int8).unwrap_err().to_string();
+        let cuda = message(Some(Provider::Cuda), None, false);
+        assert!(cuda.contains("provider `cuda` not found in this ONNX Runtime; available: openvino, cpu"), "{cuda}");
+        let bf16 = message(Some(Provider::OpenVino), Some(Precision::Bf16), false);
+        assert!(bf16.contains("does not support bf16") && bf16.contains("fp32"), "{bf16}");
+        assert!(message(None, Some(Precision::Fp16), false).contains("fp16"));
+        assert!(message(None, Some(Precision::Int8), false).contains("export --precision int8"));
+        assert!(message(None, Some(Precision::Bf16), true).contains("int8 model"));
     }
 
     #[test]
-    fn names_are_read_as_written() {
+    fn names_round_trip() {
         for provider in Provider::FASTEST_FIRST {
             assert_eq!(provider.name().parse(), Ok(provider));
         }

@@ -10,30 +10,30 @@ use super::{Backend, LoadError, LoadReason, Options, RuntimeError, refusal};
 use crate::Entry;
 use crate::gpd::{INPUT, OUTPUT};
 
-/// Images that are scored together, to bound the memory: 5.5 MB of input.
+/// Batch size, which bounds the memory: 5.5 MB of input.
 const BATCH: usize = 32;
 
-/// A classifier of grasp candidates, ready to run.
+/// A loaded classifier of grasp candidates.
 pub struct Classifier {
     session: Session,
-    /// For errors.
+    /// Name in error messages.
     name: String,
 }
 
 impl Classifier {
-    /// Loads a file, and checks that its input and output are those of a classifier.
+    /// Loads a file and checks that its input and output are those of a classifier.
     ///
     /// # Errors
-    /// [`LoadError`] names the file and what is wrong with it.
+    /// [`LoadError`] names the file and the problem.
     pub fn load(path: &Path, options: &Options) -> Result<Self, LoadError> {
         let load = || Self::open(path, &fs::read(path)?, options);
         load().map_err(|reason| LoadError { path: path.to_owned(), reason })
     }
 
-    /// Loads an entry of a store several times, for as many threads that run it at the same time.
+    /// Loads an entry of a store `count` times, once per thread.
     ///
     /// # Errors
-    /// [`LoadError`] names the file and what is wrong with it, if it is not the one that the store read, too.
+    /// [`LoadError`] names the file and the problem, including a file that changed since the store read it.
     pub fn load_several(entry: &Entry, options: &Options, count: usize) -> Result<Vec<Self>, LoadError> {
         let load = || {
             let bytes = entry.bytes()?;
@@ -42,7 +42,7 @@ impl Classifier {
         load().map_err(|reason| LoadError { path: entry.path.clone(), reason })
     }
 
-    /// Scores once, too: the first time allocates, and no caller should wait for that.
+    /// Runs once, so that the first request does not pay for allocations.
     fn open(path: &Path, bytes: &[u8], options: &Options) -> Result<Self, LoadReason> {
         let session = Model::new(path, bytes, options).open(Backend::REFERENCE, None)?;
         check(session.inputs(), INPUT, &[CHANNELS, IMAGE_SIZE, IMAGE_SIZE])?;
@@ -52,10 +52,10 @@ impl Classifier {
         Ok(classifier)
     }
 
-    /// The score of each image: the logit of a success less that of a failure, above 0 if a success is the likelier.
+    /// The score of each image: the logit of success minus the logit of failure. Above 0, success is more likely.
     ///
     /// # Errors
-    /// [`RuntimeError::Run`] when ONNX Runtime fails.
+    /// [`RuntimeError::Run`] if ONNX Runtime fails.
     pub fn score(&mut self, images: &[Image]) -> Result<Vec<f32>, RuntimeError> {
         let mut scores = Vec::with_capacity(images.len());
         for batch in images.chunks(BATCH) {
@@ -67,7 +67,7 @@ impl Classifier {
     }
 }
 
-/// Of images, one after the other.
+/// The logits of concatenated images.
 fn logits(session: &mut Session, pixels: Vec<f32>) -> ort::Result<Vec<f32>> {
     let images = pixels.len() / (CHANNELS * IMAGE_SIZE * IMAGE_SIZE);
     let input = Tensor::from_array(([images, CHANNELS, IMAGE_SIZE, IMAGE_SIZE], pixels))?;
@@ -81,10 +81,10 @@ fn check(outlets: &[Outlet], name: &str, dims: &[usize]) -> Result<(), LoadReaso
     if let [other] = outlets
         && other.name() != name
     {
-        return Err(wrong(format!("it has `{}`, not `{name}`", other.name())));
+        return Err(wrong(format!("found `{}` instead of `{name}`", other.name())));
     }
     let outlet = outlets.iter().find(|outlet| outlet.name() == name);
-    let dtype = outlet.ok_or_else(|| wrong(format!("it has no `{name}`")))?.dtype();
+    let dtype = outlet.ok_or_else(|| wrong(format!("`{name}` is missing")))?.dtype();
     let fits = |shape: &[i64]| {
         shape.len() == dims.len() + 1
             && shape[0] < 0
@@ -93,6 +93,6 @@ fn check(outlets: &[Outlet], name: &str, dims: &[usize]) -> Result<(), LoadReaso
     let is_float = dtype.tensor_type() == Some(TensorElementType::Float32);
     match dtype.tensor_shape() {
         Some(shape) if is_float && fits(shape) => Ok(()),
-        _ => Err(wrong(format!("its `{name}` is {dtype}"))),
+        _ => Err(wrong(format!("`{name}` is {dtype}"))),
     }
 }

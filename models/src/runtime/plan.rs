@@ -1,4 +1,4 @@
-//! A session and its buffers: what runs batches of one size, or of any.
+//! Sessions with their buffers, for one batch size or for any.
 
 use std::collections::{BTreeMap, btree_map};
 use std::path::Path;
@@ -14,33 +14,33 @@ use crate::onnx::ModelProto;
 use crate::upsampling::with_upsampling_folded;
 use crate::with_full_weights;
 
-/// A file, and what has to be known of it before it is loaded.
+/// A model file with the properties that are needed to load it.
 pub(super) struct Model<'a> {
     pub path: &'a Path,
-    /// As it is.
+    /// Content of the file.
     bytes: &'a [u8],
-    /// As cheap as the mathematics allows, where that is another graph.
+    /// An equivalent graph that is cheaper to compute, if there is one.
     cheaper: Option<Vec<u8>>,
     threads: usize,
-    /// Whether it computes in 8 bits.
+    /// Whether the model is quantised to 8 bits.
     pub is_int8: bool,
-    /// Another file that its weights are in.
+    /// The external file with its weights, if any.
     pub weights_elsewhere: Option<String>,
-    /// What it calls the size of its batch.
+    /// Name of the batch dimension.
     batch: Option<String>,
 }
 
-/// Runs batches.
+/// A session with its buffers.
 pub(super) struct Plan {
     session: Session,
-    /// The size of every batch; smaller ones are filled up. Any without.
+    /// The fixed batch size; smaller batches are padded. `None` for any size.
     size: Option<usize>,
-    /// By batch size; a batch of a size that was seen before allocates nothing. A caller that keeps to
-    /// [`batch_sizes`] has room for less than three times the largest.
+    /// Buffers by batch size, allocated once per size. Callers that only use [`batch_sizes`] need less than three times
+    /// the memory of the largest batch.
     buffers: BTreeMap<usize, Buffers>,
 }
 
-/// Input and outputs of one batch size, in place where ONNX Runtime reads and writes.
+/// Input and outputs of one batch size, which ONNX Runtime reads and writes in place.
 struct Buffers {
     binding: IoBinding,
     input: Tensor<f32>,
@@ -51,7 +51,7 @@ struct Buffers {
 pub(super) type Outputs = [Tensor<f32>; 3];
 
 impl<'a> Model<'a> {
-    /// Of one that is no model nothing is known; ONNX Runtime says better what is wrong with it.
+    /// Reads the properties. An invalid file gets none: ONNX Runtime reports a better error when loading it.
     pub fn new(path: &'a Path, bytes: &'a [u8], options: &Options) -> Self {
         let model = ModelProto::from_bytes(bytes).unwrap_or_default();
         let cheaper = cheaper(&model, bytes);
@@ -63,13 +63,13 @@ impl<'a> Model<'a> {
         Self { path, bytes, cheaper, threads: options.threads, is_int8, weights_elsewhere, batch }
     }
 
-    /// The file as it is, if it was to be run at less cost.
+    /// The unmodified file, if a cheaper graph is used.
     pub fn original(&self) -> Option<Self> {
         self.cheaper.as_ref()?;
         Some(Self { cheaper: None, weights_elsewhere: None, batch: self.batch.clone(), ..*self })
     }
 
-    /// Loads it, for batches of one size, if one is given.
+    /// Creates a session, for one fixed batch size if given.
     pub fn open(&self, backend: Backend, size: Option<usize>) -> Result<Session, LoadReason> {
         let runtime = runtime()?;
         let builder = Session::builder(&runtime.environment)?;
@@ -82,15 +82,15 @@ impl<'a> Model<'a> {
             builder = builder.with_execution_providers([provider]).map_err(ort::Error::from)?;
         }
         if backend.provider == Provider::OpenVino {
-            // What OpenVINO does not take would be computed elsewhere, and nobody would know.
+            // Without this option operators that OpenVINO does not support would silently run elsewhere.
             builder = builder.with_config_entry("session.disable_cpu_ep_fallback", "1").map_err(ort::Error::from)?;
         }
         Ok(builder.commit_from_memory(self.cheaper.as_deref().unwrap_or(self.bytes))?)
     }
 }
 
-/// The graph at less cost, if there is a way, and nothing of the file is lost on it: what our own types do not know of
-/// would be missing from what they write.
+/// A cheaper equivalent graph, if there is one. Only if our ONNX types represent the whole file: unknown fields would
+/// be lost.
 fn cheaper(model: &ModelProto, bytes: &[u8]) -> Option<Vec<u8>> {
     if model.encoded_len() != bytes.len() {
         return None;
@@ -99,11 +99,11 @@ fn cheaper(model: &ModelProto, bytes: &[u8]) -> Option<Vec<u8>> {
 }
 
 impl Plan {
-    /// What runs batches of up to `max_batch`, the smallest first: one session for all sizes where the provider does not
-    /// mind that they change, else one for each power of two and for the largest.
+    /// The plans for batches of up to `max_batch`, smallest first. One session serves all sizes if the provider
+    /// supports changing shapes; otherwise there is one per size of [`batch_sizes`].
     ///
-    /// OpenVINO fuses what follows the heads only if it knows the shape, which halves the time of VGN's network in bf16;
-    /// TensorRT would build its engine anew for each size that it meets.
+    /// OpenVINO fuses the operators after the heads only for a known shape, which halves the time of VGN's network in
+    /// bf16. TensorRT would build a new engine for each size.
     pub fn all(model: &Model, backend: Backend, max_batch: usize) -> Result<Vec<Self>, LoadReason> {
         let fixed = matches!(backend.provider, Provider::OpenVino | Provider::TensorRt) && model.batch.is_some();
         let sizes = if fixed { batch_sizes(max_batch).map(Some).collect() } else { vec![None] };
@@ -123,17 +123,17 @@ impl Plan {
         self.size.is_none_or(|size| batch <= size)
     }
 
-    /// Where a batch's volumes are read from, one after the other.
+    /// The input buffer of a batch, volume by volume.
     pub fn input(&mut self, batch: usize, resolution: usize) -> ort::Result<&mut [f32]> {
         let (_, buffers) = self.session_and_buffers(batch, resolution)?;
         Ok(buffers.input.extract_tensor_mut().1)
     }
 
-    /// Runs a batch over what its buffers hold. Where they have room for more, what an earlier batch left there is
-    /// computed, too, and nobody looks at it.
+    /// Runs a batch on the content of its buffers. With a larger fixed size the remaining volumes are computed too and
+    /// ignored.
     pub fn run(&mut self, batch: usize, resolution: usize) -> ort::Result<&Outputs> {
         let (session, buffers) = self.session_and_buffers(batch, resolution)?;
-        // Bound anew each time, for on some devices binding is what copies the input there.
+        // Bound again for each run, because on some devices binding copies the input.
         buffers.binding.bind_input(INPUT, &buffers.input)?;
         session.run_binding(&buffers.binding)?;
         Ok(&buffers.outputs)
@@ -149,7 +149,7 @@ impl Plan {
     }
 }
 
-/// The sizes that networks are made ready for, of batches of at most `largest`: the powers of two below it, and itself.
+/// The batch sizes that networks are prepared for: the powers of two below `largest`, and `largest`.
 pub fn batch_sizes(largest: usize) -> impl Iterator<Item = usize> {
     let powers = (0..usize::BITS).map(|bit| 1 << bit);
     powers.take_while(move |&size| size < largest).chain([largest])
@@ -176,11 +176,11 @@ mod tests {
     use crate::onnx::{StringStringEntryProto, ValueInfoProto};
 
     #[test]
-    fn a_file_is_written_anew_only_if_nothing_but_remarks_is_lost() {
+    fn a_file_is_rewritten_only_if_no_content_is_lost() {
         let mut vgn = crate::build("vgn", 0).unwrap();
         let graph = vgn.graph.as_mut().unwrap();
-        let remark = StringStringEntryProto { key: Some("from".to_owned()), value: Some("line 7".to_owned()) };
-        graph.node[0].metadata_props.push(remark);
+        let comment = StringStringEntryProto { key: Some("from".to_owned()), value: Some("line 7".to_owned()) };
+        graph.node[0].metadata_props.push(comment);
         graph.value_info.push(ValueInfoProto::tensor(&graph.node[0].output[0].clone(), vec![]));
         let mut bytes = vgn.encode_to_vec();
         let read = |bytes: &[u8]| ModelProto::from_bytes(bytes).unwrap();
@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn every_batch_fits_one_that_is_less_than_twice_its_size() {
+    fn batch_sizes_are_powers_of_two_and_the_largest() {
         let sizes = |largest| batch_sizes(largest).collect::<Vec<_>>();
         assert_eq!(sizes(1), [1]);
         assert_eq!(sizes(2), [1, 2]);

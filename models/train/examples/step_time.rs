@@ -1,4 +1,4 @@
-//! Times one training step of a network in each way it can be executed.
+//! Measures one training step of a network for each combination of precision and memory layout.
 //!
 //! `cargo run --release -p grasp-train --example step_time -- NETWORK BATCH THREADS`
 
@@ -15,7 +15,9 @@ const STEPS: usize = 8;
 
 fn main() -> anyhow::Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let [network, batch, threads] = arguments.as_slice() else { anyhow::bail!("give NETWORK BATCH THREADS") };
+    let [network, batch, threads] = arguments.as_slice() else {
+        anyhow::bail!("usage: step_time NETWORK BATCH THREADS")
+    };
     let batch: usize = batch.parse()?;
     tch::set_num_threads(threads.parse()?);
     tch::manual_seed(0);

@@ -1,8 +1,8 @@
 use tch::{Tensor, no_grad};
 
 /// Adam (Kingma and Ba, "Adam: A Method for Stochastic Optimization", ICLR 2015, algorithm 1) with its default
-/// constants, and with weights that decay by themselves (Loshchilov and Hutter, "Decoupled Weight Decay Regularization",
-/// ICLR 2019). libtorch's own keeps its state to itself, so that training could not be resumed.
+/// constants and decoupled weight decay (Loshchilov and Hutter, "Decoupled Weight Decay Regularization", ICLR 2019).
+/// libtorch's optimizer gives no access to its state, so that training could not be resumed.
 pub struct Adam {
     weight_decay: f64,
     /// Steps taken: t.
@@ -15,20 +15,20 @@ const BETA: [f64; 2] = [0.9, 0.999];
 const EPSILON: f64 = 1e-8;
 
 impl Adam {
-    /// For parameters of these shapes. Those of one dimension, biases and scales, do not decay.
+    /// An optimizer for these parameters. Parameters of one dimension (biases and scales) do not decay.
     #[must_use]
     pub fn new(parameters: &[(String, Tensor)], weight_decay: f64) -> Self {
         let moments = parameters.iter().map(|(_, weight)| [0, 1].map(|_| weight.zeros_like().set_requires_grad(false)));
         Self { weight_decay, steps: 0, moments: moments.collect() }
     }
 
-    /// How many steps were taken.
+    /// Number of steps taken.
     #[must_use]
     pub fn steps(&self) -> u64 {
         self.steps
     }
 
-    /// Moves every parameter along its gradient, and clears the gradients.
+    /// Updates every parameter and clears the gradients.
     pub fn step(&mut self, parameters: &[(String, Tensor)], learning_rate: f64) {
         self.steps += 1;
         let [first, second] = BETA.map(|beta| 1.0 - beta.powf(self.steps as f64));

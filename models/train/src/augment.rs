@@ -1,38 +1,38 @@
-//! Scenes turned, mirrored and shifted, with their grasps.
+//! Data augmentation: scenes are rotated, mirrored and shifted together with their grasps.
 //!
-//! The volume's values are sampled at (index + 0.5) voxels and grasps carry real positions, so turning both about the
-//! axis of the cube is exact; only which voxel a grasp falls into depends on the network's convention. (VGN's code turns
-//! indices about 20 instead, which moves the volume against the grasps by a voxel.)
+//! The volume's values are sampled at (index + 0.5) voxels and grasps have real positions, so that rotating both about
+//! the axis of the cube is exact. Only the voxel of a grasp depends on the network's convention. (VGN's code rotates
+//! indices about 20 instead, which shifts the volume relative to the grasps by a voxel.)
 
 use grasp_data::{TURNS, Trial};
 use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
 use rand::{Rng, RngExt};
 use serde::Serialize;
 
-/// Which changes may be made.
+/// Allowed transforms.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Augmentation {
     /// Quarter turns about z.
     pub turns: bool,
     /// Mirror images, x reversed.
     pub mirror: bool,
-    /// Shifts along z by up to so many voxels.
+    /// Maximum shift along z, voxels.
     pub shift: u32,
 }
 
-/// One change: mirrored, then turned, then shifted.
+/// A transform: mirrored, then rotated, then shifted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Transform {
     /// Quarter turns about z, counter-clockwise seen from above.
     pub turns: u32,
-    /// Whether x is reversed first.
+    /// Whether x is reversed.
     pub mirror: bool,
-    /// Voxels upwards.
+    /// Shift upwards, voxels.
     pub shift: i32,
 }
 
 impl Augmentation {
-    /// Any of the allowed changes, each as likely.
+    /// Draws one of the allowed transforms uniformly.
     pub fn draw(self, rng: &mut impl Rng) -> Transform {
         let shift = self.shift as i32;
         Transform {
@@ -44,11 +44,11 @@ impl Augmentation {
 }
 
 impl Transform {
-    /// Writes the values of the changed volume `[N, N, N]` to `out`; what is shifted in was not observed.
+    /// Writes the values of the transformed volume `[N, N, N]` to `out`. Voxels shifted in are unobserved.
     pub fn volume(self, volume: &[u8], n: usize, out: &mut [f32]) {
         for x in 0..n {
             for y in 0..n {
-                // Where this column of voxels comes from: every step undone, the last first.
+                // The source of this column of voxels, by the inverse transform.
                 let (mut from_x, mut from_y) = (x, y);
                 for _ in 0..self.turns {
                     (from_x, from_y) = (from_y, n - 1 - from_x);
@@ -65,19 +65,19 @@ impl Transform {
         }
     }
 
-    /// The grasp in the changed scene of N³ voxels.
+    /// The grasp in the transformed scene of N³ voxels.
     #[must_use]
     pub fn trial(self, trial: &Trial, n: usize) -> Trial {
         let edge = n as f64;
         let Trial { mut position, mut rotation, mut turns, .. } = *trial;
         if self.mirror {
             position.x = edge - position.x;
-            // The mirror image of a rotation about an axis is the opposite rotation about the mirrored axis. Of the
-            // hand, which is the mirror image of itself in x, this flips the x axis against the mirrored one; the
-            // approach (z) and the axis along which the fingers close (y) are the mirrored ones.
+            // The mirror image of a rotation about an axis is the inverse rotation about the mirrored axis. The hand is
+            // symmetric in x: its x axis is the negative of the mirrored axis; the approach (z) and the closing axis
+            // (y) are the mirrored axes.
             let [x, y, z, w]: [f64; 4] = rotation.coords.into();
             rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, x, -y, -z));
-            // And turns go round the other way.
+            // Mirroring reverses the direction of the turns.
             turns = (1..TURNS).fold(0, |mirrored, k| mirrored | (turns >> k & 1) << (TURNS - k));
         }
         for _ in 0..self.turns {

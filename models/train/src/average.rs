@@ -1,6 +1,6 @@
 use tch::{Tensor, no_grad};
 
-/// An exponential moving average of the weights, which does better than where the last steps happened to lead.
+/// An exponential moving average of the weights. It usually generalizes better than the last weights.
 pub(crate) struct Average {
     decay: f64,
     pub weights: Vec<Tensor>,
@@ -12,8 +12,8 @@ impl Average {
         Self { decay, weights }
     }
 
-    /// Takes in the weights after a step, `steps` since the start. The average of a short past is a short one, lest it
-    /// remember the random weights (Adam's TensorFlow implementation has the same ramp).
+    /// Updates the average after step number `steps`. The decay is smaller in the first steps, so that the average does
+    /// not keep the random initial weights (the ramp of TensorFlow's `ExponentialMovingAverage`).
     pub fn update(&mut self, parameters: &[(String, Tensor)], steps: u64) {
         let decay = self.decay.min((1 + steps) as f64 / (10 + steps) as f64);
         no_grad(|| {
@@ -23,7 +23,7 @@ impl Average {
         });
     }
 
-    /// Puts the average in the weights' place, and the weights in the average's.
+    /// Exchanges the average and the weights.
     pub fn swap(&mut self, parameters: &[(String, Tensor)]) {
         no_grad(|| {
             for (average, (_, weight)) in self.weights.iter_mut().zip(parameters) {

@@ -11,28 +11,28 @@ use crate::loss::Targets;
 use crate::settings::Quality;
 use crate::teacher::{Teacher, TeacherError};
 
-/// Batches that are read ahead of the one at work.
+/// Number of batches that are read ahead.
 const AHEAD: usize = 2;
 
-/// What a step sees of a scene.
+/// A scene as an input of a training step.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Example {
     pub scene: usize,
-    /// Which of its volumes.
-    pub look: usize,
+    /// Index of the scene's volume.
+    pub volume: usize,
     pub transform: Transform,
-    /// Decides of which voxels a teacher is asked.
+    /// Seed of the voxels for which the teacher's output is used.
     pub voxels: u64,
 }
 
-/// Scenes as a network takes them, with what it should answer.
+/// Inputs and targets of a forward pass.
 pub(crate) struct Batch {
-    /// How many scenes.
+    /// Number of scenes.
     pub len: usize,
     /// `[len, N, N, N]`.
     pub volumes: Vec<f32>,
     pub targets: Targets,
-    /// What the teacher says, if there is one.
+    /// The teacher's outputs; empty without a teacher.
     pub answers: Targets,
 }
 
@@ -48,8 +48,8 @@ impl Batch {
         let mut volumes = vec![0.0; examples.len() * n.pow(3)];
         let (mut targets, mut answers) = (Targets::default(), Targets::default());
         for (index, (example, out)) in examples.iter().zip(volumes.chunks_exact_mut(n.pow(3))).enumerate() {
-            let &Example { scene, look, transform, voxels } = example;
-            transform.volume(dataset.volume(scene, look), n, out);
+            let &Example { scene, volume, transform, voxels } = example;
+            transform.volume(dataset.volume(scene, volume), n, out);
             for trial in dataset.trials(scene) {
                 targets.push(index, &transform.trial(&trial, n), n, origin, quality);
             }
@@ -61,7 +61,7 @@ impl Batch {
     }
 }
 
-/// Gives `take` the batches of a plan, which are read in the background: the processor computes meanwhile.
+/// Passes the batches of a plan to `take`. A background thread reads them.
 pub(crate) fn read_ahead<R>(
     dataset: &Dataset,
     plan: &[&[Example]],
@@ -74,7 +74,7 @@ pub(crate) fn read_ahead<R>(
         let (sender, batches) = mpsc::sync_channel(AHEAD);
         scope.spawn(move || {
             for examples in plan {
-                // Nobody takes it when training was stopped.
+                // Sending fails when training was stopped.
                 if sender.send(Batch::read(dataset, examples, origin, quality, teacher.as_deref_mut())).is_err() {
                     break;
                 }

@@ -1,4 +1,4 @@
-//! The ranges of a network's activations, observed on real volumes.
+//! Ranges of a network's activations, measured on volumes.
 
 use std::collections::HashMap;
 
@@ -9,8 +9,8 @@ use grasp_models::{Range, quantized_activations};
 use grasp_train::{Execution, Executor};
 use tch::{Device, Tensor, no_grad};
 
-/// The range of each activation that 8 bits must hold: the mean, over the volumes, of its least and its greatest value.
-/// The range over all volumes would be that of the strangest one, and coarser for every other.
+/// The range of each activation for 8 bits: the means over the volumes of its smallest and its greatest value. The
+/// range over all volumes would be dominated by outliers and coarser for the other volumes.
 pub(crate) fn ranges(
     model: &ModelProto,
     data: &Dataset,

@@ -1,7 +1,7 @@
-//! Where a training run stands, so that it can go on as if it had not been interrupted.
+//! The state of a training run, from which it continues as if it had not been interrupted.
 //!
-//! To the last bit that holds on the CPU with the same number of threads: with another, and on a GPU at all, libtorch adds
-//! in another order, and what it computes differs in the last digits.
+//! On the CPU with the same number of threads the result is bit-identical. With another number of threads, or on a GPU,
+//! libtorch adds in another order and the results differ in the last digits.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -16,18 +16,17 @@ use crate::average::Average;
 use crate::execute::{Executor, tensor_of, values_of};
 use crate::loss::Sums;
 
-/// The file beside the network: what a network does not hold. Shuffling and augmentation are functions of the seed and
-/// the epoch, so no generator has to be kept.
+/// The state of a run that the network's file does not contain. Shuffling and augmentation are functions of the seed
+/// and the epoch, so that no state of a random generator is needed.
 #[derive(Clone, PartialEq, Message)]
 pub struct Checkpoint {
-    /// The settings it was started with, as JSON, and what tells its data from others: another run must not go on from
-    /// here.
+    /// The settings of the run as JSON, and a fingerprint of its data. Only a run with the same value can be resumed.
     #[prost(string, tag = "1")]
     pub settings: String,
     /// Epochs completed.
     #[prost(uint64, tag = "2")]
     pub epoch: u64,
-    /// Batches done of the epoch after those.
+    /// Completed batches of the current epoch.
     #[prost(uint64, tag = "3")]
     pub batch: u64,
     /// Their losses, in the order of [`Sums`].
@@ -36,28 +35,27 @@ pub struct Checkpoint {
     /// Adam's steps.
     #[prost(uint64, tag = "5")]
     pub steps: u64,
-    /// The least so far of what decides which weights are the best: the loss on the scenes held out, or the failures in a
-    /// simulator.
+    /// Smallest cost so far, by which the best weights are chosen: the validation loss, or the failures in simulation.
     #[prost(double, optional, tag = "6")]
     pub best: Option<f64>,
-    /// The weights; those in the network's file may be the best instead of the last.
+    /// The last weights. The network's file may contain the best instead.
     #[prost(message, repeated, tag = "7")]
     pub weights: Vec<TensorProto>,
-    /// Adam's moments: first and second of each weight in turn.
+    /// Adam's moments: first and second of each weight, alternating.
     #[prost(message, repeated, tag = "8")]
     pub moments: Vec<TensorProto>,
-    /// How many scenes of each folder the run has come to know: folders may have grown since.
+    /// Number of scenes of each folder that the run uses. The folders may have grown since.
     #[prost(uint64, repeated, tag = "9")]
     pub scenes: Vec<u64>,
     /// The moving average of the weights, if there is one.
     #[prost(message, repeated, tag = "10")]
     pub average: Vec<TensorProto>,
-    /// How often in a row it was not better than the best.
+    /// Consecutive results that were not better than the best.
     #[prost(uint64, tag = "11")]
     pub worse: u64,
 }
 
-/// Why a run cannot go on from a checkpoint.
+/// Why a run cannot be resumed from a checkpoint.
 #[derive(Debug, Error)]
 pub enum CheckpointError {
     /// The file cannot be read or written.
@@ -65,32 +63,35 @@ pub enum CheckpointError {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the file system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// The file is no checkpoint.
-    #[error("{}: not a checkpoint, or cut short: {reason}; start without --resume", path.display())]
+    /// The file is not a checkpoint.
+    #[error("{}: not a checkpoint, or truncated: {reason}; start without --resume", path.display())]
     Decode {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The decoder's error.
         reason: String,
     },
-    /// It belongs to a run with other settings or data.
-    #[error("the checkpoint was made with {theirs}, this run is {ours}; give the same options and data, or start anew")]
+    /// The checkpoint belongs to a run with other settings or data.
+    #[error(
+        "the checkpoint was made with {theirs}, this run has {ours}; give the same options and data, or start without \
+         --resume"
+    )]
     Settings {
         /// The checkpoint's.
         theirs: String,
         /// This run's.
         ours: String,
     },
-    /// It does not hold the losses of the epoch it was made in.
-    #[error("the checkpoint holds {0} sums of losses, it must hold 7: it is another version's; start without --resume")]
+    /// The sums of the losses are incomplete.
+    #[error("the checkpoint has {0} sums of losses, must have 8: it is of another version; start without --resume")]
     Sums(usize),
-    /// Its weights are not those of this network.
-    #[error("the checkpoint is of another network: {0}")]
+    /// The weights are not those of this network.
+    #[error("the checkpoint is of another network: {0}; start without --resume")]
     Weights(String),
-    /// Its weights cannot be read.
+    /// The weights cannot be read.
     #[error(transparent)]
     Tensor(#[from] TensorError),
 }
@@ -106,10 +107,10 @@ impl Checkpoint {
             .map_err(|error| CheckpointError::Decode { path: path.to_owned(), reason: error.to_string() })
     }
 
-    /// Writes it in place of the old one, at once.
+    /// Replaces the file atomically.
     ///
     /// # Errors
-    /// [`CheckpointError`] when the file system refuses.
+    /// [`CheckpointError`] when the file cannot be written.
     pub fn write(&self, path: &Path) -> Result<(), CheckpointError> {
         let part = path.with_extension("state.part");
         fs::write(&part, self.encode_to_vec())
@@ -117,7 +118,7 @@ impl Checkpoint {
             .map_err(|source| CheckpointError::Io { path: path.to_owned(), source })
     }
 
-    /// Stores the weights and the optimiser's state.
+    /// Stores the weights and the state of the optimizer.
     pub(crate) fn keep(&mut self, executor: &Executor, adam: &Adam, average: Option<&Average>) {
         let store = |name: &str, tensor: &Tensor| TensorProto::from_f32(name, &tensor.size(), &values_of(tensor));
         self.weights = executor.parameters().iter().map(|(name, weight)| store(name, weight)).collect();
@@ -126,7 +127,7 @@ impl Checkpoint {
         self.steps = adam.steps;
     }
 
-    /// Puts them back.
+    /// Restores the weights and the state of the optimizer.
     pub(crate) fn restore(
         &self,
         executor: &Executor,
@@ -135,12 +136,12 @@ impl Checkpoint {
     ) -> Result<(), CheckpointError> {
         let parameters = executor.parameters();
         if self.weights.len() != parameters.len() || self.moments.len() != 2 * parameters.len() {
-            let reason = format!("it has {} weights, the network {}", self.weights.len(), parameters.len());
+            let reason = format!("it has {} weights, the network has {}", self.weights.len(), parameters.len());
             return Err(CheckpointError::Weights(reason));
         }
         for (stored, (name, weight)) in self.weights.iter().zip(parameters) {
             if stored.name() != name {
-                return Err(CheckpointError::Weights(format!("`{}` in place of `{name}`", stored.name())));
+                return Err(CheckpointError::Weights(format!("weight `{}` instead of `{name}`", stored.name())));
             }
             copy(stored, weight)?;
         }
@@ -149,7 +150,7 @@ impl Checkpoint {
         }
         let averages = average.map_or(0, |average| average.weights.len());
         if self.average.len() != averages {
-            let reason = format!("it has averages of {} weights, the run {averages}", self.average.len());
+            let reason = format!("it has {} averaged weights, the run has {averages}", self.average.len());
             return Err(CheckpointError::Weights(reason));
         }
         for (stored, weight) in self.average.iter().zip(average.iter().flat_map(|average| &average.weights)) {
@@ -162,7 +163,7 @@ impl Checkpoint {
 
 fn copy(stored: &TensorProto, tensor: &Tensor) -> Result<(), CheckpointError> {
     if stored.dims != tensor.size() {
-        let reason = format!("`{}` is {:?}, not {:?}", stored.name(), stored.dims, tensor.size());
+        let reason = format!("`{}` has shape {:?}, must be {:?}", stored.name(), stored.dims, tensor.size());
         return Err(CheckpointError::Weights(reason));
     }
     let values = tensor_of(stored)?;
@@ -171,13 +172,13 @@ fn copy(stored: &TensorProto, tensor: &Tensor) -> Result<(), CheckpointError> {
 }
 
 impl Sums {
-    /// As a list, for a checkpoint.
+    /// The sums as a list, for a checkpoint.
     pub(crate) fn to_list(self) -> Vec<f64> {
         let Self { voxels, quality, rotation, width, angle, true_positives, false_positives, false_negatives } = self;
         vec![voxels, quality, rotation, width, angle, true_positives, false_positives, false_negatives]
     }
 
-    /// From such a list; none if it is of another length.
+    /// The inverse of [`to_list`](Self::to_list); `None` if the length is wrong.
     pub(crate) fn from_list(list: &[f64]) -> Option<Self> {
         let &[voxels, quality, rotation, width, angle, true_positives, false_positives, false_negatives] = list else {
             return None;

@@ -8,16 +8,15 @@ use tch::{Device, Kind, Tensor, no_grad};
 
 use crate::{Adam, Examples, ExecuteError, Execution, Executor};
 
-/// Trains the classifier of grasp candidates: cross-entropy in which failures and successes weigh the same, however
-/// many there are of each, and Adam.
+/// Trains the classifier of grasp candidates with Adam and class-balanced cross-entropy.
 pub struct Learner<'a> {
     executor: Executor,
     adam: Adam,
     examples: &'a Examples,
-    /// What it learns from; the order is drawn anew each epoch.
-    learnt: Vec<i64>,
+    /// Indices of the training candidates, shuffled in each epoch.
+    training: Vec<i64>,
     held_out: Vec<i64>,
-    /// By class.
+    /// Weights of the classes.
     weight: Tensor,
     settings: ClassifierSettings,
     rng: ChaCha8Rng,
@@ -26,28 +25,28 @@ pub struct Learner<'a> {
 /// How a classifier is trained.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ClassifierSettings {
-    /// Candidates in a step.
+    /// Candidates per step.
     pub batch: usize,
     /// Adam's learning rate.
     pub learning_rate: f64,
-    /// Share of the scenes that are held out.
+    /// Share of the scenes used for validation.
     pub validation: f64,
-    /// Decides the order in which candidates are seen.
+    /// Seed of the order of the candidates.
     pub seed: u64,
-    /// Convolutions and matrix products in bf16.
+    /// Computes convolutions and matrix products in bf16.
     pub bf16: bool,
 }
 
-/// How a classifier does on some candidates.
+/// Metrics of a classifier.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Tally {
-    /// Mean loss, the classes weighing the same.
+    /// Mean class-balanced loss.
     pub loss: f64,
-    /// Share of the candidates that are classified rightly.
+    /// Share of correctly classified candidates.
     pub accuracy: f64,
-    /// Share of successes among those taken for successes.
+    /// Share of successes among the predicted successes.
     pub precision: f64,
-    /// Share of the successes that are taken for such.
+    /// Share of the successes that are predicted.
     pub recall: f64,
 }
 
@@ -60,34 +59,34 @@ impl<'a> Learner<'a> {
         let ClassifierSettings { validation, seed, bf16, .. } = settings;
         let execution = Execution { device: Device::cuda_if_available(), bf16, channels_last: false };
         let executor = Executor::new(model, execution)?;
-        let (learnt, held_out) = examples.split(validation);
-        let weight = examples.classes(&learnt).map(|count| learnt.len() as f32 / (2.0 * count.max(1) as f32));
+        let (training, held_out) = examples.split(validation);
+        let weight = examples.classes(&training).map(|count| training.len() as f32 / (2.0 * count.max(1) as f32));
         let weight = Tensor::from_slice(&weight).to_device(executor.device());
         let adam = Adam::new(executor.parameters(), 0.0);
         let rng = ChaCha8Rng::seed_from_u64(seed);
-        Ok(Self { executor, adam, examples, learnt, held_out, weight, settings, rng })
+        Ok(Self { executor, adam, examples, training, held_out, weight, settings, rng })
     }
 
-    /// How many candidates it learns from, and how many are held out.
+    /// Number of training and validation candidates.
     #[must_use]
     pub fn candidates(&self) -> (usize, usize) {
-        (self.learnt.len(), self.held_out.len())
+        (self.training.len(), self.held_out.len())
     }
 
     /// Steps in an epoch.
     #[must_use]
     pub fn steps_per_epoch(&self) -> u64 {
-        self.learnt.len().div_ceil(self.settings.batch) as u64
+        self.training.len().div_ceil(self.settings.batch) as u64
     }
 
-    /// Learns from every candidate once; `progress` is called after each step. How it did while it learnt.
+    /// Trains on every candidate once and returns the metrics during training. `progress` is called after each step.
     ///
     /// # Errors
     /// [`ExecuteError`] names the node at which it failed.
     pub fn epoch(&mut self, mut progress: impl FnMut()) -> Result<Tally, ExecuteError> {
-        self.learnt.shuffle(&mut self.rng);
+        self.training.shuffle(&mut self.rng);
         let mut counts = Counts::default();
-        for indices in self.learnt.chunks(self.settings.batch) {
+        for indices in self.training.chunks(self.settings.batch) {
             let loss = counts.add(&self.executor, self.examples, &self.weight, indices)?;
             loss.backward();
             self.adam.step(self.executor.parameters(), self.settings.learning_rate);
@@ -96,7 +95,7 @@ impl<'a> Learner<'a> {
         Ok(counts.tally())
     }
 
-    /// How it does on what is held out; `None` if nothing is.
+    /// The metrics on the validation candidates; `None` if there are none.
     ///
     /// # Errors
     /// [`ExecuteError`] names the node at which it failed.
@@ -108,24 +107,24 @@ impl<'a> Learner<'a> {
         Ok((!self.held_out.is_empty()).then(|| counts.tally()))
     }
 
-    /// The model with the weights as they are now.
+    /// The model with the current weights.
     #[must_use]
     pub fn model(&self) -> ModelProto {
         self.executor.to_model()
     }
 }
 
-/// Candidates by what they were taken for and what they are.
+/// Confusion matrix and loss.
 #[derive(Default)]
 struct Counts {
-    /// `[taken for a success][is one]`.
+    /// `[predicted success][success]`.
     candidates: [[f64; 2]; 2],
     loss: f64,
     weight: f64,
 }
 
 impl Counts {
-    /// Classifies some candidates, counts them, and returns the mean loss, under autograd.
+    /// Classifies candidates, counts them and returns the mean loss with its gradient graph.
     fn add(
         &mut self,
         executor: &Executor,
@@ -140,10 +139,10 @@ impl Counts {
         let batch_weight = weight.index_select(0, &classes).sum(Kind::Double).double_value(&[]);
         self.loss += loss.double_value(&[]) * batch_weight;
         self.weight += batch_weight;
-        let taken = scores.argmax(1, false);
-        for [taken_for, is] in [[0, 0], [0, 1], [1, 0], [1, 1]] {
-            let both = taken.eq(taken_for).logical_and(&classes.eq(is));
-            self.candidates[taken_for as usize][is as usize] += both.sum(Kind::Double).double_value(&[]);
+        let predictions = scores.argmax(1, false);
+        for [predicted, actual] in [[0, 0], [0, 1], [1, 0], [1, 1]] {
+            let both = predictions.eq(predicted).logical_and(&classes.eq(actual));
+            self.candidates[predicted as usize][actual as usize] += both.sum(Kind::Double).double_value(&[]);
         }
         Ok(loss)
     }

@@ -12,37 +12,37 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use time::OffsetDateTime;
 
-/// Prints one JSON object an epoch. The model of the smallest validation loss is kept, or the last without validation.
+/// Prints one JSON object per epoch. Keeps the model with the smallest validation loss, or the last without validation.
 #[derive(Args)]
 pub(crate) struct Classify {
     /// Files of `grasp-sim candidates`; several are mixed.
     #[arg(long, required = true, num_args = 1..)]
     data: Vec<PathBuf>,
-    /// The classifier to write.
+    /// Output file of the classifier.
     #[arg(long)]
     out: PathBuf,
-    /// Times every candidate is seen.
+    /// Number of epochs.
     #[arg(long, default_value_t = 10)]
     epochs: u64,
-    /// Candidates in a step.
+    /// Candidates per step.
     #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u16).range(1..))]
     batch: u16,
     /// Adam's learning rate.
     #[arg(long, default_value_t = 1e-3)]
     lr: f64,
-    /// Share of the scenes that are held out to validate on.
+    /// Share of the scenes used for validation.
     #[arg(long, default_value_t = 0.1)]
     val: f64,
-    /// Decides the random weights and the order of the candidates.
+    /// Seed of the random weights and the order of the candidates.
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Compute convolutions and matrix products in bf16.
     #[arg(long)]
     bf16: bool,
-    /// The classifier's version in its metadata.
+    /// Version of the classifier in its metadata.
     #[arg(long, default_value = "1")]
     model_version: String,
-    /// Threads libtorch computes with [default: all].
+    /// Threads of libtorch [default: all cores].
     #[arg(long)]
     threads: Option<usize>,
 }
@@ -56,12 +56,11 @@ struct Record {
 }
 
 impl Classify {
-    /// Trains as told.
     pub fn run(&self) -> Result<()> {
         if let Some(threads) = self.threads {
-            tch::set_num_threads(i32::try_from(threads).context("--threads")?);
+            tch::set_num_threads(i32::try_from(threads).context("--threads is too large")?);
         }
-        ensure!((0.0..1.0).contains(&self.val), "--val is {}, must be at least 0 and below 1", self.val);
+        ensure!((0.0..1.0).contains(&self.val), "--val is {}, must be at least 0 and less than 1", self.val);
         if let Some(folder) = self.out.parent() {
             fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
         }
@@ -74,9 +73,12 @@ impl Classify {
             bf16: self.bf16,
         };
         let mut learner = Learner::new(gpd(self.seed), &examples, settings)?;
-        let (learnt, held_out) = learner.candidates();
-        ensure!(learnt > 0, "--val is {}, which leaves no scene to learn from", self.val);
-        eprintln!("{learnt} candidates to learn from, {held_out} held out, {} successes", examples.successes());
+        let (training, held_out) = learner.candidates();
+        ensure!(training > 0, "--val is {}, which leaves no scene for training; use a smaller share", self.val);
+        eprintln!(
+            "{training} training candidates, {held_out} validation candidates, {} successes",
+            examples.successes()
+        );
 
         let mut best = f64::INFINITY;
         for epoch in 1..=self.epochs {
@@ -100,7 +102,7 @@ impl Classify {
         Ok(ProgressBar::new(steps).with_style(style).with_prefix(prefix))
     }
 
-    /// Writes the classifier with a note of where its weights come from.
+    /// Writes the classifier with the origin of its weights.
     fn write(&self, learner: &Learner, examples: &Examples, record: &Record) -> Result<()> {
         let name = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let mut provenance = BTreeMap::new();

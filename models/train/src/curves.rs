@@ -1,4 +1,4 @@
-//! The course of a run as a picture.
+//! Learning curves of a run as a picture.
 
 use std::ops::Range;
 use std::path::Path;
@@ -13,7 +13,7 @@ use crate::record::{Record, Validation};
 
 const SIZE: (u32, u32) = (1500, 420);
 
-/// What a curve shows: its name and the value of an epoch.
+/// A curve: its name and its value for an epoch.
 type Curve<'a> = (&'a str, Box<dyn Fn(&Record) -> Option<f64>>);
 
 /// Draws losses and validation scores over the epochs.
@@ -35,7 +35,7 @@ pub fn draw(path: &Path, records: &[Record]) -> anyhow::Result<()> {
         [("training", Box::new(|record| Some(record.loss))), ("validation", Box::new(held_out(|v| Some(v.loss))))];
     let highest =
         records.iter().flat_map(|r| [Some(r.loss), r.validation.map(|v| v.loss)]).flatten().fold(0.0, f64::max);
-    panel(&left, "loss of a labelled voxel", 0.0..highest * 1.05, &losses, records)?;
+    panel(&left, "mean loss of labelled voxels", 0.0..highest * 1.05, &losses, records)?;
     let scores: [Curve; 3] = [
         ("accuracy", Box::new(held_out(|v| Some(v.accuracy)))),
         ("precision", Box::new(held_out(|v| v.precision))),

@@ -1,4 +1,4 @@
-//! Trying a network where it will be used, by another program: this crate knows no physics.
+//! Evaluation of a network by another program, such as the benchmark in simulation.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -6,15 +6,15 @@ use std::process::{Command, Stdio};
 use anyhow::{Context, Result, bail, ensure};
 use grasp_train::Success;
 
-/// What stands for the network's file in the command.
+/// Placeholder of the network's file in the command.
 pub(crate) const PLACE: &str = "{}";
 
-/// Runs `command` on a network. Every line that it prints must be an object with `gsr` and `dr`, as `grasp-sim bench`
-/// prints; the result is their mean.
+/// Runs `command` on a network. Every line of its output must be a JSON object with `gsr` and `dr`, as of
+/// `grasp-sim bench`. Returns their mean.
 pub(crate) fn evaluate(command: &str, network: &Path) -> Result<Success> {
     let quoted = format!("'{}'", network.display().to_string().replace('\'', "'\\''"));
     let command = command.replace(PLACE, &quoted);
-    // Its errors are for who watches the training.
+    // Errors of the command appear in the output of the training.
     let run = Command::new("sh").args(["-c", &command]).stderr(Stdio::inherit()).output();
     let output = run.with_context(|| format!("--evaluate `{command}`"))?;
     ensure!(output.status.success(), "--evaluate `{command}` failed: {}", output.status);
@@ -23,10 +23,10 @@ pub(crate) fn evaluate(command: &str, network: &Path) -> Result<Success> {
     for line in text.lines().filter(|line| !line.trim().is_empty()) {
         match serde_json::from_str::<Success>(line) {
             Ok(Success { gsr, dr }) if gsr.is_finite() && dr.is_finite() => all.push([gsr, dr]),
-            _ => bail!("--evaluate `{command}` printed `{line}`, which is no object with `gsr` and `dr`"),
+            _ => bail!("--evaluate `{command}` printed `{line}`, must print JSON objects with `gsr` and `dr`"),
         }
     }
-    ensure!(!all.is_empty(), "--evaluate `{command}` printed nothing");
+    ensure!(!all.is_empty(), "--evaluate `{command}` printed nothing, must print JSON objects with `gsr` and `dr`");
     let mean = |index: usize| all.iter().map(|figures| figures[index]).sum::<f64>() / all.len() as f64;
     Ok(Success { gsr: mean(0), dr: mean(1) })
 }
@@ -36,7 +36,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_printed_is_averaged() {
+    fn printed_results_are_averaged() {
         let command = r#"test -e {} && echo '{"gsr":0.5,"dr":0.25,"more":1}' && echo '{"gsr":1,"dr":0.75}'"#;
         let folder = tempfile::tempdir().unwrap();
         let network = folder.path().join("it's a network.onnx");
@@ -45,7 +45,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_used_is_said() {
+    fn unusable_output_is_an_error() {
         let refused = |command: &str| evaluate(command, Path::new("network.onnx")).unwrap_err().to_string();
         assert!(refused("false").contains("failed"));
         assert!(refused("true").contains("printed nothing"));

@@ -5,13 +5,13 @@ use grasp_data::{Candidates, DataError};
 use sha2::{Digest, Sha256};
 use tch::{Kind, Tensor};
 
-/// Tried grasp candidates, all in memory.
+/// Labelled grasp candidates, all in memory.
 pub struct Examples {
     /// u8 `[n, CHANNELS, IMAGE_SIZE, IMAGE_SIZE]`, 255 for 1.
     images: Tensor,
-    /// Whether each succeeded.
+    /// Whether each candidate succeeded.
     labels: Vec<bool>,
-    /// The file and the scene of each.
+    /// File index and scene number of each candidate.
     scenes: Vec<(usize, u64)>,
 }
 
@@ -32,26 +32,26 @@ impl Examples {
         Ok(Self { images: Tensor::cat(&images, 0), labels, scenes })
     }
 
-    /// How many there are.
+    /// Number of candidates.
     #[must_use]
     pub fn len(&self) -> usize {
         self.labels.len()
     }
 
-    /// Never: a file without candidates is refused.
+    /// Always false: files without candidates are errors.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.labels.is_empty()
     }
 
-    /// How many of them succeeded.
+    /// Number of successes.
     #[must_use]
     pub fn successes(&self) -> usize {
         self.labels.iter().filter(|&&label| label).count()
     }
 
-    /// Which ones to learn from and which are held out: all candidates of about `fraction` of the scenes, chosen by a
-    /// hash of the scene's file and number.
+    /// Indices of the training and the validation candidates. Validation has all candidates of about `fraction` of the
+    /// scenes, chosen by a hash of the scene's file and number.
     #[must_use]
     pub fn split(&self, fraction: f64) -> (Vec<i64>, Vec<i64>) {
         (0..self.len() as i64).partition(|&index| {
@@ -62,14 +62,14 @@ impl Examples {
         })
     }
 
-    /// Some images, f32 in [0, 1], and their classes: 1 for a success.
+    /// Images, f32 in [0, 1], and their classes: 1 for a success.
     pub(crate) fn batch(&self, indices: &[i64]) -> (Tensor, Tensor) {
         let images = self.images.index_select(0, &Tensor::from_slice(indices)).to_kind(Kind::Float) / 255.0;
         let labels: Vec<i64> = indices.iter().map(|&index| i64::from(self.labels[index as usize])).collect();
         (images, Tensor::from_slice(&labels))
     }
 
-    /// How many of these failed, and how many succeeded.
+    /// Number of failures and of successes among these candidates.
     pub(crate) fn classes(&self, indices: &[i64]) -> [usize; 2] {
         let successes = indices.iter().filter(|&&index| self.labels[index as usize]).count();
         [indices.len() - successes, successes]

@@ -1,9 +1,9 @@
-//! Executes an ONNX graph with libtorch, under autograd.
+//! Executes an ONNX graph with libtorch and autograd.
 //!
-//! What is trained is what is served: each node becomes the libtorch operation of the same meaning, each weight a tensor
-//! that learns. Weights are the floating-point initialisers, except numbers (rank 0) and those that say how an operator
-//! works, such as the bounds of a `Clip`. Only what grasp networks use is here, and anything else is refused when the
-//! graph is loaded, by its name: an operator or a setting that was skipped would train another network.
+//! Training runs the graph that is served: each node becomes the equivalent libtorch operation, each weight a trainable
+//! tensor. Weights are the floating-point initializers, except scalars (rank 0) and parameters of an operator, such as
+//! the bounds of a `Clip`. Only the operators of grasp networks are implemented. Other operators and attributes are an
+//! error when the graph is loaded, because ignoring them would train a different network.
 
 use std::collections::{HashMap, HashSet};
 use std::ops::RangeInclusive;
@@ -16,81 +16,81 @@ use thiserror::Error;
 use crate::heads::{cubes, heads};
 use crate::operators::{Step, check, supported};
 
-/// The versions of ONNX's operators that are understood. `Split`, `Softmax` and others meant something else before, or
-/// took as settings what are inputs now; later ones were never tried.
+/// Supported versions of ONNX's operator set. In earlier ones `Split`, `Softmax` and others have another meaning or
+/// have attributes instead of inputs. Later ones are untested.
 const OPSETS: RangeInclusive<i64> = 13..=20;
 
 /// Why a graph cannot be executed.
 #[derive(Debug, Error)]
 pub enum ExecuteError {
-    /// The file holds no graph.
-    #[error("the model holds no graph")]
+    /// The file has no graph.
+    #[error("the model has no graph; export it again")]
     NoGraph,
-    /// The model is written in operators of another version.
+    /// The model has an unsupported opset.
     #[error(
-        "the model is of opset {0}, it must be from {first} to {last} to be trained; export it again with one of these",
+        "the model has opset {0}, training needs an opset from {first} to {last}; export it again with one of these",
         first = OPSETS.start(),
         last = OPSETS.end()
     )]
     Opset(i64),
     /// The operator is not implemented.
-    #[error("node `{node}`: the operator `{op}` cannot be trained; there are {}", supported())]
+    #[error("node `{node}`: the operator `{op}` cannot be trained; supported: {}", supported())]
     Operator {
         /// The node.
         node: String,
         /// Its operator.
         op: String,
     },
-    /// A setting of an operator is not implemented.
+    /// An attribute of an operator is not supported.
     #[error("node `{node}` ({op}): {what} is not supported")]
     Setting {
         /// The node.
         node: String,
         /// Its operator.
         op: String,
-        /// The setting.
+        /// The attribute.
         what: String,
     },
-    /// A node reads what no node before it computed.
-    #[error("node `{node}` ({op}): `{value}` is not computed before it")]
+    /// A node reads a value that no earlier node computes.
+    #[error("node `{node}` ({op}): no earlier node computes its input `{value}`")]
     Missing {
         /// The node.
         node: String,
         /// Its operator.
         op: String,
-        /// What it reads.
+        /// The missing value.
         value: String,
     },
-    /// libtorch refused.
+    /// libtorch failed.
     #[error("node `{node}` ({op}): {source}")]
     Torch {
         /// The node.
         node: String,
         /// Its operator.
         op: String,
-        /// What it said.
+        /// libtorch's error.
         source: TchError,
     },
-    /// The graph does not compute this.
-    #[error("the graph computes no `{0}`")]
+    /// The graph has no such value.
+    #[error("the graph does not compute `{0}`")]
     Output(String),
-    /// The voxels asked for are not in the batch.
-    #[error("these voxels cannot be taken from the maps: {0}")]
+    /// The requested voxels are not in the batch.
+    #[error("the voxels cannot be selected from the maps: {0}")]
     Cells(TchError),
-    /// An initialiser's values cannot be used.
+    /// The values of an initializer cannot be used.
     #[error(transparent)]
     Tensor(#[from] TensorError),
 }
 
-/// How the graph is executed. None of it changes the mathematics; bf16 changes the precision.
+/// How the graph is executed. Only bf16 changes the numerical results, by its precision.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Execution {
-    /// Where.
+    /// Device.
     pub device: Device,
-    /// Convolutions and matrix products in bfloat16, and what follows them as far as it does no harm (as in PyTorch's
-    /// autocast); weights, sums, softmax, layer norms and outputs in f32.
+    /// Convolutions, matrix products and uncritical operators after them in bfloat16, as in PyTorch's autocast.
+    /// Weights, sums, softmax, layer norms and outputs are f32.
     pub bf16: bool,
-    /// The channels of a voxel next to each other in memory.
+    /// Memory layout with the channels of a voxel adjacent.
     pub channels_last: bool,
 }
 
@@ -98,16 +98,16 @@ pub struct Execution {
 pub struct Executor {
     model: ModelProto,
     execution: Execution,
-    /// The weights, in the order of the initialisers.
+    /// The weights, in the order of the initializers.
     parameters: Vec<(String, Tensor)>,
     constants: HashMap<String, Tensor>,
-    /// The nodes from which on single voxels can be computed.
+    /// Convolutions after which the graph is pointwise.
     heads: HashSet<usize>,
-    /// Convolutions that are computed before the voxels they read are repeated, with the node that would repeat them.
+    /// Convolutions that are computed on their input before upsampling, with the upsampling node.
     upsampled: HashMap<usize, usize>,
 }
 
-/// What a grasp network computes, f32: over a batch of volumes, or at single voxels, which are then volumes of 1³.
+/// The outputs of a grasp network, f32: for a batch of volumes, or at single voxels, which are volumes of 1³.
 pub struct Outputs {
     /// `[batch, 1, N, N, N]`, in [0, 1].
     pub quality: Tensor,
@@ -118,7 +118,7 @@ pub struct Outputs {
 }
 
 impl Outputs {
-    /// Those of so many volumes, or voxels, from the one numbered `first`.
+    /// The outputs of `count` volumes or voxels, from index `first`.
     pub(crate) fn narrow(&self, first: usize, count: usize) -> Self {
         let part = |map: &Tensor| map.narrow(0, first as i64, count as i64);
         Self { quality: part(&self.quality), rotation: part(&self.rotation), width: part(&self.width) }
@@ -126,7 +126,7 @@ impl Outputs {
 }
 
 impl Executor {
-    /// Takes over a model, its weights as f32: checks that every node can be executed and makes its weights trainable.
+    /// Checks that every node of a model is supported and makes its weights trainable, as f32.
     ///
     /// # Errors
     /// [`ExecuteError`] names the node that cannot be executed, or the opset.
@@ -134,7 +134,7 @@ impl Executor {
         let model = with_full_weights(&model)?;
         let graph = model.graph.as_ref().ok_or(ExecuteError::NoGraph)?;
         let standard = model.opset_import.iter().find(|opset| matches!(opset.domain(), "" | "ai.onnx"));
-        // A file that does not say is of the first.
+        // ONNX: a missing version means 1.
         let opset = standard.map_or(1, OperatorSetIdProto::version);
         if !OPSETS.contains(&opset) {
             return Err(ExecuteError::Opset(opset));
@@ -163,24 +163,24 @@ impl Executor {
         Ok(Self { model, execution, parameters, constants, heads, upsampled })
     }
 
-    /// Computes every value that the graph names, at the graph's own cost.
+    /// Disables optimizations, so that every value of the graph is computed.
     #[must_use]
     pub fn as_written(self) -> Self {
         Self { upsampled: HashMap::new(), ..self }
     }
 
-    /// The weights, by the names of their initialisers.
+    /// The weights with the names of their initializers.
     pub fn parameters(&self) -> &[(String, Tensor)] {
         &self.parameters
     }
 
-    /// Where it is executed.
+    /// The device.
     #[must_use]
     pub fn device(&self) -> Device {
         self.execution.device
     }
 
-    /// The model with the weights as they are now.
+    /// The model with the current weights.
     #[must_use]
     pub fn to_model(&self) -> ModelProto {
         let mut model = self.model.clone();
@@ -205,22 +205,22 @@ impl Executor {
     /// Runs any graph with one input, and returns one of its outputs in f32.
     ///
     /// # Errors
-    /// [`ExecuteError`] names the node at which it failed, or the output that there is not.
+    /// [`ExecuteError`] names the node that failed, or the missing output.
     pub fn output(&self, input: &Tensor, name: &str) -> Result<Tensor, ExecuteError> {
         take(&mut self.execute(input, None)?, name)
     }
 
-    /// Runs any graph with one input, and returns values inside it by their names, in f32.
+    /// Runs any graph with one input, and returns intermediate values by name, in f32.
     ///
     /// # Errors
-    /// [`ExecuteError`] names the node at which it failed, or the value that there is not.
+    /// [`ExecuteError`] names the node that failed, or the missing value.
     pub fn inside(&self, input: &Tensor, names: &[String]) -> Result<Vec<Tensor>, ExecuteError> {
         let values = self.execute(input, None)?;
         let value = |name: &String| values.get(name).map(|value| value.to_kind(Kind::Float));
         names.iter().map(|name| value(name).ok_or_else(|| ExecuteError::Output(name.clone()))).collect()
     }
 
-    /// Runs the network as far as some voxels need it, which are given as flat indices into `[batch, N, N, N]`.
+    /// Runs the network with the heads only at some voxels, given as flat indices into `[batch, N, N, N]`.
     ///
     /// # Errors
     /// [`ExecuteError`] names the node at which it failed.
@@ -243,7 +243,7 @@ impl Executor {
         Ok(Outputs { quality: quality?, rotation: rotation?, width: width? })
     }
 
-    /// The value of every node, computed in order; the heads at `cells` alone, if any are given.
+    /// Computes the values of all nodes in order; the heads only at `cells`, if given.
     fn execute(&self, input: &Tensor, cells: Option<&[i64]>) -> Result<HashMap<String, Tensor>, ExecuteError> {
         let graph = self.model.graph.as_ref().ok_or(ExecuteError::NoGraph)?;
         let mut values: HashMap<String, Tensor> = HashMap::with_capacity(graph.node.len());
@@ -253,7 +253,7 @@ impl Executor {
         for (name, tensor) in self.constants.iter().chain(self.parameters.iter().map(|(name, weight)| (name, weight))) {
             values.insert(name.clone(), tensor.shallow_clone());
         }
-        // The heads at single voxels read them in the large array.
+        // Heads at single voxels need their input after upsampling.
         let is_at_cells = |index: &usize| cells.is_some() && self.heads.contains(index);
         let upsampled: HashMap<usize, &NodeProto> = self
             .upsampled
@@ -290,13 +290,13 @@ impl Executor {
     }
 }
 
-/// An output among the values, in f32.
+/// Removes an output from the values and returns it in f32.
 fn take(values: &mut HashMap<String, Tensor>, name: &str) -> Result<Tensor, ExecuteError> {
     values.remove(name).map(|value| value.to_kind(Kind::Float)).ok_or_else(|| ExecuteError::Output(name.to_owned()))
 }
 
 impl Execution {
-    /// A weight as it should lie in memory; the numbers stay the same.
+    /// The weight in the memory layout of this execution.
     pub fn arrange(self, weight: &Tensor) -> Tensor {
         if self.channels_last && weight.dim() == 5 {
             weight.permute([0, 2, 3, 4, 1]).contiguous().permute([0, 4, 1, 2, 3])
@@ -306,7 +306,7 @@ impl Execution {
     }
 }
 
-/// A tensor's numbers, row-major.
+/// The values of a tensor, row-major.
 pub(crate) fn values_of(tensor: &Tensor) -> Vec<f32> {
     let tensor = no_grad(|| tensor.to_device(Device::Cpu).contiguous());
     let mut values = vec![0.0; tensor.numel()];
@@ -321,13 +321,13 @@ pub(crate) fn tensor_of(tensor: &TensorProto) -> Result<Tensor, TensorError> {
     Ok(flat.reshape(&tensor.dims))
 }
 
-/// A tensor that does not learn. Whole numbers are shapes and sizes, which are read on the CPU.
+/// A constant tensor. Integers are shapes and sizes, which are read on the CPU.
 fn constant(tensor: &TensorProto, device: Device) -> Result<Tensor, TensorError> {
     let device = if tensor.is_float() { device } else { Device::Cpu };
     Ok(tensor_of(tensor)?.to_device(device))
 }
 
-/// The inputs of a node that say how it works, rather than being worked on: a network must not learn them.
+/// The inputs of a node that are parameters of its operator, which must not be trained.
 fn settings_of(node: &NodeProto) -> &[String] {
     match node.op_type() {
         "Clip" | "Resize" => node.input.get(1..).unwrap_or_default(),

@@ -1,4 +1,4 @@
-//! The command `export`: a network in another precision, checked against the first in ONNX Runtime.
+//! The command `export`: converts a network to another precision and compares both in ONNX Runtime.
 
 use std::path::PathBuf;
 
@@ -15,32 +15,32 @@ use serde::Serialize;
 
 use crate::calibrate::ranges;
 
-/// Prints one JSON object: the bytes of both files, and with --data how far each output moved.
+/// Prints one JSON object: the sizes of both files, and with --data the differences of the outputs.
 #[derive(Args)]
 pub(crate) struct Export {
-    /// The network to start from.
+    /// Input network.
     #[arg(long)]
     from: PathBuf,
-    /// How its weights are stored. fp32 and fp16 compute in f32, fp16 is half the file; int8 also computes in 8 bits,
-    /// calibrated on volumes of --data.
+    /// Format of the weights. fp32 and fp16 compute in f32, and fp16 halves the file. int8 also computes in 8 bits and
+    /// is calibrated on volumes of --data.
     #[arg(long, value_enum)]
     precision: Precision,
-    /// Let the network look at each volume from four sides, turned by 90° each, and average: four times the work, for
-    /// grasps that turn exactly with the volume. For networks that regress axes.
+    /// Rotation averaging: average the network over the four quarter rotations of its volume, for four times the
+    /// computation. The network must regress axes.
     #[arg(long)]
     average_rotations: bool,
     #[arg(long, hide = true, num_args = 0..=1, default_missing_value = "", value_parser = refuse_turns)]
     turns: Option<String>,
-    /// The file to write. Its stem becomes the model's name.
+    /// Output file. Its stem is the model's name.
     #[arg(long)]
     out: PathBuf,
-    /// Folders of volumes to compare both on, and to calibrate on.
+    /// Data set folders for comparison and calibration.
     #[arg(long, num_args = 1..)]
     data: Vec<PathBuf>,
-    /// On so many volumes, from all over the data.
+    /// Number of volumes for the comparison, evenly spaced over the data.
     #[arg(long, default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..))]
     volumes: u64,
-    /// Calibrated on so many volumes, from all over the data.
+    /// Number of volumes for the calibration, evenly spaced over the data.
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
     calibrate: u64,
 }
@@ -66,14 +66,14 @@ impl Precision {
     }
 }
 
-/// How far an output moved, over all voxels and volumes.
+/// Absolute difference of an output, over all voxels and volumes.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 struct Moved {
     largest: f64,
     mean: f64,
 }
 
-/// What is printed.
+/// The printed report.
 #[derive(Serialize)]
 struct Report {
     from_bytes: u64,
@@ -91,9 +91,8 @@ struct Compared {
 }
 
 impl Export {
-    /// Writes the file, and compares.
     pub fn run(&self) -> Result<()> {
-        ensure!(self.from != self.out, "--from and --out are the same file");
+        ensure!(self.from != self.out, "--from and --out are the same file; use another --out");
         let model = ModelProto::read(&self.from)?;
         let data = if self.data.is_empty() { None } else { Some(Dataset::open(&self.data)?) };
         let exported = self.exported(&model, data.as_ref()).with_context(|| self.from.display().to_string())?;
@@ -107,11 +106,11 @@ impl Export {
 
     fn exported(&self, model: &ModelProto, data: Option<&Dataset>) -> Result<ModelProto> {
         let model = with_full_weights(model)?;
-        // What the average adds is not executed in libtorch, where int8 is calibrated.
+        // Averaging comes after the calibration for int8, because libtorch does not execute the nodes it adds.
         let model = match (self.precision, data) {
             (Precision::Fp32 | Precision::Fp16, _) => model,
             (Precision::Int8, Some(data)) => self.quantized(&model, data)?,
-            (Precision::Int8, None) => bail!("int8 is calibrated on volumes: name folders of them with --data"),
+            (Precision::Int8, None) => bail!("--precision int8 needs volumes for calibration; add --data"),
         };
         let model = if self.average_rotations { averaged_over_rotations(&model)? } else { model };
         let mut model = if self.precision == Precision::Fp16 { with_half_weights(&model)? } else { model };
@@ -151,7 +150,7 @@ impl Export {
 }
 
 impl Compared {
-    /// Adds one of the volumes.
+    /// Adds the differences of one volume.
     fn add(&mut self, before: &Maps, after: &Maps) {
         let share = 1.0 / self.volumes as f64;
         for (moved, before, after) in [

@@ -1,17 +1,17 @@
-//! Which part of a graph can be computed at single voxels.
+//! Finds the part of a graph that can be computed at single voxels.
 //!
-//! Only labelled voxels, a few dozen of 64,000, enter the loss. Behind its last convolutions, the heads, a grasp network
-//! treats every voxel on its own, so while training the heads are computed where there are labels: the same numbers for
-//! a small part of the work, which for VGN is most of a step.
+//! Only labelled voxels, a few dozen of 64,000, enter the loss. After its last convolutions, the heads, a grasp network
+//! is pointwise. Therefore training computes the heads only at labelled voxels. The result is the same. For VGN the
+//! heads at all voxels would take most of the time of a step.
 
 use std::collections::HashSet;
 
 use grasp_models::onnx::{GraphProto, NodeProto};
 use tch::{Kind, TchError, Tensor};
 
-/// Indices of the convolutions from which on every voxel is on its own; none if the graph is not of that kind.
+/// Indices of the convolutions after which the graph is pointwise; empty if the graph has no such structure.
 pub(crate) fn heads(graph: &GraphProto) -> HashSet<usize> {
-    // From the outputs backwards: values of which a node needs more than the voxel it computes.
+    // Backwards from the outputs: values that a node reads at more voxels than the one it computes.
     let mut whole: HashSet<&str> = HashSet::new();
     let (mut heads, mut behind) = (HashSet::new(), HashSet::new());
     for (index, node) in graph.node.iter().enumerate().rev() {
@@ -25,7 +25,7 @@ pub(crate) fn heads(graph: &GraphProto) -> HashSet<usize> {
         }
         whole.extend(node.input.iter().map(String::as_str));
     }
-    // Whatever lies behind the heads, and every output, must come from them alone, or from constants.
+    // All nodes after the heads, and all outputs, must depend only on the heads and on constants.
     let mut known: HashSet<&str> = graph.initializer.iter().map(|tensor| tensor.name()).collect();
     for (index, node) in graph.node.iter().enumerate() {
         let fits = !behind.contains(&index) || node.input.iter().all(|input| known.contains(input.as_str()));
@@ -41,7 +41,7 @@ fn ints<'a>(node: &'a NodeProto, name: &str) -> &'a [i64] {
     node.attribute(name).map_or(&[], |attribute| &attribute.ints)
 }
 
-/// The whole numbers that the graph holds under a name.
+/// The integers of a constant of the graph.
 fn constant(graph: &GraphProto, name: &str) -> Option<Vec<i64>> {
     let initializer = || graph.initializer.iter().find(|tensor| tensor.name() == name);
     let node = graph.node.iter().find(|node| node.op_type() == "Constant" && node.output.iter().any(|o| o == name));
@@ -49,7 +49,7 @@ fn constant(graph: &GraphProto, name: &str) -> Option<Vec<i64>> {
     value.to_i64().ok()
 }
 
-/// A convolution that gives a voxel from the cube around it.
+/// Whether the node is a size-preserving convolution with stride 1.
 fn is_head(node: &NodeProto) -> bool {
     let kernel = ints(node, "kernel_shape");
     node.op_type() == "Conv"
@@ -60,7 +60,7 @@ fn is_head(node: &NodeProto) -> bool {
         && node.attribute("group").is_none_or(|group| group.i() == 1)
 }
 
-/// An operation that treats every voxel on its own.
+/// Whether the node computes each voxel independently.
 fn is_pointwise(graph: &GraphProto, node: &NodeProto) -> bool {
     match node.op_type() {
         "Add" | "Clip" | "Div" | "Expand" | "LeakyRelu" | "Mul" | "Relu" | "Shape" | "Sigmoid" | "Sub" => true,
@@ -73,7 +73,7 @@ fn is_pointwise(graph: &GraphProto, node: &NodeProto) -> bool {
     }
 }
 
-/// The cubes of `edge`³ voxels around some voxels of `x` `[batch, channels, N, N, N]`, zeros beyond its faces:
+/// The cubes of `edge`³ voxels around some voxels of `x` `[batch, channels, N, N, N]`, padded with zeros:
 /// `[voxels, edge³ · channels]`, channels fastest. `cells` are flat indices into `[batch, N, N, N]`.
 pub(crate) fn cubes(x: &Tensor, cells: &[i64], edge: i64) -> Result<Tensor, TchError> {
     let (_, channels, depth, height, width) = x.size5()?;

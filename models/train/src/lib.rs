@@ -1,9 +1,9 @@
 //! Training of grasp networks.
 //!
-//! A [`Trainer`] takes scenes out of a [`Dataset`](grasp_data::Dataset), [changes](Augmentation) them, and runs them through an
-//! [`Executor`]: the ONNX graph that is served, in libtorch and under autograd. [`Targets::loss`] is what [`Adam`]
-//! minimises, and a [`Teacher`] answers where nothing was tried; a [`Checkpoint`] is where a run stands. A [`Learner`]
-//! trains the classifier of grasp candidates on [`Examples`].
+//! A [`Trainer`] reads scenes of a [`Dataset`](grasp_data::Dataset), [augments](Augmentation) them and runs them
+//! through an [`Executor`]: the ONNX graph that is served, in libtorch with autograd. [`Adam`] minimises
+//! [`Targets::loss`]. A [`Teacher`] adds targets at voxels without labels. A [`Checkpoint`] stores the state of a run.
+//! A [`Learner`] trains the classifier of grasp candidates on [`Examples`].
 
 mod adam;
 mod augment;

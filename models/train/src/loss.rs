@@ -1,5 +1,5 @@
-//! What is minimised (the paper, section "Training"; the weight of the width and the handling of the gripper's symmetry
-//! are those of VGN's code, which the paper builds on).
+//! The training loss (the paper, section "Training"; the weight of the width and the symmetry of the gripper are those
+//! of VGN's code, on which the paper builds).
 
 use grasp::VoxelOrigin;
 use grasp_data::{TURNS, Trial};
@@ -10,35 +10,35 @@ use thiserror::Error;
 use crate::execute::Outputs;
 use crate::settings::Quality;
 
-/// Weight of the width's squared error, voxels², against the other two parts. The paper's equation leaves it out.
+/// Weight of the width's squared error, voxels², relative to the other two parts. The paper's equation omits it.
 const WIDTH_WEIGHT: f64 = 0.01;
 
 /// The labelled voxels of a batch.
 #[derive(Debug, Default)]
 pub struct Targets {
-    /// Which voxel: flat index into `[batch, N, N, N]`.
+    /// Flat index into `[batch, N, N, N]`.
     cells: Vec<i64>,
-    /// 1 for a success, 0 for a failure; a network's answer lies between.
+    /// 1 for a success, 0 for a failure; the quality for a teacher's output.
     labels: Vec<f32>,
-    /// What the quality should be: the label, or the share of the tries that held.
+    /// Target of the quality: the label, or the success rate of the repetitions.
     qualities: Vec<f32>,
-    /// The rotations that hold, each also turned by 180° about its z: x y z w; where there are fewer, the first again.
+    /// The valid rotations x y z w, each also rotated by 180° about its z; padded with the first.
     rotations: Vec<[[[f32; 4]; 2]; TURNS]>,
-    /// Voxels.
+    /// Widths, voxels.
     widths: Vec<f32>,
 }
 
-/// What each part of the loss counts for.
+/// Weights of the parts of the loss.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weights {
-    /// Voxels that failed, and voxels that succeeded.
+    /// Weights of failures and of successes.
     pub classes: [f64; 2],
-    /// The rotation's part of a success.
+    /// Weight of the rotation.
     pub rotation: f64,
 }
 
 impl Default for Weights {
-    /// As in the paper: everything counts the same.
+    /// All weights are 1, as in the paper.
     fn default() -> Self {
         Self { classes: [1.0; 2], rotation: 1.0 }
     }
@@ -48,22 +48,22 @@ impl Default for Weights {
 pub struct Loss {
     /// The mean over the labelled voxels, to be minimised.
     pub mean: Tensor,
-    /// What the mean is made of.
+    /// Sums of its parts.
     pub sums: Sums,
 }
 
-/// Sums over labelled voxels; the means of several batches are those of their sums.
+/// Sums over labelled voxels, which can be added over batches.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Sums {
     /// Labelled voxels.
     pub voxels: f64,
     /// Binary cross-entropy of the quality.
     pub quality: f64,
-    /// Weighted 1 − |r·r*| to the nearest rotation that holds, successes only.
+    /// Weighted 1 − |r·r*| to the nearest valid rotation, successes only.
     pub rotation: f64,
     /// Weighted squared error of the width, successes only.
     pub width: f64,
-    /// The angle to the nearest rotation that holds, degrees, successes only.
+    /// Angle to the nearest valid rotation, degrees, successes only.
     pub angle: f64,
     /// Successes with a quality above 0.5.
     pub true_positives: f64,
@@ -73,19 +73,19 @@ pub struct Sums {
     pub false_negatives: f64,
 }
 
-/// Why there is no loss.
+/// Why the loss cannot be computed.
 #[derive(Debug, Error)]
 pub enum LossError {
-    /// The network has lost its way.
+    /// The network's quality is NaN: the training has diverged.
     #[error("the network's quality is not a number")]
     NotANumber,
-    /// libtorch refused, because the outputs are of other voxels.
+    /// libtorch failed, because the outputs are of other voxels.
     #[error(transparent)]
     Torch(#[from] TchError),
 }
 
 impl Targets {
-    /// Adds a grasp in the volume number `index` of the batch; without effect when it lies outside the volume.
+    /// Adds a grasp in volume number `index` of the batch. A grasp outside the volume is ignored.
     pub fn push(&mut self, index: usize, trial: &Trial, n: usize, origin: VoxelOrigin, quality: Quality) {
         let Some(cell) = voxel_of(trial, n, origin) else { return };
         self.cells.push((index * n.pow(3) + cell) as i64);
@@ -98,7 +98,7 @@ impl Targets {
         self.widths.push(trial.width as f32);
     }
 
-    /// Adds what a network answers at a voxel: a quality in [0, 1], a quaternion x y z w, a width in voxels.
+    /// Adds a teacher's output at a voxel: a quality in [0, 1], a quaternion x y z w, a width in voxels.
     pub(crate) fn push_answer(&mut self, cell: usize, quality: f32, rotation: [f32; 4], width: f32) {
         self.cells.push(cell as i64);
         self.labels.push(quality);
@@ -107,30 +107,30 @@ impl Targets {
         self.widths.push(width);
     }
 
-    /// How many voxels are labelled.
+    /// Number of labelled voxels.
     #[must_use]
     pub fn len(&self) -> usize {
         self.cells.len()
     }
 
-    /// Which: flat indices into `[batch, N, N, N]`.
+    /// The labelled voxels: flat indices into `[batch, N, N, N]`.
     #[must_use]
     pub fn cells(&self) -> &[i64] {
         &self.cells
     }
 
-    /// Whether none is.
+    /// Whether there is no labelled voxel.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.cells.is_empty()
     }
 
     /// The loss of a network's outputs at [these voxels](Self::cells): L = c·(BCE(q, q*) + s·(ρ·(1 − max |r·r*|) +
-    /// 0.01·(w − w*)²)), averaged over them, with s 1 for a success and 0 for a failure, c the weight of that class and ρ
-    /// that of the rotation. In the paper q* is s; see [`Quality`] for the other choice.
+    /// 0.01·(w − w*)²)), averaged over them. s is 1 for a success and 0 for a failure, c the weight of the class and ρ
+    /// that of the rotation. In the paper q* is s; see [`Quality`] for the alternative.
     ///
     /// # Errors
-    /// [`LossError`] when the outputs are not numbers, or of other voxels.
+    /// [`LossError`] when outputs are NaN or of other voxels.
     pub fn loss(&self, outputs: &Outputs, weights: &Weights) -> Result<Loss, LossError> {
         let device = outputs.quality.device();
         let labels = Tensor::f_from_slice(&self.labels)?.to_device(device);
@@ -174,12 +174,12 @@ impl Targets {
     }
 }
 
-/// A rotation x y z w, and the same turned by 180° about its own z, q · (0, 0, 1, 0): a hand has no front.
+/// A rotation x y z w, and the same rotated by 180° about its own z, q · (0, 0, 1, 0): the hand is symmetric.
 fn both_ways([x, y, z, w]: [f32; 4]) -> [[f32; 4]; 2] {
     [[x, y, z, w], [y, -x, w, -z]]
 }
 
-/// The voxel that stands for a grasp there: the nearest index (VGN), or the voxel it lies in.
+/// The voxel of a grasp: the nearest index (VGN), or the voxel that contains it.
 fn voxel_of(trial: &Trial, n: usize, origin: VoxelOrigin) -> Option<usize> {
     let index = match origin {
         VoxelOrigin::Corner => trial.position.coords.map(f64::round),
@@ -190,7 +190,7 @@ fn voxel_of(trial: &Trial, n: usize, origin: VoxelOrigin) -> Option<usize> {
 }
 
 impl Sums {
-    /// Adds those of another batch.
+    /// Adds the sums of another batch.
     pub fn add(&mut self, other: &Self) {
         self.voxels += other.voxels;
         self.quality += other.quality;
@@ -208,13 +208,13 @@ impl Sums {
         (self.quality + self.rotation + self.width) / self.voxels
     }
 
-    /// Mean angle of a success to the nearest rotation that holds, degrees.
+    /// Mean angle of the successes to the nearest valid rotation, degrees.
     #[must_use]
     pub fn angle(&self) -> f64 {
         self.angle / (self.true_positives + self.false_negatives)
     }
 
-    /// Share of the voxels on the right side of 0.5.
+    /// Share of correctly classified voxels, with a threshold of 0.5.
     #[must_use]
     pub fn accuracy(&self) -> f64 {
         1.0 - (self.false_positives + self.false_negatives) / self.voxels

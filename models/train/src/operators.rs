@@ -1,4 +1,4 @@
-//! What each operator of ONNX is in libtorch.
+//! ONNX operators in libtorch.
 
 use grasp_models::onnx::{AttributeProto, NodeProto};
 use grasp_models::upsampled_taps;
@@ -7,7 +7,7 @@ use tch::{Device, Kind, TchError, Tensor};
 use crate::execute::{ExecuteError, Execution, values_of};
 use crate::heads::cubes;
 
-/// An operator as ONNX names it, with the settings of it that are understood.
+/// Supported operators with their supported attributes.
 const OPERATORS: &[(&str, &[&str])] = &[
     ("Add", &[]),
     ("Clip", &[]),
@@ -38,25 +38,25 @@ const OPERATORS: &[(&str, &[&str])] = &[
     ("Transpose", &["perm"]),
 ];
 
-/// The operators there are.
+/// The supported operators, for error messages.
 pub(crate) fn supported() -> String {
     OPERATORS.iter().map(|&(op, _)| op).collect::<Vec<_>>().join(", ")
 }
 
-/// Refuses what would not be understood: an operator or a setting that was skipped would train another network.
+/// Checks that the operator and its attributes are supported. Ignoring one of them would train a different network.
 pub(crate) fn check(node: &NodeProto) -> Result<(), ExecuteError> {
     let (name, op) = (node.name().to_owned(), node.op_type().to_owned());
     let known = OPERATORS.iter().find(|(known, _)| *known == op && node.domain().is_empty());
     let Some((_, settings)) = known else { return Err(ExecuteError::Operator { node: name, op }) };
     match node.attribute.iter().find(|attribute| !settings.contains(&attribute.name())) {
         Some(unknown) => {
-            Err(ExecuteError::Setting { node: name, op, what: format!("the setting `{}`", unknown.name()) })
+            Err(ExecuteError::Setting { node: name, op, what: format!("the attribute `{}`", unknown.name()) })
         }
         None => Ok(()),
     }
 }
 
-/// One node with the values it reads.
+/// One node with its input values.
 pub(crate) struct Step<'a> {
     pub node: &'a NodeProto,
     pub inputs: Vec<Option<&'a Tensor>>,
@@ -64,7 +64,7 @@ pub(crate) struct Step<'a> {
 }
 
 impl Step<'_> {
-    /// What it computes.
+    /// Computes the outputs of the node.
     pub fn run(&self) -> Result<Vec<Tensor>, ExecuteError> {
         let one = |result: Result<Tensor, TchError>| Ok(vec![result.map_err(|source| self.torch(source))?]);
         match self.node.op_type() {
@@ -101,7 +101,7 @@ impl Step<'_> {
                 if slope as f32 == 0.01 {
                     one(x.f_leaky_relu())
                 } else {
-                    // The binding has that slope built in; PReLU is the same function with any, and six times slower.
+                    // The binding supports only the slope 0.01. PReLU supports any slope, but is six times slower.
                     one(x.f_prelu(&Tensor::from(slope).to_kind(x.kind()).to_device(x.device())))
                 }
             }
@@ -109,7 +109,7 @@ impl Step<'_> {
             "MaxPool" => self.max_pool(),
             "Mul" => one(self.input(0)?.f_mul(self.input(1)?)),
             "ReduceL2" => {
-                // A setting until opset 17, an input since.
+                // The axes are an attribute until opset 17 and an input since opset 18.
                 let axes = if self.optional(1).is_some() { self.whole(1)? } else { self.ints("axes", &[]) };
                 if axes.is_empty() && self.int("noop_with_empty_axes", 0) != 0 {
                     return Err(self.setting("`noop_with_empty_axes`".to_owned()));
@@ -139,7 +139,7 @@ impl Step<'_> {
     }
 
     fn convolution(&self, transposed: bool) -> Result<Vec<Tensor>, ExecuteError> {
-        // oneDNN's bf16 gradient of a weight reads memory it never wrote when a volume is narrower than the kernel.
+        // oneDNN's bf16 weight gradient reads uninitialized memory when a volume is narrower than the kernel.
         let narrow =
             self.input(0)?.size().iter().zip(self.input(1)?.size()).skip(2).any(|(size, kernel)| *size < kernel);
         let [x, weight] = if narrow { [self.full(0)?, self.full(1)?] } else { [self.reduced(0)?, self.reduced(1)?] };
@@ -167,8 +167,9 @@ impl Step<'_> {
         Ok(vec![y.map_err(|source| self.torch(source))?])
     }
 
-    /// A convolution of one channel whose windows lie side by side, as a matrix product: oneDNN's convolution of 8³ windows
-    /// was a fifth of the time that the transformer's convolutions took. None if it is another.
+    /// A convolution of one channel with adjacent, non-overlapping windows, computed as a matrix product. oneDNN's
+    /// convolution with 8³ windows took a fifth of the time of the transformer's convolutions. `None` for other
+    /// convolutions.
     fn patches(&self, x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> Option<Result<Tensor, TchError>> {
         let (&[batch, 1, size, height, width], &[channels, 1, edge, ..]) =
             (x.size().as_slice(), weight.size().as_slice())
@@ -190,7 +191,7 @@ impl Step<'_> {
         Some(compute())
     }
 
-    /// A convolution over what is twice as large as its input, of which it is told the small array
+    /// A convolution of the input after upsampling by 2, computed on the input before upsampling
     /// ([`grasp_models::upsampled_convolutions`]).
     pub fn convolution_before_upsampling(&self) -> Result<Tensor, ExecuteError> {
         let (x, weight) = (self.reduced(0)?, self.input(1)?);
@@ -198,7 +199,7 @@ impl Step<'_> {
             let (channels, inputs, kernel, ..) = weight.size5()?;
             let (taps, small) = upsampled_taps(kernel as usize);
             let small = small as i64;
-            // [2 · small, kernel]: which taps of the large kernel each tap of the small one is the sum of, per parity.
+            // [2 · small, kernel]: for each parity, the taps of the large kernel that a tap of the small one sums.
             let sums = Tensor::f_zeros([2 * small, kernel], (Kind::Float, weight.device()))?;
             for (parity, taps) in (0..).zip(&taps) {
                 for (tap, &position) in (0..).zip(taps) {
@@ -240,11 +241,11 @@ impl Step<'_> {
         Ok(vec![y.map_err(|source| self.torch(source))?])
     }
 
-    /// A convolution that keeps the size, at some voxels: `[voxels, channels, 1, 1, 1]`. In f32, there are few of them.
+    /// A size-preserving convolution at some voxels: `[voxels, channels, 1, 1, 1]`. It is computed in f32.
     pub fn convolution_at(&self, cells: &[i64]) -> Result<Tensor, ExecuteError> {
         let (x, weight) = (self.input(0)?, self.input(1)?);
         let edge = weight.size().last().copied().unwrap_or(1);
-        // Channels fastest, as in the cubes.
+        // Channels are the fastest axis, as in `cubes`.
         let compute = || {
             let weight = weight.f_permute([0, 2, 3, 4, 1])?.f_reshape([weight.size()[0], -1])?;
             let y = cubes(x, cells, edge)?.f_linear(&weight, self.optional(2))?;
@@ -253,7 +254,7 @@ impl Step<'_> {
         compute().map_err(|source| self.torch(source))
     }
 
-    /// Repeats voxels: `Resize` as far as it agrees with libtorch's `nearest`.
+    /// Nearest-neighbour upsampling: the modes of `Resize` that libtorch's `nearest` supports.
     fn nearest(&self) -> Result<Result<Tensor, TchError>, ExecuteError> {
         for (name, expected) in
             [("mode", "nearest"), ("coordinate_transformation_mode", "asymmetric"), ("nearest_mode", "floor")]
@@ -274,7 +275,7 @@ impl Step<'_> {
             (None, None) => return Err(self.setting("neither scales nor sizes".to_owned())),
         };
         if x.dim() != 5 || size.len() != 5 || size[..2] != x.size()[..2] {
-            return Err(self.setting(format!("enlarging {:?} to {size:?}", x.size())));
+            return Err(self.setting(format!("resizing {:?} to {size:?}", x.size())));
         }
         Ok(x.f_upsample_nearest3d(&size[2..], None, None, None))
     }
@@ -290,7 +291,7 @@ impl Step<'_> {
         Ok(vec![x])
     }
 
-    /// The target of a `Reshape`, where 0 means the size there is.
+    /// The target shape of a `Reshape`; 0 keeps the size of the input.
     fn new_shape(&self) -> Result<Vec<i64>, ExecuteError> {
         let size = self.input(0)?.size();
         let shape = self.whole(1)?.into_iter().enumerate();
@@ -302,10 +303,10 @@ impl Step<'_> {
     }
 
     fn input(&self, index: usize) -> Result<&Tensor, ExecuteError> {
-        self.optional(index).ok_or_else(|| self.setting(format!("leaving out input {index}")))
+        self.optional(index).ok_or_else(|| self.setting(format!("omitting input {index}")))
     }
 
-    /// An input in f32: where bf16 would cost accuracy.
+    /// An input in f32, for operators that lose accuracy in bf16.
     fn full(&self, index: usize) -> Result<Tensor, ExecuteError> {
         Ok(self.input(index)?.to_kind(Kind::Float))
     }
@@ -316,7 +317,7 @@ impl Step<'_> {
         Ok(self.input(index)?.to_kind(kind))
     }
 
-    /// An input of whole numbers.
+    /// An input of integers.
     fn whole(&self, index: usize) -> Result<Vec<i64>, ExecuteError> {
         let tensor = self.input(index)?;
         Vec::<i64>::try_from(tensor.to_device(Device::Cpu)).map_err(|source| self.torch(source))
@@ -334,7 +335,7 @@ impl Step<'_> {
         self.node.attribute(name).map_or_else(|| default.to_vec(), |attribute| attribute.ints.clone())
     }
 
-    /// An axis, counted from the end when negative.
+    /// An axis; negative values count from the end.
     fn axis(&self, name: &str, default: i64, dims: usize) -> Result<usize, ExecuteError> {
         let axis = self.int(name, default);
         let from_start = if axis < 0 { axis + dims as i64 } else { axis };

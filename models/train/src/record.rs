@@ -2,10 +2,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::loss::Sums;
 
-/// One epoch, as it is logged.
+/// Log record of an epoch.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Record {
-    /// Counted from 1.
+    /// Number of the epoch, from 1.
     pub epoch: u64,
     /// Steps since the start.
     pub steps: u64,
@@ -13,46 +13,46 @@ pub struct Record {
     pub learning_rate: f64,
     /// Mean loss over the labelled voxels.
     pub loss: f64,
-    /// Its parts: cross-entropy of the quality,
+    /// Part of the loss: cross-entropy of the quality.
     pub loss_quality: f64,
-    /// rotation,
+    /// Part of the loss: rotation.
     pub loss_rotation: f64,
-    /// and width.
+    /// Part of the loss: width.
     pub loss_width: f64,
-    /// The same over the scenes held out, if any.
+    /// Results on the validation scenes, if there are any.
     pub validation: Option<Validation>,
-    /// What clearing tables with it came to, if it was tried.
+    /// Results of the benchmark, if it was run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub success: Option<Success>,
-    /// Time this epoch took, without the part before an interruption.
+    /// Duration of the epoch, without the part before an interruption, seconds.
     pub seconds: f64,
-    /// Training speed.
+    /// Training speed, volumes per second.
     pub volumes_per_second: f64,
 }
 
-/// How the network does on scenes it does not learn from.
+/// Results on the validation scenes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Validation {
     /// Mean loss over the labelled voxels.
     pub loss: f64,
-    /// Its parts: cross-entropy of the quality,
+    /// Part of the loss: cross-entropy of the quality.
     pub loss_quality: f64,
-    /// rotation,
+    /// Part of the loss: rotation.
     pub loss_rotation: f64,
-    /// and width.
+    /// Part of the loss: width.
     pub loss_width: f64,
-    /// Mean angle of a success to the nearest rotation that holds, degrees.
+    /// Mean angle of the successes to the nearest valid rotation, degrees.
     #[serde(default)]
     pub angle: Option<f64>,
-    /// Share of voxels on the right side of a quality of 0.5.
+    /// Share of correctly classified voxels, with a threshold of 0.5.
     pub accuracy: f64,
-    /// Share of successes among the voxels above it.
+    /// Share of successes among the voxels above 0.5.
     pub precision: Option<f64>,
-    /// Share of the successes above it.
+    /// Share of the successes above 0.5.
     pub recall: Option<f64>,
 }
 
-/// How the network does in a simulator: means over all that was played.
+/// Results of a benchmark in simulation, averaged over its conditions.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Success {
     /// Grasp success rate.
@@ -62,7 +62,7 @@ pub struct Success {
 }
 
 impl Validation {
-    /// Of the scenes held out; none if there are none.
+    /// From the sums over the validation scenes; `None` without voxels.
     pub(crate) fn of(sums: &Sums) -> Option<Self> {
         (sums.voxels > 0.0).then(|| Self {
             loss: sums.loss(),

@@ -1,4 +1,4 @@
-//! The command `train`: a run with its files, its progress bar and Ctrl-C.
+//! The command `train`: a run with its files, progress bar and Ctrl-C.
 
 use std::fs;
 use std::io::ErrorKind;
@@ -20,20 +20,23 @@ use crate::device;
 use crate::evaluate::{PLACE, evaluate};
 use crate::{Change, Keep, Origin, Training};
 
-/// Trains as told, until the last epoch or Ctrl-C.
+/// Trains until the last epoch or Ctrl-C.
 pub(crate) fn train(training: &Training) -> Result<()> {
     if let Some(threads) = training.threads {
-        tch::set_num_threads(i32::try_from(threads).context("--threads")?);
+        tch::set_num_threads(i32::try_from(threads).context("--threads is too large")?);
     }
-    ensure!((0.0..1.0).contains(&training.val), "--val is {}, must be at least 0 and below 1", training.val);
+    ensure!((0.0..1.0).contains(&training.val), "--val is {}, must be at least 0 and less than 1", training.val);
     ensure!(training.save_every >= 0.0, "--save-every is {}, must be at least 0 seconds", training.save_every);
     ensure!(training.weight_decay >= 0.0, "--weight-decay is {}, must be at least 0", training.weight_decay);
     ensure!(training.rotation_weight >= 0.0, "--rotation-weight is {}, must be at least 0", training.rotation_weight);
     if let Some(decay) = training.ema {
-        ensure!((0.0..1.0).contains(&decay), "--ema is {decay}, must be at least 0 and below 1");
+        ensure!((0.0..1.0).contains(&decay), "--ema is {decay}, must be at least 0 and less than 1");
     }
     if let Some(command) = &training.evaluate {
-        ensure!(command.contains(PLACE), "--evaluate is `{command}`, in which {PLACE} must stand for the model");
+        ensure!(
+            command.contains(PLACE),
+            "--evaluate is `{command}`, must contain {PLACE} in place of the model's file"
+        );
     }
     let files = Files::beside(&training.out)?;
     let (model, mut metadata) = start_from(training)?;
@@ -41,7 +44,7 @@ pub(crate) fn train(training: &Training) -> Result<()> {
     let dataset = Dataset::open(&training.data)?;
     ensure!(
         dataset.resolution() == metadata.resolution,
-        "the data have {0}³ voxels, the network reads {1}³",
+        "--data has volumes of {0}³ voxels, but the network needs {1}³",
         dataset.resolution(),
         metadata.resolution
     );
@@ -63,16 +66,17 @@ pub(crate) fn train(training: &Training) -> Result<()> {
         records = files.read_log(trainer.epochs())?;
     }
     report(&trainer);
-    eprintln!("computing on {}", device::name(device));
+    eprintln!("device: {}", device::name(device));
 
     let stop = Arc::new(AtomicBool::new(false));
     let signal = Arc::clone(&stop);
-    ctrlc::set_handler(move || signal.store(true, Ordering::Relaxed)).context("cannot listen for Ctrl-C")?;
+    ctrlc::set_handler(move || signal.store(true, Ordering::Relaxed))
+        .context("cannot install the handler of Ctrl-C")?;
 
     let mut saved = Instant::now();
-    let goes_on =
+    let continues =
         |epochs: u64, worse: u64| epochs < settings.epochs && training.patience.is_none_or(|patience| worse < patience);
-    while goes_on(trainer.epochs(), progress.worse) {
+    while continues(trainer.epochs(), progress.worse) {
         if training.follow && trainer.follow()? > 0 {
             report(&trainer);
         }
@@ -98,7 +102,7 @@ pub(crate) fn train(training: &Training) -> Result<()> {
             curves::draw(&files.curves, &records)?;
         }
         let Progress { best, worse } = progress;
-        let ends = interrupted || !goes_on(trainer.epochs(), worse);
+        let ends = interrupted || !continues(trainer.epochs(), worse);
         let due = ends || saved.elapsed().as_secs_f64() >= training.save_every;
         if better || training.keep == Keep::Last && due {
             describe(training, &settings, trainer.dataset(), &mut metadata);
@@ -109,27 +113,27 @@ pub(crate) fn train(training: &Training) -> Result<()> {
             saved = Instant::now();
         }
         if interrupted {
-            eprintln!("stopped after step {}; go on with --resume", trainer.steps());
+            eprintln!("stopped after step {}; continue with --resume", trainer.steps());
             return Ok(());
         }
     }
     Ok(())
 }
 
-/// How good it has been.
+/// The best result so far.
 #[derive(Clone, Copy, Default)]
 struct Progress {
-    /// The least so far of what is to be small.
+    /// Smallest cost.
     best: Option<f64>,
-    /// How often in a row it was not less since.
+    /// Consecutive epochs without a smaller cost.
     worse: u64,
 }
 
 impl Progress {
-    /// Whether this epoch is the best so far; if nothing can be said of it, whether there is none before it.
+    /// Adds an epoch and returns whether it is the best so far. Without a cost it is the best if no epoch had one.
     fn take(&mut self, training: &Training, record: &Record) -> bool {
         let cost = match (&training.evaluate, record.success) {
-            // Failures of grasps and objects left on the table weigh the same.
+            // Failed grasps and objects left on the table have the same weight.
             (Some(_), success) => success.map(|Success { gsr, dr }| 1.0 - (gsr + dr) / 2.0),
             (None, _) => record.validation.map(|validation| validation.loss),
         };
@@ -141,16 +145,16 @@ impl Progress {
 }
 
 fn report(trainer: &Trainer) {
-    let (learnt, held_out) = trainer.scenes();
+    let (training, held_out) = trainer.scenes();
     let (grasps, successes) = all_grasps(trainer.dataset());
-    eprintln!("{learnt} scenes to learn from, {held_out} held out, {grasps} grasps, {successes} of them successes");
+    eprintln!("{training} training scenes, {held_out} validation scenes, {grasps} grasps, {successes} successes");
 }
 
 fn all_grasps(dataset: &Dataset) -> (usize, usize) {
     dataset.grasps(&(0..dataset.len()).collect::<Vec<_>>())
 }
 
-/// The network and what it says of itself.
+/// The initial network and its metadata.
 fn start_from(training: &Training) -> Result<(ModelProto, Metadata)> {
     let model = match (&training.from, &training.network) {
         (Some(path), _) => ModelProto::read(path)?,
@@ -174,29 +178,29 @@ fn start_from(training: &Training) -> Result<(ModelProto, Metadata)> {
     Ok((model, metadata))
 }
 
-/// Who teaches, and its name and version. It computes in the thread that reads the scenes.
-fn teacher(training: &Training, path: &Path, pupil: &Metadata) -> Result<(Teacher, String)> {
+/// Loads the teacher; returns it with its name, version and weight. It runs in the thread that reads the scenes.
+fn teacher(training: &Training, path: &Path, student: &Metadata) -> Result<(Teacher, String)> {
     let weight = training.teacher_weight;
     ensure!(weight >= 0.0, "--teacher-weight is {weight}, must be at least 0");
     let network = Network::load(path, &Options::auto(1))?;
     let Metadata { name, version, resolution, voxel_origin, .. } = network.metadata();
     ensure!(
-        *resolution == pupil.resolution,
-        "the teacher reads {resolution}³ voxels, its pupil {0}³",
-        pupil.resolution
+        *resolution == student.resolution,
+        "--teacher needs {resolution}³ voxels, the trained network {0}³; use a teacher of the same resolution",
+        student.resolution
     );
     ensure!(
-        *voxel_origin == pupil.voxel_origin,
-        "the teacher's grasps stand at the {} of their voxels, its pupil's at the {}; give --voxel-origin",
+        *voxel_origin == student.voxel_origin,
+        "the voxel origin of --teacher is {0}, that of the trained network is {1}; give --voxel-origin {0}",
         voxel_origin.name(),
-        pupil.voxel_origin.name()
+        student.voxel_origin.name()
     );
     let name = format!("{name} {version} at {weight}");
     Ok((Teacher::new(network, weight), name))
 }
 
-/// VGN's released code trains with Adam at 3e-4 in batches of 32 for 30 epochs; the paper with 1e-4, 64 and 21. A model
-/// that is fine-tuned notes which it is; one that does not is taken for VGN.
+/// Settings of the run. VGN's released code trains with Adam at 3e-4 in batches of 32 for 30 epochs; the paper with
+/// 1e-4, 64 and 21. For fine-tuning the metadata name the architecture; VGN is the default.
 fn settings(training: &Training, metadata: &Metadata) -> Settings {
     let network = training.network.as_ref().or_else(|| metadata.provenance.get("architecture"));
     let of_paper = network.is_some_and(|network| network.starts_with("transformer"));
@@ -226,7 +230,7 @@ fn settings(training: &Training, metadata: &Metadata) -> Settings {
     }
 }
 
-/// Notes in the metadata where the weights will come from.
+/// Writes the origin of the weights to the metadata.
 fn describe(training: &Training, settings: &Settings, dataset: &Dataset, metadata: &mut Metadata) {
     let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let (grasps, successes) = all_grasps(dataset);
@@ -273,17 +277,17 @@ fn progress_bar(steps: u64, epoch: u64, epochs: u64) -> ProgressBar {
     bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
-/// What is kept beside the model.
+/// The files beside the model.
 struct Files {
     state: PathBuf,
     log: PathBuf,
     curves: PathBuf,
-    /// The model while it is tried.
+    /// The model for --evaluate.
     tried: PathBuf,
 }
 
 impl Files {
-    /// Makes their folder, lest the first epoch be lost for want of it.
+    /// Creates their folder at the start, so that the first epoch is not lost.
     fn beside(model: &Path) -> Result<Self> {
         let folder = model.parent().unwrap_or(Path::new(""));
         fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;

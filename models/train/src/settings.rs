@@ -4,19 +4,19 @@ use serde::Serialize;
 
 use crate::augment::Augmentation;
 
-/// What the quality is learnt from, by binary cross-entropy.
+/// Target of the quality in the binary cross-entropy.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Quality {
-    /// Whether a grasp held: 1 or 0.
+    /// Success of the grasp: 1 or 0.
     #[default]
     Label,
-    /// The share of its tries that held. Where none was tried again, the same as the label.
+    /// Success rate of its repetitions; the label if there are none.
     Share,
 }
 
 impl Quality {
-    /// What the quality of a grasp should be.
+    /// The target of a grasp.
     #[must_use]
     pub fn of(self, trial: &Trial) -> f32 {
         match self {
@@ -26,47 +26,45 @@ impl Quality {
     }
 }
 
-/// Everything that decides the outcome of a run, besides the network it starts from and the data.
+/// Settings of a run. Together with the initial network and the data they determine its result.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Settings {
-    /// Times every scene is seen.
+    /// Number of epochs.
     pub epochs: u64,
-    /// Scenes in a forward pass.
+    /// Scenes per forward pass.
     pub batch: usize,
-    /// Forward passes in a step.
+    /// Forward passes per step.
     pub accumulate: usize,
     /// Adam's learning rate, after the warm-up.
     pub learning_rate: f64,
-    /// Steps over which the learning rate rises from 0.
+    /// Warm-up steps, in which the learning rate rises linearly from 0.
     pub warmup: u64,
-    /// Whether it then falls to 0 along half a cosine, instead of staying.
+    /// Whether the learning rate falls to 0 along half a cosine after the warm-up; otherwise it is constant.
     pub cosine: bool,
-    /// What is taken off the weights in every step, times the learning rate.
+    /// Decoupled weight decay; multiplied by the learning rate.
     pub weight_decay: f64,
-    /// Share of itself that the moving average of the weights keeps in every step; the average is what is validated and
-    /// written. None: the weights themselves are.
+    /// Decay per step of the moving average of the weights, which is validated and written. `None`: no average.
     pub average: Option<f64>,
-    /// Decides the order of the scenes and how they are changed.
+    /// Seed of the order of the scenes and the augmentation.
     pub seed: u64,
-    /// Share of the scenes that are held out.
+    /// Share of the scenes used for validation.
     pub validation: f64,
-    /// How scenes are changed.
+    /// Data augmentation.
     pub augmentation: Augmentation,
-    /// Whether failures and successes weigh the same, however many there are of each: in the mean as if there were as
-    /// many of both. Otherwise the data decide, which VGN balances beforehand.
+    /// Whether failures and successes have the same total weight in the loss. VGN balances the data instead.
     pub balance: bool,
-    /// What the quality is learnt from. Rotation and width are learnt from every success the same.
+    /// Target of the quality. Rotation and width do not depend on it.
     pub quality: Quality,
-    /// What the rotation's part of the loss counts for.
+    /// Weight of the rotation in the loss.
     pub rotation_weight: f64,
-    /// Where in its voxel a grasp stands, `corner` or `center`.
+    /// Point of a voxel that a grasp refers to, `corner` or `center`.
     #[serde(serialize_with = "origin_name")]
     pub voxel_origin: VoxelOrigin,
     /// Whether convolutions and matrix products are computed in bf16.
     pub bf16: bool,
 }
 
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks for a reference")]
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde requires a reference")]
 fn origin_name<S: serde::Serializer>(origin: &VoxelOrigin, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_str(match origin {
         VoxelOrigin::Corner => "corner",
@@ -75,7 +73,7 @@ fn origin_name<S: serde::Serializer>(origin: &VoxelOrigin, serializer: S) -> Res
 }
 
 impl Settings {
-    /// The learning rate of a step, of which there are so many in an epoch.
+    /// The learning rate of a step.
     #[must_use]
     pub fn learning_rate_at(&self, step: u64, steps_per_epoch: u64) -> f64 {
         let Self { epochs, learning_rate, warmup, cosine, .. } = *self;
@@ -90,8 +88,8 @@ impl Settings {
         learning_rate * 0.5 * (1.0 + (std::f64::consts::PI * progress.min(1.0)).cos())
     }
 
-    /// What must be the same for a run to go on: the settings, the scenes and their grasps. A run at a constant learning
-    /// rate may be made longer.
+    /// A text that must be the same for a run to be resumed: settings, scenes and labels. The number of epochs is
+    /// excluded if the learning rate is constant.
     pub(crate) fn fingerprint(&self, dataset: &Dataset, training: usize, validation: usize) -> String {
         let mut settings = self.clone();
         if !settings.cosine {

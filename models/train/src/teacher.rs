@@ -1,7 +1,7 @@
-//! Learning from a trained network (Hinton et al., "Distilling the Knowledge in a Neural Network").
+//! Distillation of a trained network (Hinton et al., "Distilling the Knowledge in a Neural Network").
 //!
-//! Trials label a few dozen voxels of a scene; a trained network has an answer for every one. Where scenes come turned and
-//! mirrored at random, what is learnt is the mean of its answers, which is better than any single one.
+//! Trials label a few dozen voxels of a scene; a trained network has an output at every voxel. With random rotations
+//! and mirror images the student learns the mean of the teacher's outputs, which is better than a single output.
 
 use grasp::{Volume, VolumeError, WORKSPACE_SIZE};
 use grasp_models::{Metadata, Network, RuntimeError};
@@ -11,48 +11,50 @@ use thiserror::Error;
 
 use crate::loss::Targets;
 
-/// Voxels of a volume that are learnt from, in the mean: others in every step, for the heads cost most of it.
+/// Mean number of voxels of a volume that are used. They are drawn again in every step, because the heads at all voxels
+/// would take most of the time.
 const VOXELS: f64 = 400.0;
 
-/// How likely a voxel is drawn that is no grasp, against a certain one.
+/// Relative probability to draw a voxel with quality 0, against 1 + this for quality 1.
 const FLOOR: f64 = 0.05;
 
-/// Why a teacher has no answer.
+/// Why a teacher failed.
 #[derive(Debug, Error)]
 pub enum TeacherError {
-    /// It cannot be asked.
+    /// The volume is invalid.
     #[error(transparent)]
     Volume(#[from] VolumeError),
-    /// It could not compute.
+    /// The inference failed.
     #[error(transparent)]
     Runtime(#[from] RuntimeError),
 }
 
-/// A trained network that answers where nothing was tried. It is run as it is served.
+/// A trained network whose outputs are targets at voxels without trials. It runs in ONNX Runtime.
 pub struct Teacher {
     network: Network,
     weight: f64,
 }
 
 impl Teacher {
-    /// What the mean loss to a network's answers counts for, against that to the trials.
+    /// `weight` is the weight of the mean loss to the teacher's outputs, relative to that of the trials.
     #[must_use]
     pub fn new(network: Network, weight: f64) -> Self {
         Self { network, weight }
     }
 
-    /// What its answers count for.
+    /// Weight of the teacher's outputs in the loss.
     pub(crate) fn weight(&self) -> f64 {
         self.weight
     }
 
-    /// What must be the same for a run to go on.
+    /// A text that must be the same for a run to be resumed.
     pub(crate) fn fingerprint(&self) -> String {
         let Metadata { name, version, .. } = self.network.metadata();
         format!("taught by {name} {version} ({}) at {}", self.network.backend(), self.weight)
     }
 
-    /// Adds its answers at voxels drawn in front of the surfaces of a volume `[N, N, N]`, the batch's number `index`.
+    /// Adds the teacher's outputs at voxels drawn in front of the surfaces of a volume `[N, N, N]`. `index` is its
+    /// index in the batch.
     pub(crate) fn answer(
         &mut self,
         index: usize,
@@ -60,14 +62,14 @@ impl Teacher {
         rng: &mut impl Rng,
         answers: &mut Targets,
     ) -> Result<(), TeacherError> {
-        // In front of surfaces, where grasps are tried and taken: of the inside of things nobody taught the teacher, and 0
-        // is where nothing was seen, or no surface is near.
+        // Voxels in front of surfaces, where grasps are tried. The teacher was not trained on the inside of objects,
+        // and 0 means unobserved or not near a surface.
         let near = || (0..values.len()).filter(|&cell| values[cell] > 0.5);
         if near().next().is_none() {
             return Ok(());
         }
         let resolution = self.network.metadata().resolution;
-        // How large and where does not matter: a network sees voxels.
+        // Size and pose are arbitrary, because the network's output is in voxels.
         let voxel_size = WORKSPACE_SIZE / resolution as f64;
         let volume = Volume::new(resolution, voxel_size, Isometry3::identity(), values.to_vec())?;
         let output = self.network.infer(&[&volume])?;

@@ -10,31 +10,31 @@ use grasp_train::{Execution, Executor};
 use serde::Serialize;
 use tch::{Device, Kind, Tensor};
 
-/// Volumes before those that are timed.
+/// Volumes before the timed ones.
 const WARM_UP: usize = 3;
 
-/// How long libtorch takes for one volume in fp32, an operator at a time: what PyTorch does in eager mode.
+/// Median latency of libtorch for one volume in fp32, operator by operator, as in PyTorch's eager mode.
 #[derive(Args)]
 pub(crate) struct Time {
-    /// The model.
+    /// Model file.
     #[arg(long)]
     model: PathBuf,
-    /// How many volumes to time.
+    /// Number of timed volumes.
     #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..))]
     calls: u32,
-    /// Threads that libtorch uses.
+    /// Threads of libtorch.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
     threads: u16,
 }
 
-/// What is printed.
+/// The printed report.
 #[derive(Serialize)]
 struct Report {
     calls: u32,
     threads: u16,
-    /// The file's graph.
+    /// Median for the graph of the file.
     p50_ms: f64,
-    /// With a convolution for each of the three heads, as VGN and the paper have it.
+    /// Median with a separate convolution for each of the three heads, as in VGN and the paper.
     published_p50_ms: f64,
 }
 
@@ -42,7 +42,8 @@ impl Time {
     pub fn run(&self) -> Result<()> {
         tch::set_num_threads(self.threads.into());
         let model = ModelProto::read(&self.model)?;
-        let published = with_published_heads(&with_full_weights(&model)?).context("the network was not made here")?;
+        let published =
+            with_published_heads(&with_full_weights(&model)?).context("--model must be a network of `grasp-train`")?;
         let published_p50_ms = self.median(published)?;
         let p50_ms = self.median(model)?;
         let report = Report { calls: self.calls, threads: self.threads, p50_ms, published_p50_ms };
@@ -50,7 +51,7 @@ impl Time {
         Ok(())
     }
 
-    /// Milliseconds.
+    /// Median latency, milliseconds.
     fn median(&self, model: ModelProto) -> Result<f64> {
         let execution = Execution { device: Device::Cpu, bf16: false, channels_last: false };
         let executor = Executor::new(model, execution)?.as_written();

@@ -22,31 +22,31 @@ use crate::teacher::{Teacher, TeacherError};
 /// Why training stopped.
 #[derive(Debug, Error)]
 pub enum TrainError {
-    /// A setting makes no sense with these data.
+    /// The settings do not fit the data.
     #[error("{0}")]
     Settings(String),
-    /// The data have been damaged meanwhile.
+    /// The data cannot be read.
     #[error(transparent)]
     Data(#[from] DataError),
     /// The graph cannot be executed.
     #[error(transparent)]
     Execute(#[from] ExecuteError),
-    /// libtorch refused.
+    /// libtorch failed.
     #[error(transparent)]
     Torch(#[from] TchError),
-    /// The checkpoint cannot be continued.
+    /// The checkpoint cannot be resumed.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// The teacher has no answer.
-    #[error("the teacher: {0}")]
+    /// The teacher failed.
+    #[error("--teacher: {0}")]
     Teacher(#[from] TeacherError),
     /// The loss cannot be computed.
     #[error(transparent)]
     Loss(#[from] LossError),
-    /// The loss is no number any more.
-    #[error("the loss is no number any more at step {step}; use a smaller learning rate or a warm-up")]
+    /// The training diverged.
+    #[error("the loss is not finite at step {step}; use a smaller learning rate or a warm-up")]
     Diverged {
-        /// When.
+        /// Number of the step.
         step: u64,
     },
 }
@@ -56,36 +56,36 @@ pub enum TrainError {
 pub enum Epoch {
     /// Complete.
     Done(Record),
-    /// Stopped after a step; the next call goes on from there.
+    /// Stopped after a step; the next call continues.
     Interrupted,
 }
 
-/// A run: a network, its optimiser, the data, and how far it has come.
+/// A training run: network, optimizer, data and progress.
 pub struct Trainer {
     settings: Settings,
     dataset: Dataset,
     training: Vec<usize>,
     validation: Vec<usize>,
     weights: Weights,
-    /// What must be the same for a run to go on.
+    /// Must be the same for a run to be resumed.
     fingerprint: String,
     executor: Executor,
     teacher: Option<Teacher>,
-    /// What its answers count for.
+    /// Weight of the teacher's outputs in the loss.
     teaching: f64,
     adam: Adam,
     average: Option<Average>,
-    /// Epochs completed, batches done of the next, and their losses.
+    /// Completed epochs, completed batches of the current epoch, and their losses.
     epoch: u64,
     batch: u64,
     sums: Sums,
 }
 
 impl Trainer {
-    /// A run from the beginning.
+    /// A new run.
     ///
     /// # Errors
-    /// [`TrainError`] when the graph cannot be executed, or no scene is left to learn from.
+    /// [`TrainError`] when the graph cannot be executed, or there is no training scene.
     pub fn new(
         model: ModelProto,
         dataset: Dataset,
@@ -111,18 +111,18 @@ impl Trainer {
             batch: 0,
             sums: Sums::default(),
         };
-        trainer.look_over()?;
+        trainer.update_scenes()?;
         Ok(trainer)
     }
 
-    /// The same run, with a network to learn from beside the trials.
+    /// Adds a teacher to the run.
     #[must_use]
     pub fn taught_by(self, teacher: Teacher) -> Self {
         let fingerprint = format!("{}, {}", self.fingerprint, teacher.fingerprint());
         Self { teaching: teacher.weight(), teacher: Some(teacher), fingerprint, ..self }
     }
 
-    /// Takes in what has been added to the data since; says how many scenes. Between two epochs only.
+    /// Reads scenes that were added to the data and returns their number. Has no effect within an epoch.
     ///
     /// # Errors
     /// [`TrainError::Data`] when a file is damaged.
@@ -132,19 +132,20 @@ impl Trainer {
         }
         let added = self.dataset.refresh()?;
         if added > 0 {
-            self.look_over()?;
+            self.update_scenes()?;
         }
         Ok(added)
     }
 
-    /// Everything that depends on the scenes at hand.
-    fn look_over(&mut self) -> Result<(), TrainError> {
+    /// Updates everything that depends on the scenes.
+    fn update_scenes(&mut self) -> Result<(), TrainError> {
         let (training, validation) = self.dataset.split(self.settings.validation);
         let Settings { batch, accumulate, .. } = self.settings;
         if training.is_empty() || batch == 0 || accumulate == 0 {
             let (scenes, held_out) = (self.dataset.len(), validation.len());
             let reason = format!(
-                "nothing to learn from: {scenes} scenes, {held_out} held out, steps of {accumulate} times {batch}"
+                "no training scenes: {scenes} scenes, {held_out} for validation, steps of {accumulate} × {batch}; \
+                 all but validation must be greater than 0"
             );
             return Err(TrainError::Settings(reason));
         }
@@ -164,7 +165,7 @@ impl Trainer {
         &self.dataset
     }
 
-    /// Scenes learnt from and held out.
+    /// Number of training and validation scenes.
     #[must_use]
     pub fn scenes(&self) -> (usize, usize) {
         (self.training.len(), self.validation.len())
@@ -189,13 +190,13 @@ impl Trainer {
         self.training.len().div_ceil(batch).div_ceil(accumulate) as u64
     }
 
-    /// The network as it is now, with the average of the weights if there is one.
+    /// The current network, with the average of the weights if there is one.
     #[must_use]
     pub fn model(&mut self) -> ModelProto {
         self.averaged(|trainer| trainer.executor.to_model())
     }
 
-    /// Works with the average of the weights, if there is one.
+    /// Calls `work` with the average of the weights, if there is one.
     fn averaged<R>(&mut self, work: impl FnOnce(&Self) -> R) -> R {
         if let Some(average) = &mut self.average {
             average.swap(self.executor.parameters());
@@ -207,7 +208,7 @@ impl Trainer {
         result
     }
 
-    /// Where the run stands.
+    /// The state of the run.
     #[must_use]
     pub fn checkpoint(&self) -> Checkpoint {
         let mut checkpoint = Checkpoint {
@@ -222,15 +223,15 @@ impl Trainer {
         checkpoint
     }
 
-    /// Goes on from there.
+    /// Restores the state of a run.
     ///
     /// # Errors
-    /// [`TrainError::Checkpoint`] when it belongs to another run, or lacks something.
+    /// [`TrainError::Checkpoint`] when the checkpoint belongs to another run or is incomplete.
     pub fn resume(&mut self, checkpoint: &Checkpoint) -> Result<(), TrainError> {
         let known: Vec<usize> = checkpoint.scenes.iter().map(|&size| size as usize).collect();
         if known.len() == self.dataset.sizes().len() && known != self.dataset.sizes() {
             self.dataset.limit(&known);
-            self.look_over()?;
+            self.update_scenes()?;
         }
         if checkpoint.settings != self.fingerprint {
             let (theirs, ours) = (checkpoint.settings.clone(), self.fingerprint.clone());
@@ -244,8 +245,8 @@ impl Trainer {
         Ok(())
     }
 
-    /// Trains for the rest of an epoch, unless `stop` is set meanwhile; `report` hears of every step: how many of the
-    /// epoch are done, and its mean loss so far.
+    /// Trains for the rest of an epoch, or until `stop` is set. After every step it calls `report` with the number of
+    /// steps of the epoch and its mean loss.
     ///
     /// # Errors
     /// [`TrainError`] when the network or the loss fails.
@@ -256,7 +257,7 @@ impl Trainer {
         let plan: Vec<&[Example]> = plan.chunks(batch).skip(self.batch as usize).collect();
         let mut volumes = 0;
         let mut learning_rate = 0.0;
-        // Out of the way of what the steps change; back in its place before anything is returned.
+        // Moved out of `self`, because the steps borrow `self` mutably. Restored below.
         let dataset = std::mem::replace(&mut self.dataset, Dataset::none());
         let mut teacher = self.teacher.take();
         let answers = teacher.as_mut();
@@ -298,14 +299,14 @@ impl Trainer {
         }))
     }
 
-    /// One step over so many batches, whose gradients weigh the same; says how many volumes they were.
+    /// One step over `passes` batches, whose gradients are averaged. Returns the number of volumes.
     fn step(
         &mut self,
         batches: impl Iterator<Item = Result<Batch, TeacherError>>,
         passes: usize,
         learning_rate: f64,
     ) -> Result<usize, TrainError> {
-        let (mut volumes, mut learnt) = (0, false);
+        let (mut volumes, mut has_gradient) = (0, false);
         for batch in batches {
             let batch = batch?;
             volumes += batch.len;
@@ -315,9 +316,9 @@ impl Trainer {
             }
             (mean / passes as f64).f_backward()?;
             self.sums.add(&sums);
-            learnt = true;
+            has_gradient = true;
         }
-        if learnt {
+        if has_gradient {
             self.adam.step(self.executor.parameters(), learning_rate);
             if let Some(average) = &mut self.average {
                 average.update(self.executor.parameters(), self.adam.steps());
@@ -326,7 +327,7 @@ impl Trainer {
         Ok(volumes)
     }
 
-    /// The loss over the scenes held out, as they are; none if there are none.
+    /// The results on the validation scenes, without augmentation; `None` if there are none.
     fn validate(&self) -> Result<Option<Validation>, TrainError> {
         let scenes: Vec<_> = self.validation.iter().map(|&scene| Example { scene, ..Example::default() }).collect();
         let Settings { batch, voxel_origin, quality, .. } = self.settings;
@@ -342,28 +343,28 @@ impl Trainer {
         })
     }
 
-    /// The order of an epoch's scenes and how each is changed: a function of the seed and the epoch.
+    /// The order of an epoch's scenes and their augmentation: a function of the seed and the epoch.
     fn plan(&self) -> Vec<Example> {
         let stream = |number| {
             let mut rng = ChaCha8Rng::seed_from_u64(self.settings.seed);
             rng.set_stream(number);
             rng
         };
-        // The teacher has a stream of its own: with and without one, all else is the same.
+        // The teacher's voxels use a separate stream, so that a teacher does not change the rest.
         let (mut rng, mut voxels) = (stream(self.epoch), stream(!self.epoch));
         let mut scenes = self.training.clone();
         scenes.shuffle(&mut rng);
         let mut example = |scene| Example {
             scene,
-            look: rng.random_range(0..self.dataset.volumes(scene)),
+            volume: rng.random_range(0..self.dataset.volumes(scene)),
             transform: self.settings.augmentation.draw(&mut rng),
             voxels: voxels.random(),
         };
         scenes.into_iter().map(&mut example).collect()
     }
 
-    /// One forward pass; none when no grasp of the scenes lies inside its volume. A teacher's answers are part of the
-    /// mean; the sums are of the trials alone.
+    /// One forward pass; `None` if no grasp of the scenes lies inside its volume. The teacher's outputs enter the mean;
+    /// the sums contain only trials.
     fn loss(&self, batch: &Batch) -> Result<Option<Loss>, TrainError> {
         if batch.targets.is_empty() {
             return Ok(None);
@@ -376,7 +377,7 @@ impl Trainer {
         let outputs = self.executor.forward_at(&volumes, &cells)?;
         let Loss { mut mean, sums } = self.checked(batch.targets.loss(&outputs.narrow(0, tried), &self.weights))?;
         if answered > 0 {
-            // A teacher's qualities are balanced as its own training was.
+            // No class weights: the teacher's training has already balanced its qualities.
             let weights = Weights { rotation: self.settings.rotation_weight, ..Weights::default() };
             let answers = self.checked(batch.answers.loss(&outputs.narrow(tried, answered), &weights))?;
             mean += answers.mean * self.teaching;
@@ -396,11 +397,11 @@ impl Trainer {
     }
 }
 
-/// Weights that make both classes count the same: n / (2 n_class).
+/// Class weights that give both classes the same total weight: n / (2 n_class).
 fn class_weights(dataset: &Dataset, scenes: &[usize]) -> Result<[f64; 2], TrainError> {
     let (all, successes) = dataset.grasps(scenes);
     if successes == 0 || successes == all {
-        let reason = format!("the classes cannot be balanced: {successes} of {all} grasps succeeded");
+        let reason = format!("--balance needs successes and failures, but {successes} of {all} grasps succeeded");
         return Err(TrainError::Settings(reason));
     }
     Ok([all - successes, successes].map(|count| all as f64 / (2 * count) as f64))

@@ -1,4 +1,4 @@
-//! libtorch computes what ONNX Runtime computes.
+//! Agreement of libtorch with ONNX Runtime.
 
 use std::path::Path;
 
@@ -88,10 +88,10 @@ fn the_classifier_agrees_with_onnx_runtime() {
     }
 }
 
-/// A model of another origin, such as VGN's released weights, whose three heads are three convolutions.
+/// An external model, such as VGN's released weights, whose three heads are separate convolutions.
 #[test]
-#[ignore = "needs a model from elsewhere: GRASPD_REFERENCE_ONNX names its file"]
-fn a_model_from_elsewhere_agrees_too() {
+#[ignore = "needs an external model: set GRASPD_REFERENCE_ONNX to its file"]
+fn an_external_model_agrees_with_onnx_runtime() {
     let path = std::env::var_os("GRASPD_REFERENCE_ONNX").expect("GRASPD_REFERENCE_ONNX is not set");
     let execution = Execution { device: Device::Cpu, bf16: false, channels_last: false };
     let worst = difference(Path::new(&path), execution);

@@ -1,4 +1,4 @@
-//! Changing scenes together with their grasps.
+//! Augmentation of scenes together with their grasps.
 
 mod support;
 
@@ -22,8 +22,8 @@ fn random_trial(rng: &mut ChaCha8Rng) -> Trial {
     Trial { position, rotation, width: 5.0, success: true, turns, share, clearance }
 }
 
-/// Points that fix a grasp up to its symmetry: the finger base and the two fingertips. One of its own, then one for each
-/// turn that holds, too.
+/// Points that define a grasp up to its symmetry: the finger base and the two fingertips; for the grasp and for each
+/// other valid turn.
 fn points(trial: &Trial) -> Vec<[Point3<f64>; 3]> {
     let hold = |rotation| {
         let pose = Isometry3::from_parts(Translation3::from(trial.position), rotation);
@@ -33,17 +33,17 @@ fn points(trial: &Trial) -> Vec<[Point3<f64>; 3]> {
     trial.rotations().map(hold).collect()
 }
 
-/// Whether two grasps are the same, the fingers in either order.
+/// Whether two grasps are the same, with the fingers in either order.
 fn same([base, left, right]: [Point3<f64>; 3], other: [Point3<f64>; 3]) -> bool {
     let close = |points: [Point3<f64>; 3]| points.iter().zip(&other).all(|(a, b)| (a - b).norm() < 1e-9);
     close([base, left, right]) || close([base, right, left])
 }
 
-/// Where a point of a scene goes when the scene is changed.
+/// A point of a scene after the transform.
 type Move<'a> = &'a dyn Fn(Point3<f64>) -> Point3<f64>;
 
 #[test]
-fn a_changed_label_is_the_label_of_the_changed_scene() {
+fn a_transformed_label_is_the_label_of_the_transformed_scene() {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let edge = N as f64;
     let turned = |p: Point3<f64>| Point3::new(edge - p.y, p.x, p.z);
@@ -59,7 +59,11 @@ fn a_changed_label_is_the_label_of_the_changed_scene() {
         for (transform, expected) in moves {
             let moved: Vec<_> = points(&trial).into_iter().map(|grasp| grasp.map(expected)).collect();
             let changed = transform.trial(&trial, N);
-            assert_eq!((changed.share, changed.clearance), (trial.share, trial.clearance), "room to spare stays");
+            assert_eq!(
+                (changed.share, changed.clearance),
+                (trial.share, trial.clearance),
+                "share and clearance stay the same"
+            );
             let got = points(&changed);
             assert!(same(got[0], moved[0]), "{transform:?}: {:?} instead of {:?}", got[0], moved[0]);
             assert_eq!(got.len(), moved.len());
@@ -70,7 +74,7 @@ fn a_changed_label_is_the_label_of_the_changed_scene() {
 
 #[test]
 fn the_grid_moves_with_the_label() {
-    // One voxel is different; the label stands at its centre, and so it must afterwards.
+    // One voxel differs, with the label at its centre. The transform must preserve this.
     let mut rng = ChaCha8Rng::seed_from_u64(2);
     let all = Augmentation { turns: true, mirror: true, shift: 2 };
     for _ in 0..50 {
@@ -89,7 +93,7 @@ fn the_grid_moves_with_the_label() {
 }
 
 #[test]
-fn four_turns_are_none() {
+fn four_quarter_turns_are_the_identity() {
     let scene = support::scene(3, N);
     let turn = |turns| Transform { turns, ..Transform::default() };
     let mut grid = vec![0.0; N.pow(3)];
@@ -99,13 +103,13 @@ fn four_turns_are_none() {
     let turned = turn(4).trial(trial, N);
     assert!((turned.position - trial.position).norm() < 1e-12);
     assert!(turned.rotation.angle_to(&trial.rotation) < 1e-9);
-    assert!((turn(1).trial(trial, N).position - trial.position).norm() > 1e-3, "one turn is not none");
+    assert!((turn(1).trial(trial, N).position - trial.position).norm() > 1e-3, "one turn is not the identity");
     let twice = turn(1).trial(&turn(1).trial(trial, N), N);
     assert!((twice.position - turn(2).trial(trial, N).position).norm() < 1e-12);
 }
 
 #[test]
-fn every_allowed_change_is_drawn_and_no_other() {
+fn all_allowed_transforms_are_drawn_and_no_others() {
     let mut rng = ChaCha8Rng::seed_from_u64(4);
     let mut draw = |allowed: Augmentation| (0..200).map(|_| allowed.draw(&mut rng)).collect::<Vec<_>>();
     assert!(draw(Augmentation::default()).iter().all(|t| *t == Transform::default()));

@@ -1,4 +1,4 @@
-//! The classifier of grasp candidates, from what `grasp-sim` writes to what its benchmark plans with.
+//! The classifier of grasp candidates, from the data of `grasp-sim` to its use in the benchmark.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -21,7 +21,7 @@ use grasp_sim::score::Summary;
 use grasp_train::{ClassifierSettings, Examples, Learner};
 use nalgebra::{Isometry3, Point3, Vector3};
 
-/// A wall between the fingers: along the approach it is held, across it is not.
+/// A wall between the fingers: along the approach the grasp succeeds, across it fails.
 fn push(number: u64, candidates: &mut Candidates) {
     let success = number.is_multiple_of(3);
     let offset = (number % 7) as f64 * 0.003 - 0.009;
@@ -48,30 +48,30 @@ fn classify(folder: &Path, arguments: &str) -> Output {
 }
 
 #[test]
-fn a_small_set_is_learnt_by_heart() {
+fn a_small_set_is_memorized() {
     let folder = tempfile::tempdir().unwrap();
     let examples = Examples::read(&[examples(folder.path(), 48)]).unwrap();
     assert_eq!((examples.len(), examples.successes()), (48, 16));
     let settings = ClassifierSettings { batch: 16, learning_rate: 1e-3, validation: 0.25, seed: 1, bf16: false };
     let mut learner = Learner::new(gpd(1), &examples, settings).unwrap();
-    let (learnt, held_out) = learner.candidates();
-    assert!(learnt + held_out == 48 && held_out > 0 && held_out % 4 == 0, "whole scenes are held out");
+    let (training, held_out) = learner.candidates();
+    assert!(training + held_out == 48 && held_out > 0 && held_out % 4 == 0, "validation has whole scenes");
     let first = learner.epoch(|| ()).unwrap();
     let last = (0..15).map(|_| learner.epoch(|| ()).unwrap()).last().unwrap();
     assert!(last.loss < 0.1 && last.loss < first.loss / 4.0, "from {} to {}", first.loss, last.loss);
     assert_eq!((last.accuracy, last.precision, last.recall), (1.0, 1.0, 1.0));
-    assert!(learner.validate().unwrap().unwrap().accuracy > 0.9, "the walls of other scenes are no different");
+    assert!(learner.validate().unwrap().unwrap().accuracy > 0.9, "the validation scenes have the same walls");
 }
 
 #[test]
-fn candidates_become_a_classifier_that_plans() {
+fn a_trained_classifier_plans_in_the_benchmark() {
     let folder = tempfile::tempdir().unwrap();
     let config = SceneConfig {
         kind: SceneKind::Packed,
         objects: ObjectSet::procedural(Split::Train),
         points: 10,
         views: Views::Side { azimuth: 0.0 },
-        looks: 1,
+        observations: 1,
         noise: 1.0,
         seed: 1,
     };
@@ -126,7 +126,7 @@ fn the_same_seed_gives_the_same_classifier() {
 }
 
 #[test]
-fn what_cannot_be_learnt_from_is_said() {
+fn errors_name_the_flag_or_the_file() {
     let folder = tempfile::tempdir().unwrap();
     examples(folder.path(), 8);
     fs::write(folder.path().join("text.npz"), "not a zip").unwrap();

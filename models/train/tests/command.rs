@@ -40,7 +40,7 @@ fn said(output: &Output) -> String {
 }
 
 #[test]
-fn a_run_leaves_a_model_that_can_be_served() {
+fn a_run_writes_a_model_that_can_be_served() {
     let folder = prepare();
     let arguments = "--out models/pile.onnx --epochs 2 --val 0.3 --voxel-origin center --model-version 2.0 --seed 3";
     let output = train(folder.path(), arguments);
@@ -62,7 +62,7 @@ fn a_run_leaves_a_model_that_can_be_served() {
         assert_eq!(metadata.provenance.get(key).map(String::as_str), Some(value), "{key}");
     }
     let log = fs::read_to_string(models.join("pile.jsonl")).unwrap();
-    assert_eq!(log, String::from_utf8(output.stdout).unwrap(), "what is logged is printed");
+    assert_eq!(log, String::from_utf8(output.stdout).unwrap(), "the log equals the output");
     let records: Vec<Record> = log.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     assert_eq!(records.iter().map(|record| record.epoch).collect::<Vec<_>>(), [1, 2]);
     assert!(records.iter().all(|record| record.validation.is_some() && record.volumes_per_second > 0.0));
@@ -70,7 +70,7 @@ fn a_run_leaves_a_model_that_can_be_served() {
 }
 
 #[test]
-fn fine_tuning_follows_the_network_it_starts_from() {
+fn fine_tuning_uses_the_defaults_of_the_initial_network() {
     let folder = prepare();
     let start = Architecture::TransformerSmall.build(N, 0).unwrap();
     start.write(&folder.path().join("small.onnx")).unwrap();
@@ -87,7 +87,7 @@ fn fine_tuning_follows_the_network_it_starts_from() {
 }
 
 #[test]
-fn a_run_goes_on_where_it_stopped() {
+fn a_run_can_be_resumed() {
     let folder = prepare();
     assert!(train(folder.path(), "--out whole.onnx --epochs 3 --name x").status.success());
     assert!(train(folder.path(), "--out parts.onnx --epochs 1 --name x --save-every 1000").status.success());
@@ -104,7 +104,7 @@ fn a_run_goes_on_where_it_stopped() {
 }
 
 #[test]
-fn a_teacher_is_named_and_one_of_another_convention_refused() {
+fn a_teacher_is_recorded_and_another_voxel_origin_is_an_error() {
     let folder = prepare();
     let output = train(folder.path(), "--out out.onnx --epochs 1 --teacher start.onnx --teacher-weight 2");
     assert!(output.status.success(), "{}", said(&output));
@@ -116,9 +116,9 @@ fn a_teacher_is_named_and_one_of_another_convention_refused() {
 }
 
 #[test]
-fn a_run_ends_when_the_simulator_says_so() {
+fn a_run_ends_after_the_patience_of_the_evaluation() {
     let folder = prepare();
-    // Worse each time: 0.9, 0.8, 0.7…
+    // Each evaluation is worse: 0.9, 0.8, 0.7…
     let script =
         r#"n=$(cat n 2>/dev/null || echo 9); echo $((n - 1)) > n; test -s {} && echo "{\"gsr\":0.$n,\"dr\":0.$n}""#;
     let arguments =
@@ -128,18 +128,18 @@ fn a_run_ends_when_the_simulator_says_so() {
     let lines = String::from_utf8(output.stdout).unwrap();
     let records: Vec<Record> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let rates: Vec<f64> = records.iter().map(|record| record.success.unwrap().gsr).collect();
-    assert_eq!(rates, [0.9, 0.8, 0.7], "twice in a row it was no better");
+    assert_eq!(rates, [0.9, 0.8, 0.7], "two consecutive results were not better");
     let path = folder.path().join("out.onnx");
     let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
     assert_eq!(metadata.provenance["epochs"], "1");
     assert_eq!(metadata.provenance["evaluation"], "GSR 0.900, DR 0.900");
-    // Told again, it knows that it has ended.
+    // A resumed run that has ended does nothing.
     let again = command(folder.path(), &format!("{arguments} --resume")).args(["--evaluate", script]).output().unwrap();
     assert!(again.status.success() && again.stdout.is_empty());
 }
 
 #[test]
-fn ctrl_c_leaves_a_checkpoint() {
+fn ctrl_c_writes_a_checkpoint() {
     let folder = prepare();
     let arguments =
         "train --from start.onnx --data data --batch 1 --threads 1 --epochs 100000 --save-every 0.5 --out out.onnx";
@@ -168,7 +168,7 @@ fn a_network_is_written_with_random_weights() {
 }
 
 #[test]
-fn an_export_is_half_the_file_and_computes_the_same() {
+fn an_fp16_export_halves_the_file_and_computes_the_same() {
     let folder = prepare();
     let arguments = "export --from start.onnx --precision fp16 --out half.onnx --data data --volumes 5";
     let output = command(folder.path(), arguments).output().unwrap();
@@ -182,7 +182,7 @@ fn an_export_is_half_the_file_and_computes_the_same() {
             (number(&format!("/compared/{output}/largest")), number(&format!("/compared/{output}/mean")));
         assert!(largest > 0.0 && largest < 5e-3 && mean < largest, "{output}: {report}");
     }
-    // What was stored as f16 is trained, and stored as f32, again.
+    // An fp16 file can be trained and exported to fp32.
     for arguments in [
         "train --from half.onnx --data data --threads 1 --epochs 1 --out trained.onnx",
         "export --from half.onnx --precision fp32 --out full.onnx",
@@ -191,12 +191,12 @@ fn an_export_is_half_the_file_and_computes_the_same() {
         assert!(output.status.success(), "{arguments}: {}", said(&output));
     }
     let size = |name: &str| fs::metadata(folder.path().join(name)).unwrap().len();
-    // The same weights, and a note on what was done.
+    // The weights are the same; the metadata have an additional entry.
     assert!(size("full.onnx").abs_diff(size("start.onnx")) < 100 && size("trained.onnx") > size("half.onnx"));
 }
 
 #[test]
-fn an_export_in_8_bits_is_a_third_of_the_file_and_computes_nearly_the_same() {
+fn an_int8_export_is_a_third_of_the_file_and_computes_nearly_the_same() {
     let folder = prepare();
     let arguments = "export --from start.onnx --precision int8 --out int8.onnx --data data --calibrate 4";
     let output = command(folder.path(), arguments).output().unwrap();
@@ -209,14 +209,14 @@ fn an_export_in_8_bits_is_a_third_of_the_file_and_computes_nearly_the_same() {
             (number(&format!("/compared/{output}/largest")), number(&format!("/compared/{output}/mean")));
         assert!(largest > 0.0 && largest < 0.1 && mean < 0.02, "{output}: {report}");
     }
-    // It is made to be served, not to be trained on.
+    // An int8 network cannot be trained.
     let arguments = "train --from int8.onnx --data data --epochs 1 --out trained.onnx";
     let output = command(folder.path(), arguments).output().unwrap();
     assert!(said(&output).contains("the operator `QuantizeLinear` cannot be trained"), "{}", said(&output));
 }
 
 #[test]
-fn an_average_over_turns_is_exported_in_every_precision() {
+fn rotation_averaging_is_exported_in_every_precision() {
     let folder = prepare();
     let axes = Architecture::Vgn.build_with(N, Orientation::Axes, 0).unwrap();
     axes.write(&folder.path().join("axes.onnx")).unwrap();
@@ -243,15 +243,18 @@ fn an_average_over_turns_is_exported_in_every_precision() {
 }
 
 #[test]
-fn what_cannot_be_done_is_said() {
+fn errors_name_the_flag_or_the_file() {
     let folder = prepare();
     for (arguments, expected) in [
-        ("train --network vng --data data --out x.onnx", "there is no network `vng`"),
-        ("train --network vgn --data data --out x.onnx", "the data have 16³ voxels, the network reads 40³"),
+        ("train --network vng --data data --out x.onnx", "network `vng` not found"),
+        ("train --network vgn --data data --out x.onnx", "--data has volumes of 16³ voxels, but the network needs 40³"),
         ("train --network vgn --data data --ema 1 --out x.onnx", "--ema is 1"),
         ("train --network vgn --data data --weight-decay=-1 --out x.onnx", "--weight-decay is -1"),
-        ("train --network vgn --data data --evaluate true --out x.onnx", "in which {} must stand for the model"),
-        ("train --from start.onnx --data data --accumulate 0 --out x.onnx", "nothing to learn from"),
+        (
+            "train --network vgn --data data --evaluate true --out x.onnx",
+            "must contain {} in place of the model's file",
+        ),
+        ("train --from start.onnx --data data --accumulate 0 --out x.onnx", "no training scenes"),
         ("train --network vgn --data nowhere --out x.onnx", "nowhere: No such file"),
         ("train --network vgn --data data --out x.onnx --val 1", "--val is 1"),
         ("train --from start.onnx --data data --out x.onnx --resume", "x.state: No such file"),
@@ -259,7 +262,7 @@ fn what_cannot_be_done_is_said() {
         ("train --from start.onnx --data data --out x.onnx --device cuda:99", "--device is cuda:99"),
         ("train --from start.onnx --data data --out x.onnx --device gpu", "cuda:N"),
         ("export --from start.onnx --precision fp16 --turns --out x.onnx", "`--turns` is now `--average-rotations`"),
-        ("export --from start.onnx --precision int8 --out x.onnx", "name folders of them with --data"),
+        ("export --from start.onnx --precision int8 --out x.onnx", "add --data"),
     ] {
         let output = command(folder.path(), arguments).output().unwrap();
         assert!(!output.status.success());
@@ -268,7 +271,7 @@ fn what_cannot_be_done_is_said() {
 }
 
 #[test]
-fn the_eager_mode_is_timed() {
+fn the_latency_of_the_eager_mode_is_measured() {
     let folder = tempfile::tempdir().unwrap();
     assert!(command(folder.path(), "init --network vgn --out vgn.onnx").status().unwrap().success());
     let output = command(folder.path(), "time --model vgn.onnx --calls 2").output().unwrap();

@@ -1,4 +1,4 @@
-//! What the executor understands of ONNX, beyond what the networks here use, and what it refuses.
+//! ONNX graphs that the executor supports, beyond the networks of this repository, and those that it rejects.
 
 use grasp_models::onnx::{AttributeProto, GraphProto, ModelProto, NodeProto, OperatorSetIdProto, TensorProto};
 use grasp_models::{Architecture, Orientation, gpd};
@@ -14,7 +14,7 @@ fn vgn() -> ModelProto {
 
 fn run(model: ModelProto, execution: Execution) -> Result<Outputs, ExecuteError> {
     let edge = N as i64;
-    // The same each time, which libtorch's generator is not: the tests that run beside this one draw from it, too.
+    // Deterministic values. libtorch's generator is shared with tests that run in parallel.
     let volumes = (Tensor::arange(2 * edge.pow(3), (Kind::Float, Device::Cpu)) * 0.7).sin() * 0.5 + 0.5;
     let volumes = volumes.view([2, 1, edge, edge, edge]);
     let executor = Executor::new(model, execution)?;
@@ -42,7 +42,7 @@ fn whole_numbers(name: &str, values: &[i64]) -> NodeProto {
     node("Constant", &[], name, vec![AttributeProto::tensor("value", value)])
 }
 
-/// The same network as PyTorch exports VGN: three heads, sizes computed from shapes, lengths expanded.
+/// The same network in the style of PyTorch's export of VGN: three heads, sizes computed from shapes, expanded norms.
 fn as_exported(mut model: ModelProto) -> ModelProto {
     let graph = model.graph.as_mut().unwrap();
     unfuse_heads(graph);
@@ -102,7 +102,7 @@ fn unfuse_heads(graph: &mut GraphProto) {
     graph.node.remove(fused);
 }
 
-/// The same network as of opset 18, which made the axes of `ReduceL2` an input.
+/// The same network for opset 18, in which the axes of `ReduceL2` are an input.
 fn with_axes_as_input(mut model: ModelProto) -> ModelProto {
     model.opset_import[0].version = Some(18);
     let graph = model.graph.as_mut().unwrap();
@@ -115,16 +115,16 @@ fn with_axes_as_input(mut model: ModelProto) -> ModelProto {
 }
 
 #[test]
-fn axes_are_a_setting_or_an_input() {
+fn axes_are_an_attribute_or_an_input() {
     let (setting, input) = (run(vgn(), EXECUTION).unwrap(), run(with_axes_as_input(vgn()), EXECUTION).unwrap());
     assert!(difference(&setting, &input) == 0.0);
 }
 
 #[test]
-fn only_weights_are_learnt() {
+fn only_weights_are_trained() {
     let mut model = vgn();
     let graph = model.graph.as_mut().unwrap();
-    // A factor and the bounds and scales of operators, as initialisers.
+    // A factor, and bounds and scales of operators, as initializers.
     let width = graph.node.iter_mut().flat_map(|node| &mut node.output).find(|output| *output == "width").unwrap();
     *width = "raw".to_owned();
     let product = node("Mul", &["raw", "factor"], "product", vec![]);
@@ -152,7 +152,7 @@ fn only_weights_are_learnt() {
 }
 
 #[test]
-fn other_opsets_are_refused() {
+fn unsupported_opsets_are_errors() {
     let of = |opsets: &[(&str, i64)]| {
         let import = |&(domain, version): &(&str, i64)| OperatorSetIdProto {
             domain: Some(domain.to_owned()),
@@ -184,13 +184,13 @@ fn a_graph_in_pytorchs_style_is_the_same_network() {
 }
 
 #[test]
-fn single_voxels_are_those_of_the_whole_maps() {
+fn single_voxels_equal_those_of_the_whole_maps() {
     let edge = N as i64;
     let volumes = Tensor::rand([2, 1, edge, edge, edge], (Kind::Float, Device::Cpu));
     // Corners, edges, faces and the inside, of both volumes.
     let cells: Vec<i64> = (0..2 * edge.pow(3)).step_by(37).chain([0, edge.pow(3) - 1, 2 * edge.pow(3) - 1]).collect();
     let index = Tensor::from_slice(&cells);
-    // A network whose width has no head of its own is computed whole.
+    // A network whose width has no head is computed at all voxels.
     let mut whole = vgn();
     let graph = whole.graph.as_mut().unwrap();
     let last = graph.node.iter_mut().find(|node| node.output.contains(&"width".to_owned())).unwrap();
@@ -222,7 +222,7 @@ fn single_voxels_are_those_of_the_whole_maps() {
 }
 
 #[test]
-fn bf16_changes_little() {
+fn bf16_changes_the_outputs_little() {
     for architecture in [Architecture::Vgn, Architecture::TransformerSmall] {
         let model = || architecture.build(N, 0).unwrap();
         let full = run(model(), EXECUTION).unwrap();
@@ -235,7 +235,7 @@ fn bf16_changes_little() {
 
 #[test]
 fn gradients_in_bf16_are_reproducible() {
-    // At this size one convolution is over 2³ voxels, and memory that was used before holds no zeros.
+    // At this size one convolution is over 2³ voxels, and reused memory is not zero.
     let edge = N as i64;
     let volumes = Tensor::ones([8, 1, edge, edge, edge], (Kind::Float, Device::Cpu));
     for architecture in [Architecture::Vgn, Architecture::TransformerSmall] {
@@ -260,9 +260,9 @@ fn gradients_in_bf16_are_reproducible() {
     }
 }
 
-/// Convolutions over repeated voxels are computed before they are repeated; what is learnt is the same.
+/// Convolutions after upsampling are computed before it; outputs and gradients are the same.
 #[test]
-fn what_is_computed_in_another_order_gives_the_same_maps_and_gradients() {
+fn convolutions_before_upsampling_give_the_same_maps_and_gradients() {
     let edge = N as i64;
     let volumes = (Tensor::arange(2 * edge.pow(3), (Kind::Float, Device::Cpu)) * 0.7).sin() * 0.5 + 0.5;
     let volumes = volumes.view([2, 1, edge, edge, edge]);
@@ -291,7 +291,7 @@ fn what_is_computed_in_another_order_gives_the_same_maps_and_gradients() {
 }
 
 #[test]
-fn a_model_is_given_back_as_it_came() {
+fn an_untrained_model_is_returned_unchanged() {
     for channels_last in [false, true] {
         let executor = Executor::new(vgn(), Execution { channels_last, ..EXECUTION }).unwrap();
         assert_eq!(executor.to_model(), vgn());
@@ -305,7 +305,7 @@ fn refusal(change: impl FnOnce(&mut GraphProto)) -> String {
 }
 
 #[test]
-fn what_is_not_understood_is_refused_by_name() {
+fn errors_name_unsupported_operators_and_attributes() {
     let error = refusal(|graph| graph.node[1].op_type = Some("Tan".to_owned()));
     assert!(error.contains("Relu_1") && error.contains("`Tan`"), "{error}");
     let error = refusal(|graph| graph.node[1].domain = Some("com.example".to_owned()));
@@ -333,7 +333,7 @@ fn what_is_not_understood_is_refused_by_name() {
 }
 
 #[test]
-fn windows_are_those_of_onnx_or_refused() {
+fn pooling_windows_follow_onnx_or_are_errors() {
     let pooled = |attributes: Vec<AttributeProto>| {
         let mut model = gpd::gpd(0);
         let nodes = &mut model.graph.as_mut().unwrap().node;

@@ -1,4 +1,4 @@
-//! The README's training command, on a small data set at the place it names.
+//! The training command of docs/training.md, on a small data set in the folder that it names.
 
 mod support;
 
@@ -9,9 +9,9 @@ use grasp::RESOLUTION;
 use grasp_models::Store;
 
 #[test]
-fn the_training_command_of_the_readme_works() {
-    let readme = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../README.md")).unwrap();
-    let line = readme.lines().find(|line| line.starts_with("grasp-train train ")).expect("the README trains");
+fn the_training_command_of_the_documents_works() {
+    let page = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/training.md")).unwrap();
+    let line = page.lines().find(|line| line.starts_with("grasp-train train ")).expect("docs/training.md trains");
     let arguments: Vec<&str> = line.split_whitespace().skip(1).collect();
     let value = |flag: &str| arguments[arguments.iter().position(|&word| word == flag).unwrap() + 1];
 

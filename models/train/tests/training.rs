@@ -1,4 +1,4 @@
-//! Runs of training, small enough to watch.
+//! Small training runs.
 
 mod support;
 
@@ -49,12 +49,12 @@ fn trainer(dataset: Dataset, settings: &Settings, execution: Execution) -> Train
 fn epoch(trainer: &mut Trainer) -> Record {
     match trainer.epoch(&AtomicBool::new(false), |_, _| {}).unwrap() {
         Epoch::Done(record) => record,
-        Epoch::Interrupted => panic!("nobody interrupted"),
+        Epoch::Interrupted => panic!("the epoch was interrupted"),
     }
 }
 
 #[test]
-fn eight_scenes_are_learnt_by_heart() {
+fn eight_scenes_are_memorized() {
     use Orientation::{Axes, Quaternion};
     for (network, orientation, learning_rate, epochs, bf16) in [
         (Architecture::Vgn, Quaternion, 1e-3, 120, false),
@@ -85,10 +85,10 @@ fn difference(a: &ModelProto, b: &ModelProto) -> f32 {
 }
 
 #[test]
-fn two_batches_in_a_step_are_one_of_twice_the_size() {
+fn two_accumulated_batches_equal_one_of_twice_the_size() {
     let run = |batch: usize, accumulate: usize| {
         let settings = Settings { batch, accumulate, learning_rate: 1e-3, ..settings() };
-        // Scenes of as many grasps each, so that a mean of means is the mean.
+        // All scenes have the same number of grasps, so that the mean of means is the mean.
         let mut trainer = trainer(support::dataset(8, N), &settings, EXECUTION);
         epoch(&mut trainer);
         assert_eq!(trainer.steps(), (8 / batch / accumulate) as u64);
@@ -110,7 +110,7 @@ fn the_average_of_the_weights_lags_behind_them() {
         trainer.model()
     };
     let (plain, none, some) = (run(None), run(Some(0.0)), run(Some(0.9)));
-    assert_eq!(difference(&plain, &none), 0.0, "an average that forgets at once is the weights");
+    assert_eq!(difference(&plain, &none), 0.0, "an average with decay 0 equals the weights");
     let start = Architecture::Vgn.build(N, 0).unwrap();
     let (lag, way) = (difference(&plain, &some), difference(&plain, &start));
     assert!(lag > 0.0 && lag < way, "{lag} of {way}");
@@ -146,10 +146,10 @@ fn a_resumed_run_is_the_uninterrupted_run() {
         ..settings()
     };
     let mut whole = trainer(dataset(), &settings, EXECUTION);
-    assert!(whole.scenes().1 > 0, "some are held out");
+    assert!(whole.scenes().1 > 0, "there are validation scenes");
     let records: Vec<_> = (0..3).map(|_| epoch(&mut whole)).collect();
 
-    // Interrupted after the first batch of the second epoch, and written to a file.
+    // Interrupted after the first batch of the second epoch; the checkpoint is written to a file.
     let mut part = trainer(dataset(), &settings, EXECUTION);
     epoch(&mut part);
     let stop = AtomicBool::new(false);
@@ -168,11 +168,11 @@ fn a_resumed_run_is_the_uninterrupted_run() {
         let comparable = |record: &Record| Record { seconds: 0.0, volumes_per_second: 0.0, ..record.clone() };
         assert_eq!(comparable(&got), comparable(expected));
     }
-    assert_eq!(resumed.model(), whole.model(), "to the last bit");
+    assert_eq!(resumed.model(), whole.model(), "bit-identical");
 }
 
 #[test]
-fn a_pupil_learns_what_no_trial_said() {
+fn a_student_learns_from_the_teacher_where_there_are_no_trials() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("teacher.onnx");
     let learnt = Settings { batch: 8, learning_rate: 1e-3, ..settings() };
@@ -187,7 +187,7 @@ fn a_pupil_learns_what_no_trial_said() {
     metadata.write_to(&mut file);
     file.write(&path).unwrap();
 
-    // The pupil sees scenes that its teacher never saw, and none of its own trials is near most of their surfaces.
+    // The student's scenes are not in the teacher's data, and most of their surfaces have no trials nearby.
     let scenes = || Dataset::of((100..108).map(|seed| support::scene(seed, N)).collect()).unwrap();
     let teacher = || Teacher::new(Network::load(&path, &Options::default()).unwrap(), 10.0);
     let start = || {
@@ -210,21 +210,21 @@ fn a_pupil_learns_what_no_trial_said() {
     let answers = qualities(&teacher_model);
     let distance = |model: &ModelProto| (qualities(model) - &answers).abs().mean(Kind::Float).double_value(&[]);
     let (without, with) = (distance(&alone.model()), distance(&pupil.model()));
-    println!("mean difference of quality to the teacher's: {without:.3} without its answers, {with:.3} with them");
+    println!("mean difference of quality to the teacher's: {without:.3} without its outputs, {with:.3} with them");
     assert!(with < without / 2.0, "{with} and {without}");
 
-    // Another voxel is drawn in every step, but not when the run is resumed.
+    // Voxels are drawn again in every step; a resumed run draws the same ones.
     let mut resumed = start().taught_by(teacher());
     resumed.resume(&pupil.checkpoint()).unwrap();
     epoch(&mut resumed);
     epoch(&mut pupil);
-    assert_eq!(resumed.model(), pupil.model(), "to the last bit");
+    assert_eq!(resumed.model(), pupil.model(), "bit-identical");
     let refused = start().resume(&pupil.checkpoint());
     assert!(matches!(refused, Err(TrainError::Checkpoint(CheckpointError::Settings { .. }))), "the teacher is missing");
 }
 
 #[test]
-fn scenes_that_come_while_it_runs_are_learnt_too() {
+fn scenes_added_during_a_run_are_used() {
     let folder = tempfile::tempdir().unwrap();
     let provenance = support::provenance();
     let mut writer = packed::Writer::open(folder.path(), &Setup::benchmark(provenance)).unwrap();
@@ -232,7 +232,7 @@ fn scenes_that_come_while_it_runs_are_learnt_too() {
         for number in numbers {
             let scene = support::scene(number, N);
             let volume: Vec<f32> = scene.volumes[0].iter().map(|&byte| grasp_data::value(byte)).collect();
-            // Two looks at each, which the plan has to draw from.
+            // Two volumes per scene, from which the plan draws one.
             writer.append(number, &[volume.clone(), volume], &scene.trials).unwrap();
         }
     };
@@ -246,9 +246,9 @@ fn scenes_that_come_while_it_runs_are_learnt_too() {
     let stop = AtomicBool::new(false);
     whole.epoch(&stop, |_, _| stop.store(true, Ordering::Relaxed)).unwrap();
     write(8..12);
-    assert_eq!(whole.follow().unwrap(), 0, "an epoch that has begun keeps its scenes");
+    assert_eq!(whole.follow().unwrap(), 0, "scenes are not added within an epoch");
 
-    // Resumed, the run knows what it knew, although there is more by now.
+    // A resumed run uses the scenes of its checkpoint, although the folder has more.
     let mut resumed = trainer(open(), &settings(), EXECUTION);
     resumed.resume(&whole.checkpoint()).unwrap();
     for trainer in [&mut whole, &mut resumed] {
@@ -256,7 +256,7 @@ fn scenes_that_come_while_it_runs_are_learnt_too() {
         assert_eq!(trainer.follow().unwrap(), 4);
         epoch(trainer);
     }
-    assert_eq!(resumed.model(), whole.model(), "to the last bit");
+    assert_eq!(resumed.model(), whole.model(), "bit-identical");
 }
 
 #[test]
@@ -275,13 +275,13 @@ fn a_checkpoint_of_another_run_is_refused() {
     "other".clone_into(&mut renamed[3].id);
     for scenes in [relabelled, shared, renamed] {
         let mut other = trainer(Dataset::of(scenes).unwrap(), &settings(), EXECUTION);
-        assert!(refused(other.resume(&checkpoint)), "as many scenes, but others");
+        assert!(refused(other.resume(&checkpoint)), "the same number of scenes, but other scenes");
     }
     let short = Checkpoint { sums: vec![0.0; 3], ..checkpoint.clone() };
     let cut = trainer(dataset(), &settings(), EXECUTION).resume(&short);
     assert!(matches!(cut, Err(TrainError::Checkpoint(CheckpointError::Sums(3)))));
     let mut longer = trainer(dataset(), &Settings { epochs: 9, ..settings() }, EXECUTION);
-    assert!(longer.resume(&checkpoint).is_ok(), "a run at a constant learning rate may be made longer");
+    assert!(longer.resume(&checkpoint).is_ok(), "a run with a constant learning rate can be extended");
     let model = Architecture::TransformerSmall.build(N, 0).unwrap();
     let mut other = Trainer::new(model, dataset(), settings(), EXECUTION).unwrap();
     assert!(matches!(other.resume(&checkpoint), Err(TrainError::Checkpoint(CheckpointError::Weights(_)))));
@@ -292,11 +292,11 @@ fn a_run_without_scenes_is_refused() {
     let empty = Dataset::of(Vec::new()).unwrap();
     let model = Architecture::Vgn.build(N, 0).unwrap();
     let error = Trainer::new(model, empty, settings(), EXECUTION).err().unwrap();
-    assert!(error.to_string().contains("nothing to learn from"), "{error}");
+    assert!(error.to_string().contains("no training scenes"), "{error}");
 }
 
 #[test]
-fn a_run_that_diverges_says_so() {
+fn divergence_is_an_error() {
     let mut trainer = trainer(support::dataset(8, N), &Settings { learning_rate: 1e30, ..settings() }, EXECUTION);
     let error = (0..5).find_map(|_| trainer.epoch(&AtomicBool::new(false), |_, _| {}).err()).unwrap();
     assert!(error.to_string().contains("smaller learning rate"), "{error}");
@@ -309,7 +309,7 @@ fn outputs(quality: f32, rotation: [f32; 4], width: f32) -> Outputs {
 }
 
 #[test]
-fn the_loss_is_the_papers() {
+fn the_loss_follows_the_papers_equation() {
     let n = 2;
     let label = Trial {
         position: Point3::new(1.2, 0.7, 1.9),
@@ -325,7 +325,7 @@ fn the_loss_is_the_papers() {
     targets.push(0, &Trial { success: false, ..label }, n, VoxelOrigin::Center, Quality::Label);
     assert_eq!(targets.len(), 2);
 
-    // The same rotation, turned by 180° about the approach, with either sign, costs nothing.
+    // A rotation by 180° about the approach, and the sign of the quaternion, do not change the loss.
     let half_turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI);
     for rotation in [label.rotation, label.rotation * half_turn] {
         for sign in [1.0, -1.0] {
@@ -338,7 +338,7 @@ fn the_loss_is_the_papers() {
             assert_eq!((loss.sums.accuracy(), loss.sums.precision(), loss.sums.recall()), (0.5, 0.5, 1.0));
         }
     }
-    // A turn that holds, too, is as good.
+    // Other valid turns have the same loss.
     let turns = |k: u8| {
         let mut targets = Targets::default();
         targets.push(0, &Trial { turns: 1 << k, ..label }, n, VoxelOrigin::Center, Quality::Label);
@@ -365,7 +365,7 @@ fn the_loss_is_the_papers() {
 }
 
 #[test]
-fn the_quality_is_learnt_from_the_label_or_from_the_share() {
+fn the_target_of_the_quality_is_the_label_or_the_share() {
     let label = Trial {
         position: Point3::new(0.5, 0.5, 0.5),
         rotation: UnitQuaternion::identity(),
@@ -390,12 +390,12 @@ fn the_quality_is_learnt_from_the_label_or_from_the_share() {
     assert_eq!((least(Quality::Share), least(Quality::Label)), (50, 99));
 
     let (share, whole) = (sums(Quality::Share, 0.8), sums(Quality::Label, 0.8));
-    // Both voxels weigh as successes do.
+    // Both voxels have the weight of successes.
     let expected = -3.0 * (0.8_f64.ln() + 0.2_f64.ln());
     assert!((share.quality - expected).abs() < 1e-5, "{}", share.quality);
     assert!(share.rotation > 1.0 && share.width > 0.1);
     assert_eq!((share.rotation, share.width), (whole.rotation, whole.width), "a success counts for one");
-    assert_eq!((share.accuracy(), share.recall()), (1.0, 1.0), "what succeeded is decided by the label");
+    assert_eq!((share.accuracy(), share.recall()), (1.0, 1.0), "the label decides what is a success");
 }
 
 #[test]
@@ -408,13 +408,13 @@ fn a_run_learns_the_share() {
         (0..80).map(|_| epoch(&mut trainer)).last().unwrap().loss_quality
     };
     let (label, share) = (last_loss(Quality::Label), last_loss(Quality::Share));
-    // Half of the voxels are successes, of which no better is to be had than ln 2.
+    // Half of the voxels are successes; their smallest possible loss is ln 2.
     let least = 0.5 * std::f64::consts::LN_2;
     assert!(label < 0.05 && (least - 1e-4..least + 0.05).contains(&share), "{label}, {share}");
 }
 
 #[test]
-fn a_grasp_stands_for_the_voxel_of_its_convention() {
+fn the_voxel_of_a_grasp_depends_on_the_voxel_origin() {
     let at = |x: f64, y: f64, z: f64| Trial {
         position: Point3::new(x, y, z),
         rotation: UnitQuaternion::identity(),

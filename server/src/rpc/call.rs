@@ -15,20 +15,20 @@ use crate::readiness::State;
 use crate::rpc::refusal::Refusal;
 use crate::serving::engine::{Detection, Engine, Reply, SessionOutput, Tensors};
 use crate::telemetry::metrics::Metrics;
-use crate::telemetry::recent::{Answered, Outcome, RecentRequests};
+use crate::telemetry::recent::{Detected, Outcome, RecentRequests};
 use crate::telemetry::subscriber::{self, REQUEST};
 use crate::telemetry::timings::StageTimings;
 use crate::transport::deadline::{self, Deadline};
 use crate::transport::request_body::unreadable_message;
 use grasp_planner::Scene;
 
-/// Longest request id and frame id, bytes: they are echoed, and the first is logged.
+/// Maximum length of a request id and a frame id, bytes. Both are echoed; the request id is also logged.
 const MAX_ID: usize = 256;
 
-/// When to ask again while the sessions warm up.
+/// Retry hint while the models are loaded and warmed up.
 const WARM_UP: Duration = Duration::from_secs(1);
 
-/// Opens the calls of a service.
+/// Creates the [`Call`] of each request.
 #[derive(Clone)]
 pub(crate) struct Calls {
     metrics: Arc<Metrics>,
@@ -37,7 +37,8 @@ pub(crate) struct Calls {
     ids: Arc<RequestIds>,
 }
 
-/// A request on its way. Dropped before its end, it counts as cancelled by its caller, unless that one's time was up.
+/// A request in progress, with its id, span and metrics. If it is dropped before it ends, it counts as cancelled by the
+/// client, or as expired if its deadline has passed.
 pub(crate) struct Call {
     pub id: String,
     pub deadline: Option<Deadline>,
@@ -47,12 +48,12 @@ pub(crate) struct Call {
     recent: Arc<RecentRequests>,
     name: String,
     version: String,
-    /// The planner's, empty as long as none is chosen.
+    /// `name version` of the model; empty until a model is selected.
     label: String,
     ended: bool,
 }
 
-/// Who calls: until when they wait, and what the call is a part of.
+/// Deadline and trace context from a request's headers.
 #[derive(Clone, Default)]
 pub(crate) struct CallContext {
     deadline: Option<Deadline>,
@@ -65,17 +66,17 @@ impl CallContext {
     }
 }
 
-/// What a request that was taken needs for its reply.
+/// A queued request: the pending result of the session, and what the response needs besides it.
 pub(crate) struct PendingReply {
     reply: Reply<Detection>,
     params: DetectParams,
-    /// What to look at was made in this time, checking and fusing.
+    /// Time until the scene was queued, without the fusion.
     preprocessing: Duration,
     fusion: Option<Duration>,
     origin: FrameStamp,
 }
 
-/// Where and when a request's views were taken: echoed.
+/// Frame id and time stamp of a request's views, echoed in the response.
 #[derive(Clone, Default)]
 pub(crate) struct FrameStamp {
     pub frame_id: String,
@@ -87,28 +88,27 @@ impl Calls {
         Self { metrics, recent, state, ids: Arc::new(RequestIds::new()) }
     }
 
-    /// Whether the server is starting, serving or draining.
     pub fn state(&self) -> watch::Receiver<State> {
         self.state.clone()
     }
 
-    /// What ends a stream whose messages cannot be read any more.
+    /// The status that ends a stream after a message that cannot be read.
     pub fn unreadable(&self, status: Status) -> Status {
         unreadable_message(status, &self.metrics)
     }
 
-    /// Opens a call. What is wrong with its id or its moment is the second of the two.
-    pub fn open(&self, mut id: String, caller: CallContext) -> (Call, Result<(), Refusal>) {
+    /// Opens a call. The second value is an error if the id is invalid or the server is still starting.
+    pub fn open(&self, mut id: String, context: CallContext) -> (Call, Result<(), Refusal>) {
         let started = Instant::now();
         let mut checked = check_id("request_id", &id).map_err(Refusal::from);
         if id.is_empty() || checked.is_err() {
             id = self.ids.next();
         }
-        // What arrives on a connection that is already open is still answered; streams stop reading by themselves.
+        // During the drain, requests on open connections are still answered; streams stop reading on their own.
         if checked.is_ok() && *self.state.borrow() == State::Starting {
             checked = Err(Refusal::Starting(WARM_UP));
         }
-        let CallContext { deadline, parent } = caller;
+        let CallContext { deadline, parent } = context;
         let span = info_span!(
             REQUEST,
             otel.kind = "server",
@@ -122,7 +122,7 @@ impl Calls {
             postprocessing = Empty,
             total = Empty,
         );
-        subscriber::adopt(&span, parent);
+        subscriber::set_parent(&span, parent);
         let call = Call {
             id,
             deadline,
@@ -154,19 +154,19 @@ fn check_id(field: &'static str, id: &str) -> Result<(), FieldError> {
     if id.len() <= MAX_ID {
         return Ok(());
     }
-    Err(FieldError::new(field, format_args!("{} bytes long", id.len()), format_args!("at most {MAX_ID} are taken")))
+    Err(FieldError::new(field, format_args!("{} bytes long", id.len()), format_args!("must be at most {MAX_ID}")))
 }
 
 impl Call {
-    /// This planner will answer.
-    pub fn by(&mut self, engine: &Engine) {
+    /// Records the model that processes the request.
+    pub fn set_model(&mut self, engine: &Engine) {
         self.label.clone_from(&engine.label);
         engine.source.name().clone_into(&mut self.name);
         engine.source.version().clone_into(&mut self.version);
         self.span.record("model", &engine.label);
     }
 
-    /// Queues what there is to look at; `fusion` of the time until now was spent on making it.
+    /// Queues a scene. `fusion` is the time that its fusion took.
     pub fn submit(
         &self,
         engine: &Engine,
@@ -180,10 +180,10 @@ impl Call {
         Ok(PendingReply { reply, params, preprocessing, fusion, origin })
     }
 
-    /// Waits for the session, and says in the log and the metrics how it went.
-    pub async fn finish(mut self, work: Result<PendingReply, Refusal>) -> Result<pb::DetectGraspsResponse, Refusal> {
-        let outcome = match work {
-            Ok(work) => self.reply(work).await,
+    /// Waits for the session's result, and records the outcome in the log and the metrics.
+    pub async fn finish(mut self, pending: Result<PendingReply, Refusal>) -> Result<pb::DetectGraspsResponse, Refusal> {
+        let outcome = match pending {
+            Ok(pending) => self.reply(pending).await,
             Err(refusal) => Err(refusal),
         };
         match outcome {
@@ -195,44 +195,43 @@ impl Call {
         }
     }
 
-    /// Waits for the maps of each volume, and says how it went. The times are those of the volume that took longest.
+    /// Waits for the maps of each volume, and records the outcome. The timings are those of the slowest volume.
     pub async fn maps(mut self, replies: Vec<Reply<Tensors>>) -> Result<(Vec<Tensors>, StageTimings), Refusal> {
         let preprocessing = self.started.elapsed();
         let mut maps = Vec::with_capacity(replies.len());
         let mut timings = StageTimings { preprocessing, ..StageTimings::default() };
         for reply in replies {
-            let SessionOutput { made, queue, inference, postprocessing } = match reply.wait(self.deadline).await {
-                Ok(answer) => answer,
+            let SessionOutput { value, queue, inference, postprocessing } = match reply.wait(self.deadline).await {
+                Ok(output) => output,
                 Err(error) => return Err(self.end(error.into())),
             };
-            maps.push(made);
+            maps.push(value);
             if queue + inference >= timings.queue + timings.inference {
                 timings = StageTimings { queue, inference, postprocessing, ..timings };
             }
         }
         timings.total = self.started.elapsed();
-        self.answered(&timings, 0);
+        self.succeeded(&timings, 0);
         self.recent.add(self.id.clone(), self.label.clone(), Outcome::Inferred(timings));
         self.ended = true;
         Ok((maps, timings))
     }
 
-    /// It ends with a refusal.
+    /// Ends the call with a refusal.
     pub fn end(mut self, refusal: Refusal) -> Refusal {
         self.refused(&refusal);
         self.ended = true;
         refusal
     }
 
-    /// The span of its log.
     pub fn span(&self) -> Span {
         self.span.clone()
     }
 
-    async fn reply(&mut self, work: PendingReply) -> Result<pb::DetectGraspsResponse, Refusal> {
-        let PendingReply { reply, params, preprocessing, fusion, origin } = work;
-        let SessionOutput { made, queue, inference, postprocessing } = reply.wait(self.deadline).await?;
-        let Detection { grasps: found, collides, dropped, over_limit, volume } = made;
+    async fn reply(&mut self, pending: PendingReply) -> Result<pb::DetectGraspsResponse, Refusal> {
+        let PendingReply { reply, params, preprocessing, fusion, origin } = pending;
+        let SessionOutput { value, queue, inference, postprocessing } = reply.wait(self.deadline).await?;
+        let Detection { grasps: found, collides, dropped, over_limit, volume } = value;
 
         let grasps: Vec<_> = found
             .iter()
@@ -243,18 +242,18 @@ impl Call {
                 pb::Grasp { pose, width: grasp.width, quality: grasp.quality, pregrasp, retreat, collides }
             })
             .collect();
-        // At most one grasp per voxel.
+        // Fits: there is at most one grasp per voxel.
         let over_limit = over_limit as u32;
         let dropped = (params.explain || grasps.is_empty()).then(|| pb::Dropped { over_limit, ..(&dropped).into() });
 
         let finger_depth = params.hand.map_or(grasp::FINGER_DEPTH, |hand| hand.depth);
         let total = self.started.elapsed();
         let timings = StageTimings { queue, preprocessing, fusion, inference, postprocessing, total };
-        self.answered(&timings, grasps.len());
+        self.succeeded(&timings, grasps.len());
         let (pose, size) = (*volume.pose(), volume.voxel_size() * volume.resolution() as f64);
-        let volume = Some(volume).filter(|volume| volume.resolution() <= Answered::MAX_RESOLUTION);
-        let answered = Answered { timings, pose, size, volume, grasps: found, collides, finger_depth };
-        let outcome = Outcome::Answered(Box::new(answered));
+        let volume = Some(volume).filter(|volume| volume.resolution() <= Detected::MAX_RESOLUTION);
+        let detected = Detected { timings, pose, size, volume, grasps: found, collides, finger_depth };
+        let outcome = Outcome::Detected(Box::new(detected));
         self.recent.add(self.id.clone(), self.label.clone(), outcome);
         Ok(pb::DetectGraspsResponse {
             request_id: self.id.clone(),
@@ -268,11 +267,11 @@ impl Call {
         })
     }
 
-    fn answered(&self, timings: &StageTimings, grasps: usize) {
+    fn succeeded(&self, timings: &StageTimings, grasps: usize) {
         timings.record(&self.span);
         subscriber::stages(&self.span, timings);
-        self.metrics.answered(&self.label, timings, grasps);
-        self.span.in_scope(|| debug!(grasps, "answered"));
+        self.metrics.succeeded(&self.label, timings, grasps);
+        self.span.in_scope(|| debug!(grasps, "request succeeded"));
     }
 
     fn refused(&self, refusal: &Refusal) {
@@ -290,14 +289,18 @@ impl Drop for Call {
     fn drop(&mut self) {
         if !self.ended {
             let expired = self.deadline.is_some_and(Deadline::has_passed);
-            let code = if expired { Code::DeadlineExceeded } else { Code::Cancelled };
+            let (code, reason) = if expired {
+                (Code::DeadlineExceeded, "the deadline has passed")
+            } else {
+                (Code::Cancelled, "cancelled by the client")
+            };
             self.metrics.ended(&self.label, code);
-            self.span.in_scope(|| info!(?code, "the caller has gone"));
+            self.span.in_scope(|| info!(?code, "{reason}"));
         }
     }
 }
 
-/// Ids for requests that bring none: the process's own number, then a counter.
+/// Ids for requests without one: a random number of the process, then a counter.
 struct RequestIds {
     process: u32,
     next: AtomicU64,
@@ -305,7 +308,7 @@ struct RequestIds {
 
 impl RequestIds {
     fn new() -> Self {
-        // The standard library's hashers are seeded by the system: randomness without another dependency.
+        // The standard library's hashers have random seeds, so no dependency for random numbers is needed.
         Self { process: RandomState::new().hash_one(0) as u32, next: AtomicU64::new(1) }
     }
 

@@ -19,18 +19,18 @@ use crate::rpc::call::{Call, CallContext, Calls, FrameStamp, PendingReply};
 use crate::rpc::refusal::Refusal;
 use crate::serving::engine::{Engine, EngineError};
 use crate::serving::registry::{ModelRegistry, check_voxel_size};
-use crate::serving::scene::{FusionGrid, eyes, rendered, size};
+use crate::serving::scene::{FusionGrid, camera_positions, rendered, size};
 use crate::serving::tracking::{Track, TrackedVolumes};
 use crate::transport::deadline::Deadline;
 use grasp_planner::Scene;
 
-/// Requests of one stream that wait behind the one being answered: enough that no session waits for the next volume,
-/// and few enough that a stream alone never fills a queue.
+/// Requests of one stream that are queued behind the current one: enough to keep a session busy, and few enough that a
+/// single stream never fills a queue.
 const READ_AHEAD: usize = 1;
 
-/// Bytes of a volume that are converted where they arrive, in tens of microseconds: handing them to another thread would
-/// take as long.
-const AT_ONCE: usize = 1 << 20;
+/// Largest volume that is converted on the async runtime's thread, bytes. That takes tens of microseconds, as long as
+/// handing it to another thread.
+const INLINE_BYTES: usize = 1 << 20;
 
 /// grasp.v1.GraspService.
 #[derive(Clone)]
@@ -38,21 +38,22 @@ pub(crate) struct GraspRpc {
     models: Arc<ModelRegistry>,
     calls: Calls,
     tracked_volumes: Arc<TrackedVolumes>,
-    /// As many requests as there are processors convert and fuse at a time...
+    /// One permit per CPU. A request holds one while it is converted and fused.
     fusion_permits: Arc<Semaphore>,
-    /// ... and as many more as a model's queue takes wait for that: a crowd of them would fill the memory.
+    /// One permit per CPU and per place in a model's queue. A request holds one while it waits for a fusion permit and
+    /// is fused, which bounds the memory of waiting requests.
     conversion_permits: Arc<Semaphore>,
 }
 
-/// A request that was taken, or refused without anyone having been told yet.
+/// A call that is queued, or refused with its refusal not yet sent.
 struct PendingCall {
     call: Call,
-    work: Result<PendingReply, Refusal>,
+    reply: Result<PendingReply, Refusal>,
 }
 
 impl PendingCall {
     async fn finish(self) -> Result<pb::DetectGraspsResponse, Refusal> {
-        self.call.finish(self.work).await
+        self.call.finish(self.reply).await
     }
 
     async fn respond(self) -> Result<Response<pb::DetectGraspsResponse>, Status> {
@@ -62,27 +63,27 @@ impl PendingCall {
 }
 
 impl GraspRpc {
-    /// `queue` requests may wait to be converted and fused.
+    /// `queue` is the number of requests that may wait for conversion and fusion.
     pub fn new(models: Arc<ModelRegistry>, calls: Calls, tracked_volumes: TrackedVolumes, queue: usize) -> Self {
         let processors = thread::available_parallelism().map_or(1, NonZero::get);
-        let semaphore = |places: usize| Arc::new(Semaphore::new(places.min(Semaphore::MAX_PERMITS)));
+        let semaphore = |permits: usize| Arc::new(Semaphore::new(permits.min(Semaphore::MAX_PERMITS)));
         let (fusion_permits, conversion_permits) = (semaphore(processors), semaphore(processors.saturating_add(queue)));
         Self { models, calls, tracked_volumes: Arc::new(tracked_volumes), fusion_permits, conversion_permits }
     }
 
-    /// Opens a call and submits what it asks for. What is wrong with it comes out of [`PendingCall::finish`], like the answer.
+    /// Opens a call and submits its request. [`PendingCall::finish`] returns both results and refusals.
     async fn begin(
         &self,
         request_id: String,
-        caller: CallContext,
+        context: CallContext,
         submit: impl AsyncFnOnce(&mut Call) -> Result<PendingReply, Refusal>,
     ) -> PendingCall {
-        let (mut call, checked) = self.calls.open(request_id, caller);
-        let work = match checked {
+        let (mut call, checked) = self.calls.open(request_id, context);
+        let reply = match checked {
             Ok(()) => submit(&mut call).await,
             Err(refusal) => Err(refusal),
         };
-        PendingCall { call, work }
+        PendingCall { call, reply }
     }
 
     async fn submit(&self, request: pb::DetectGraspsRequest, call: &mut Call) -> Result<PendingReply, Refusal> {
@@ -90,15 +91,15 @@ impl GraspRpc {
         let mut volume = volume.ok_or_else(|| FieldError::new("volume", "absent", "must be given"))?;
         let origin = FrameStamp::checked("volume.frame_id", std::mem::take(&mut volume.frame_id), volume.stamp)?;
         let params = DetectParams::try_from(&options.unwrap_or_default())?;
-        // The model before the data: nothing is converted that no model takes.
+        // Selects the model first, so that no volume is converted that no model accepts.
         let engine = self.models.select(&params.model, &params.version, Some(resolution(&volume)?))?;
-        call.by(&engine);
-        let checked = if volume.data.len() <= AT_ONCE {
+        call.set_model(&engine);
+        let checked = if volume.data.len() <= INLINE_BYTES {
             Volume::try_from(&volume)?
         } else {
-            let held = (self.conversion_permit(&engine)?, self.fusion_permit(call).await?);
-            engine.check_place()?;
-            blocking(held, move || Ok(Volume::try_from(&volume)?)).await?
+            let permits = (self.conversion_permit(&engine)?, self.fusion_permit(call).await?);
+            engine.check_capacity()?;
+            blocking(permits, move || Ok(Volume::try_from(&volume)?)).await?
         };
         check_voxel_size(&checked, &engine)?;
         call.submit(&engine, Scene { volume: checked, points: None }, params, origin, None)
@@ -111,11 +112,11 @@ impl GraspRpc {
     ) -> Result<PendingReply, Refusal> {
         let pb::DetectGraspsFromDepthRequest { views, workspace, options, .. } = request;
         let count = views.len();
-        let seen = move |workspace: &Workspace, _: f64| -> Result<Vec<View>, FieldError> {
+        let make_views = move |workspace: &Workspace, _: f64| -> Result<Vec<View>, FieldError> {
             let views = views.iter().enumerate();
             views.map(|(index, view)| depth_view(view, index, &workspace.frame_from_task)).collect()
         };
-        self.submit_views(count, workspace, options, call, seen).await
+        self.submit_views(count, workspace, options, call, make_views).await
     }
 
     async fn submit_cloud(
@@ -125,22 +126,23 @@ impl GraspRpc {
     ) -> Result<PendingReply, Refusal> {
         let pb::DetectGraspsFromCloudRequest { views, workspace, options, .. } = request;
         let count = views.len();
-        let seen = move |workspace: &Workspace, size: f64| -> Result<Vec<View>, FieldError> {
+        let make_views = move |workspace: &Workspace, size: f64| -> Result<Vec<View>, FieldError> {
             let views = views.iter().enumerate();
             let clouds = views.map(|(index, view)| cloud_view(view, index, &workspace.frame_from_task));
             rendered(&clouds.collect::<Result<Vec<_>, _>>()?, size)
         };
-        self.submit_views(count, workspace, options, call, seen).await
+        self.submit_views(count, workspace, options, call, make_views).await
     }
 
-    /// Fuses so many views, which are `seen` in a workspace and a cube of that size, and queues what they show.
+    /// Fuses `count` views and queues the scene. `make_views` returns the views in a workspace and a cube of that size,
+    /// metres.
     async fn submit_views(
         &self,
         count: usize,
         workspace: Option<pb::Workspace>,
         options: Option<pb::Options>,
         call: &mut Call,
-        seen: impl FnOnce(&Workspace, f64) -> Result<Vec<View>, FieldError> + Send + 'static,
+        make_views: impl FnOnce(&Workspace, f64) -> Result<Vec<View>, FieldError> + Send + 'static,
     ) -> Result<PendingReply, Refusal> {
         check_count(count)?;
         let params = DetectParams::try_from(&options.unwrap_or_default())?;
@@ -148,45 +150,44 @@ impl GraspRpc {
         let origin =
             FrameStamp::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
         let engine = self.models.select(&params.model, &params.version, None)?;
-        call.by(&engine);
-        let held = (self.conversion_permit(&engine)?, self.fusion_permit(call).await?);
-        engine.check_place()?;
-        let from = Arc::clone(&engine);
-        let fused = blocking(held, move || {
-            let views = seen(&workspace, size(&from.source, &workspace))?;
-            fuse(&from, params, &workspace, &views)
+        call.set_model(&engine);
+        let permits = (self.conversion_permit(&engine)?, self.fusion_permit(call).await?);
+        engine.check_capacity()?;
+        let selected = Arc::clone(&engine);
+        let fused = blocking(permits, move || {
+            let views = make_views(&workspace, size(&selected.source, &workspace))?;
+            fuse(&selected, params, &workspace, &views)
         });
         let (scene, params, fusion) = fused.await?;
         call.submit(&engine, scene, params, origin, Some(fusion))
     }
 
-    /// Ends a stream, and counts and tells that.
-    fn refuse(&self, refusal: Refusal, caller: CallContext) -> Status {
-        let (call, _) = self.calls.open(String::new(), caller);
+    /// The status that ends a stream. The refusal is logged and counted.
+    fn refuse(&self, refusal: Refusal, context: CallContext) -> Status {
+        let (call, _) = self.calls.open(String::new(), context);
         let id = call.id.clone();
         call.end(refusal).status(&id)
     }
 
-    /// A turn to convert and fuse, or a refusal at once: where too many wait already, or the planner has no place.
+    /// Takes a conversion permit. Refuses immediately if none is left or the model's queue is full.
     fn conversion_permit(&self, engine: &Engine) -> Result<OwnedSemaphorePermit, Refusal> {
-        engine.check_place()?;
-        let conversion_permit = Arc::clone(&self.conversion_permits).try_acquire_owned();
-        Ok(conversion_permit
-            .map_err(|_| engine.overloaded("too many requests wait to be converted and fused".to_owned()))?)
+        engine.check_capacity()?;
+        let permit = Arc::clone(&self.conversion_permits).try_acquire_owned();
+        Ok(permit.map_err(|_| engine.overloaded("too many requests are waiting for fusion".to_owned()))?)
     }
 
-    /// Waits for a place to do it, but no longer than anybody waits for the reply.
+    /// Waits for a fusion permit until the call's deadline.
     async fn fusion_permit(&self, call: &Call) -> Result<OwnedSemaphorePermit, Refusal> {
-        let place = Arc::clone(&self.fusion_permits).acquire_owned();
-        let place = match call.deadline {
-            None => place.await,
-            Some(Deadline(deadline)) => timeout_at(deadline.into(), place).await.map_err(|_| EngineError::Expired)?,
+        let permit = Arc::clone(&self.fusion_permits).acquire_owned();
+        let permit = match call.deadline {
+            None => permit.await,
+            Some(Deadline(deadline)) => timeout_at(deadline.into(), permit).await.map_err(|_| EngineError::Expired)?,
         };
-        // Nobody closes it.
-        place.map_err(|_| EngineError::Gone.into())
+        // Cannot fail: the semaphore is never closed.
+        permit.map_err(|_| EngineError::SessionEnded.into())
     }
 
-    /// Integrates what came into the volume that is kept, and queues that.
+    /// Integrates the views of a request into the stream's volume, and queues the scene.
     async fn submit_track(
         &self,
         request: pb::TrackGraspsRequest,
@@ -200,20 +201,20 @@ impl GraspRpc {
             (options, _) => DetectParams::try_from(&options.unwrap_or_default())?,
         };
         let engine = self.models.select(&params.model, &params.version, None)?;
-        call.by(&engine);
-        // Without a turn: there are no more of these than volumes that are kept.
-        let place = self.fusion_permit(call).await?;
-        let (from, old) = (Arc::clone(&engine), track.take());
-        // It comes back in any case: what is wrong with a view does not cost the volume.
-        let (kept, fused) =
-            blocking(place, move || Ok(Track::integrate(old, &from, params, workspace, &views))).await?;
-        *track = kept;
+        call.set_model(&engine);
+        // No conversion permit is needed: --max-tracked already limits the streams.
+        let permit = self.fusion_permit(call).await?;
+        let (selected, old) = (Arc::clone(&engine), track.take());
+        // The volume is returned in any case, so an invalid view does not lose it.
+        let (new, fused) =
+            blocking(permit, move || Ok(Track::integrate(old, &selected, params, workspace, &views))).await?;
+        *track = new;
         let (scene, params, origin, fusion) = fused?;
         call.submit(&engine, scene, params, origin, Some(fusion))
     }
 }
 
-/// Views into a volume, and how long that took.
+/// Fuses views into a scene. Returns it with the updated parameters and the time that it took.
 fn fuse(
     engine: &Engine,
     mut params: DetectParams,
@@ -221,21 +222,21 @@ fn fuse(
     views: &[View],
 ) -> Result<(Scene, DetectParams, std::time::Duration), Refusal> {
     let started = Instant::now();
-    let grid = FusionGrid::of(&engine.source, workspace, &eyes(views))?;
+    let grid = FusionGrid::of(&engine.source, workspace, &camera_positions(views))?;
     let mut fusion = grid.fusion();
-    let sights = grid.integrate(&mut fusion, views)?;
+    let points = grid.integrate(&mut fusion, views)?;
     params.constraints = grid.within(params.constraints);
-    Ok((grid.scene(&fusion, Some(sights))?, params, started.elapsed()))
+    Ok((grid.scene(&fusion, Some(points))?, params, started.elapsed()))
 }
 
-/// On a thread that may take its time; those that move messages must not.
+/// Runs `work` on a thread for blocking tasks, to keep the async runtime's threads free.
 async fn blocking<T: Send + 'static>(
-    place: impl Send + 'static,
+    permits: impl Send + 'static,
     work: impl FnOnce() -> Result<T, Refusal> + Send + 'static,
 ) -> Result<T, Refusal> {
-    // The place is given back when the work is done, whether or not anybody still waits for it.
+    // Holds the permits until the work is done, even if the call is cancelled before.
     let work = move || {
-        let _place = place;
+        let _permits = permits;
         work()
     };
     let done = tokio::task::spawn_blocking(work).await;
@@ -248,30 +249,30 @@ impl GraspService for GraspRpc {
         &self,
         request: Request<pb::DetectGraspsRequest>,
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
-        let caller = CallContext::of(&request);
+        let context = CallContext::of(&request);
         let mut request = request.into_inner();
         let id = std::mem::take(&mut request.request_id);
-        self.begin(id, caller, async |call| self.submit(request, call).await).await.respond().await
+        self.begin(id, context, async |call| self.submit(request, call).await).await.respond().await
     }
 
     async fn detect_grasps_from_depth(
         &self,
         request: Request<pb::DetectGraspsFromDepthRequest>,
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
-        let caller = CallContext::of(&request);
+        let context = CallContext::of(&request);
         let mut request = request.into_inner();
         let id = std::mem::take(&mut request.request_id);
-        self.begin(id, caller, async |call| self.submit_depth(request, call).await).await.respond().await
+        self.begin(id, context, async |call| self.submit_depth(request, call).await).await.respond().await
     }
 
     async fn detect_grasps_from_cloud(
         &self,
         request: Request<pb::DetectGraspsFromCloudRequest>,
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
-        let caller = CallContext::of(&request);
+        let context = CallContext::of(&request);
         let mut request = request.into_inner();
         let id = std::mem::take(&mut request.request_id);
-        self.begin(id, caller, async |call| self.submit_cloud(request, call).await).await.respond().await
+        self.begin(id, context, async |call| self.submit_cloud(request, call).await).await.respond().await
     }
 
     type DetectGraspsStreamStream = BoxStream<pb::DetectGraspsStreamResponse>;
@@ -280,27 +281,27 @@ impl GraspService for GraspRpc {
         &self,
         request: Request<Streaming<pb::DetectGraspsRequest>>,
     ) -> Result<Response<Self::DetectGraspsStreamStream>, Status> {
-        // The stream's, hence that of every request in it.
-        let caller = CallContext::of(&request);
+        // Of the stream, and so of every request in it.
+        let context = CallContext::of(&request);
         let mut requests = request.into_inner();
         let service = self.clone();
         let (pending, calls) = mpsc::channel(READ_AHEAD);
         tokio::spawn(async move {
-            // A place first, then the next message: what is read is in flight, the rest waits with the client.
-            while let Ok(place) = pending.reserve().await {
+            // Reserves a slot before it reads a message, so that flow control keeps further messages at the client.
+            while let Ok(slot) = pending.reserve().await {
                 let message = tokio::select! {
                     message = requests.message() => message,
-                    () = draining(service.calls.state()) => return place.send(Err(service.refuse(Refusal::Draining, caller))),
+                    () = draining(service.calls.state()) => return slot.send(Err(service.refuse(Refusal::Draining, context))),
                 };
                 match message {
                     Ok(Some(mut request)) => {
                         let id = std::mem::take(&mut request.request_id);
                         let submit = async |call: &mut Call| service.submit(request, call).await;
-                        place.send(Ok(service.begin(id, caller.clone(), submit).await));
+                        slot.send(Ok(service.begin(id, context.clone(), submit).await));
                     }
                     Ok(None) => return,
-                    // Too large, or no message at all: HTTP/2's framing is lost, so the stream ends with this status.
-                    Err(status) => return place.send(Err(service.calls.unreadable(status))),
+                    // Too large or malformed: the framing of messages is lost, so the stream ends with this status.
+                    Err(status) => return slot.send(Err(service.calls.unreadable(status))),
                 }
             }
         });
@@ -318,22 +319,22 @@ impl GraspService for GraspRpc {
         &self,
         request: Request<Streaming<pb::TrackGraspsRequest>>,
     ) -> Result<Response<Self::TrackGraspsStream>, Status> {
-        let caller = CallContext::of(&request);
+        let context = CallContext::of(&request);
         let mut requests = request.into_inner();
         let service = self.clone();
-        let place = self.tracked_volumes.place().map_err(|refusal| self.refuse(refusal, caller.clone()))?;
+        let permit = self.tracked_volumes.acquire().map_err(|refusal| self.refuse(refusal, context.clone()))?;
         let (replies, sent) = mpsc::channel(2);
-        // Half of it is for what ends the stream, which must not wait for who reads nothing.
+        // One of the two slots is reserved for the status that ends the stream, in case the client reads no replies.
         let Ok(end) = replies.clone().try_reserve_owned() else {
-            return Err(Status::internal("a channel is full from the beginning"));
+            return Err(Status::internal("cannot reserve a slot in a new channel"));
         };
         tokio::spawn(async move {
-            // Given back when the stream ends, with the volume.
-            let _place = place;
+            // Released when the stream ends, with the volume.
+            let _permit = permit;
             let mut track = None;
             let ended = loop {
                 let next = async {
-                    // A place for the reply first: what is not read holds up what comes after it.
+                    // Reserves the reply's slot before it reads a message, so that unread replies stop further reading.
                     let reply = replies.reserve().await.ok()?;
                     Some((reply, requests.message().await))
                 };
@@ -342,8 +343,8 @@ impl GraspService for GraspRpc {
                         Some(next) => next,
                         None => return,
                     },
-                    () = draining(service.calls.state()) => break service.refuse(Refusal::Draining, caller),
-                    refusal = service.tracked_volumes.expired() => break service.refuse(refusal, caller),
+                    () = draining(service.calls.state()) => break service.refuse(Refusal::Draining, context),
+                    refusal = service.tracked_volumes.expired() => break service.refuse(refusal, context),
                 };
                 let mut request = match message {
                     Ok(Some(request)) => request,
@@ -351,17 +352,17 @@ impl GraspService for GraspRpc {
                     Err(status) => break service.calls.unreadable(status),
                 };
                 let id = std::mem::take(&mut request.request_id);
-                let answer = async {
+                let result = async {
                     let submit = async |call: &mut Call| service.submit_track(request, &mut track, call).await;
-                    let pending = service.begin(id, caller.clone(), submit).await;
+                    let pending = service.begin(id, context.clone(), submit).await;
                     let id = pending.call.id.clone();
                     response(id, pending.finish().await)
                 };
                 tokio::select! {
-                    // What was read is opened first, and counted.
+                    // Polls the request first, so that it is opened and counted.
                     biased;
-                    answer = answer => reply.send(Ok(answer)),
-                    // Who has gone wants none; the call counts as cancelled.
+                    result = result => reply.send(Ok(result)),
+                    // The client has closed the stream; the call counts as cancelled.
                     () = replies.closed() => return,
                 }
             };
@@ -375,7 +376,7 @@ impl GraspService for GraspRpc {
     }
 }
 
-/// An answer of a stream, which goes on after a refusal.
+/// One response of a stream. The stream continues after a refusal.
 fn response(request_id: String, outcome: Result<pb::DetectGraspsResponse, Refusal>) -> pb::DetectGraspsStreamResponse {
     let outcome = match outcome {
         Ok(response) => Outcome::Response(response),

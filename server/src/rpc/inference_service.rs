@@ -23,39 +23,39 @@ use crate::transport::response_buffer::{ResponseBuffer, ResponsePermit};
 
 const FP32: &str = "FP32";
 
-/// The most volumes of one request, if so many may wait.
+/// Maximum number of volumes per request.
 const MAX_BATCH: usize = 64;
 
-/// Bytes of the maps for each voxel of a volume: six f32.
+/// Bytes of the maps per voxel: six f32.
 const MAPS_PER_VOXEL: usize = 24;
 
-/// The Open Inference Protocol: a network's own input and output, for tools that know nothing of grasps.
+/// The Open Inference Protocol: a network's raw input and output, for generic inference clients.
 #[derive(Clone)]
 pub(crate) struct InferenceRpc {
     models: Arc<ModelRegistry>,
     calls: Calls,
-    /// Maps are a hundred times as large as the grasps in them.
-    outbox: ResponseBuffer,
+    /// Limits the memory of maps, which are a hundred times as large as the grasps in them.
+    response_buffer: ResponseBuffer,
 }
 
 impl InferenceRpc {
     pub fn new(models: Arc<ModelRegistry>, calls: Calls) -> Self {
-        Self { models, calls, outbox: ResponseBuffer::new() }
+        Self { models, calls, response_buffer: ResponseBuffer::new() }
     }
 
     fn is_ready(&self) -> bool {
         *self.calls.state().borrow() == State::Ready
     }
 
-    /// The network of that name; a planner without one has nothing to infer.
+    /// The network with this name and version. Planners without a network are not found.
     fn network(&self, name: &str, version: &str) -> Result<Arc<Engine>, Refusal> {
-        let wanted = || on_a_line(format!("{name} {version}").trim_end());
+        let requested = || on_a_line(format!("{name} {version}").trim_end());
         let networks = || {
             let served = self.models.now();
             let names = served.iter().filter(|engine| engine.source.network().is_some());
             names.map(|engine| engine.label.clone()).collect::<Vec<_>>().join(", ")
         };
-        let unknown = || Refusal::UnknownModel { field: "model_name", wanted: wanted(), available: networks() };
+        let unknown = || Refusal::UnknownModel { field: "model_name", requested: requested(), available: networks() };
         if name.is_empty() {
             return Err(unknown());
         }
@@ -63,22 +63,22 @@ impl InferenceRpc {
         if engine.source.network().is_some() { Ok(engine) } else { Err(unknown()) }
     }
 
-    /// Checks a request and queues each of its volumes.
+    /// Validates a request and queues each of its volumes.
     fn submit(&self, request: &oip::ModelInferRequest, call: &mut Call) -> Result<Queued, Refusal> {
         let engine = self.network(&request.model_name, &request.model_version)?;
-        call.by(&engine);
+        call.set_model(&engine);
         let network = engine.source.network().map(|entry| &entry.metadata);
         let (n, voxel_size) = network.map_or((0, 0.0), |metadata| (metadata.resolution, metadata.voxel_size));
         for output in &request.outputs {
             if !OUTPUTS.iter().any(|(name, _)| *name == output.name) {
-                let needed = "the outputs are quality, rotation and width";
+                let needed = "must be quality, rotation or width";
                 return Err(FieldError::new("outputs", format_args!("`{}`", output.name), needed).into());
             }
         }
         let batch = batches(request, n, max_batch(&engine))?;
-        let held = self.outbox.hold(batch.len() * MAPS_PER_VOXEL).ok_or_else(|| {
-            let most = ResponseBuffer::CAPACITY >> 20;
-            engine.overloaded(format!("of {most} MiB of maps too few were read yet by those who asked for them"))
+        let permit = self.response_buffer.acquire(batch.len() * MAPS_PER_VOXEL).ok_or_else(|| {
+            let capacity = ResponseBuffer::CAPACITY >> 20;
+            engine.overloaded(format!("the buffer of unread ModelInfer responses is full ({capacity} MiB)"))
         })?;
         let volume = |values: &[f32]| {
             let volume = Volume::new(n, voxel_size, Isometry3::identity(), values.to_vec());
@@ -87,24 +87,24 @@ impl InferenceRpc {
             })
         };
         let volumes = batch.chunks_exact(n.pow(3)).map(volume).collect::<Result<Vec<_>, _>>()?;
-        // If one finds no place, those before it leave theirs.
+        // If the queue is full for one volume, the volumes before it leave the queue when their replies are dropped.
         let replies = volumes.into_iter().map(|volume| engine.maps(volume, call.deadline, call.span()));
         let replies = replies.collect::<Result<Vec<_>, _>>()?;
-        Ok(Queued { engine, replies, held })
+        Ok(Queued { engine, replies, permit })
     }
 }
 
-/// The volumes of a request, on their way.
+/// The queued volumes of a request.
 struct Queued {
     engine: Arc<Engine>,
     replies: Vec<Reply<Tensors>>,
-    held: ResponsePermit,
+    permit: ResponsePermit,
 }
 
-/// The values of the input, checked: `[batch, 1, n, n, n]`.
-fn batches(request: &oip::ModelInferRequest, n: usize, most: usize) -> Result<Vec<f32>, FieldError> {
+/// The validated values of the input `[batch, 1, n, n, n]`.
+fn batches(request: &oip::ModelInferRequest, n: usize, max_batch: usize) -> Result<Vec<f32>, FieldError> {
     let [InferInputTensor { name, datatype, shape, contents, .. }] = &request.inputs[..] else {
-        let needed = format_args!("must have the one tensor `{INPUT}`");
+        let needed = format_args!("must contain exactly one tensor, `{INPUT}`");
         return Err(FieldError::new("inputs", format_args!("a list of {}", request.inputs.len()), needed));
     };
     if name != INPUT {
@@ -118,8 +118,8 @@ fn batches(request: &oip::ModelInferRequest, n: usize, most: usize) -> Result<Ve
         [batch, 1, x, y, z] if [x, y, z] == [edge; 3] => usize::try_from(batch).unwrap_or(0),
         _ => 0,
     };
-    if !(1..=most).contains(&batch) {
-        let needed = format_args!("must be [batch, 1, {n}, {n}, {n}] with a batch from 1 to {most}");
+    if !(1..=max_batch).contains(&batch) {
+        let needed = format_args!("must be [batch, 1, {n}, {n}, {n}] with a batch from 1 to {max_batch}");
         return Err(FieldError::new("inputs[0].shape", format_args!("{shape:?}"), needed));
     }
     let expected = batch * n.pow(3);
@@ -128,17 +128,17 @@ fn batches(request: &oip::ModelInferRequest, n: usize, most: usize) -> Result<Ve
             raw.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect()
         }
         ([raw], None) => {
-            let needed = format_args!("the shape needs {}", 4 * expected);
+            let needed = format_args!("must be {} bytes for this shape", 4 * expected);
             return Err(FieldError::new("raw_input_contents[0]", format_args!("{} bytes", raw.len()), needed));
         }
         ([], Some(contents)) => contents.fp32_contents.clone(),
         (raw, contents) => {
             let given = usize::from(contents.is_some());
-            let value = format_args!("a list of {}, beside {given} of contents", raw.len());
+            let value = format_args!("a list of {} with {given} of contents", raw.len());
             return Err(FieldError::new(
                 "raw_input_contents",
                 value,
-                "the tensor's values must come in one of the two",
+                "the tensor's values must be in exactly one of raw_input_contents[0] and inputs[0].contents",
             ));
         }
     };
@@ -148,18 +148,18 @@ fn batches(request: &oip::ModelInferRequest, n: usize, most: usize) -> Result<Ve
         Err(FieldError::new(
             "inputs[0]",
             format_args!("{} values", values.len()),
-            format_args!("the shape needs {expected}"),
+            format_args!("must be {expected} values for this shape"),
         ))
     }
 }
 
-/// Copies of megabytes are made where no messages are moved.
+/// Runs `work` on a thread for blocking tasks, because it copies megabytes.
 async fn copying<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, Status> {
     let copied = spawn_blocking(work).await;
     copied.map_err(|panic| Status::internal(EngineError::Panic(panic.to_string()).to_string()))
 }
 
-/// The volumes' maps one after the other, as one tensor for each output that was asked for.
+/// The response: the maps of all volumes, concatenated to one tensor per requested output.
 fn response(
     request: oip::ModelInferRequest,
     engine: &Engine,
@@ -259,9 +259,9 @@ impl GrpcInferenceService for InferenceRpc {
         &self,
         request: Request<oip::ModelInferRequest>,
     ) -> Result<Response<oip::ModelInferResponse>, Status> {
-        let caller = CallContext::of(&request);
+        let context = CallContext::of(&request);
         let request = request.into_inner();
-        let (mut call, checked) = self.calls.open(request.id.clone(), caller);
+        let (mut call, checked) = self.calls.open(request.id.clone(), context);
         let id = call.id.clone();
         let inference = self.clone();
         let (call, request, queued) = copying(move || {
@@ -270,12 +270,12 @@ impl GrpcInferenceService for InferenceRpc {
         })
         .await?;
         let outcome = match queued {
-            Ok(Queued { engine, replies, held }) => call.maps(replies).await.map(|answer| (engine, held, answer)),
+            Ok(Queued { engine, replies, permit }) => call.maps(replies).await.map(|maps| (engine, permit, maps)),
             Err(refusal) => Err(call.end(refusal)),
         };
-        let (engine, held, (maps, timings)) = outcome.map_err(|refusal| refusal.status(&id))?;
+        let (engine, permit, (maps, timings)) = outcome.map_err(|refusal| refusal.status(&id))?;
         let mut response = Response::new(copying(move || response(request, &engine, &maps, &timings)).await?);
-        response.extensions_mut().insert(held);
+        response.extensions_mut().insert(permit);
         Ok(response)
     }
 
@@ -298,7 +298,6 @@ impl GrpcInferenceService for InferenceRpc {
                 name: engine.source.name().to_owned(),
                 platform: PLATFORM.to_owned(),
                 backend: "onnxruntime".to_owned(),
-                // At most, as the requests are bounded.
                 max_batch_size: max_batch(&engine) as i32,
                 input: vec![oip::ModelInput { name: INPUT.to_owned(), data_type, dims: dims(1) }],
                 output: OUTPUTS.into_iter().map(output).collect(),
@@ -307,15 +306,15 @@ impl GrpcInferenceService for InferenceRpc {
     }
 }
 
-/// As Triton calls what runs ONNX files.
+/// Triton's platform name for ONNX Runtime.
 const PLATFORM: &str = "onnxruntime_onnx";
 
-/// Voxels along an edge of what a network reads.
+/// Resolution of a network's input, voxels along an edge.
 fn edge(engine: &Engine) -> i64 {
     engine.source.network().map_or(0, |entry| entry.metadata.resolution as i64)
 }
 
-/// A request whose volumes do not all fit into the queue, or whose maps into the outbox, could never be answered.
+/// Maximum number of volumes per request: all of them must fit into the queue, and their maps into the response buffer.
 fn max_batch(engine: &Engine) -> usize {
     let maps = (edge(engine) as usize).pow(3) * MAPS_PER_VOXEL;
     MAX_BATCH.min(engine.capacity()).min(ResponseBuffer::CAPACITY / maps.max(1))

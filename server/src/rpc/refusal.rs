@@ -8,32 +8,32 @@ use tonic_types::{ErrorDetails, StatusExt};
 
 use crate::serving::engine::{EngineError, Overloaded};
 
-/// Why a request gets no grasps.
+/// Why a request ends without grasps.
 #[derive(Debug, Error)]
 pub(crate) enum Refusal {
     #[error(transparent)]
     Field(#[from] FieldError),
-    #[error("{field} is `{wanted}`, there is no such; there are {available}")]
-    UnknownModel { field: &'static str, wanted: String, available: String },
+    #[error("{field}: `{requested}` not found; available: {available}")]
+    UnknownModel { field: &'static str, requested: String, available: String },
     #[error(transparent)]
     Overloaded(#[from] Overloaded),
-    #[error("the server is warming up; come back in {0:?}")]
+    #[error("the server is warming up; retry after {0:?}")]
     Starting(Duration),
-    #[error("the server is shutting down; another one may be up")]
+    #[error("the server is shutting down; retry on another replica")]
     Draining,
-    #[error("{0} volumes are kept already, no more are; end a stream, or raise --max-tracked")]
+    #[error("all {0} TrackGrasps streams are in use; close a stream, or raise --max-tracked")]
     TooManyTracked(usize),
-    #[error("no request came for {0:?}: the volume is gone; open another stream")]
+    #[error("no request for {0:?} (--track-timeout), the volume was dropped; open a new stream")]
     TrackExpired(Duration),
     #[error(transparent)]
     Failed(#[from] EngineError),
 }
 
-/// The trailer with which gRPC servers tell clients when to retry (gRPC proposal A6).
+/// The trailer with the server's retry hint (gRPC proposal A6).
 const RETRY_PUSHBACK: &str = "grpc-retry-pushback-ms";
 
-/// When it is worth asking again for a volume to be kept: streams live long.
-const KEPT: Duration = Duration::from_secs(1);
+/// Retry hint when all streams are in use: streams live long.
+const STREAMS_IN_USE: Duration = Duration::from_secs(1);
 
 impl Refusal {
     pub fn code(&self) -> Code {
@@ -48,7 +48,7 @@ impl Refusal {
         }
     }
 
-    /// The field of the request that is not what it must be.
+    /// The invalid field of the request, if a field is the reason.
     fn field(&self) -> Option<&str> {
         match self {
             Self::Field(error) => Some(&error.field),
@@ -57,12 +57,12 @@ impl Refusal {
         }
     }
 
-    /// When it is worth coming back, where it is.
+    /// The retry hint; None if a retry does not help.
     fn retry_after(&self) -> Option<Duration> {
         match self {
             Self::Overloaded(overloaded) => Some(overloaded.retry_after),
             Self::Starting(retry_after) => Some(*retry_after),
-            Self::TooManyTracked(_) => Some(KEPT),
+            Self::TooManyTracked(_) => Some(STREAMS_IN_USE),
             Self::Field(_) | Self::UnknownModel { .. } | Self::Draining | Self::TrackExpired(_) | Self::Failed(_) => {
                 None
             }
@@ -71,9 +71,9 @@ impl Refusal {
 }
 
 impl Refusal {
-    /// With what clients need to react to it by themselves: `google.rpc.BadRequest` names the field, `google.rpc.RetryInfo`
-    /// says when to come back, and so does the trailer that gRPC's own retries look at; `google.rpc.RequestInfo` has the
-    /// id by which the server's log knows the request.
+    /// The gRPC status, with details for clients: `google.rpc.BadRequest` names the field, `google.rpc.RetryInfo` and
+    /// the trailer for gRPC's built-in retries contain the retry hint, and `google.rpc.RequestInfo` the request id that
+    /// is in the server's log.
     pub fn status(self, request_id: &str) -> Status {
         let mut details = ErrorDetails::new();
         details.set_request_info(request_id, "");
@@ -110,15 +110,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn clients_are_told_when_to_come_back_in_every_way_they_look_at() {
+    fn the_status_has_the_retry_hint_in_its_details_and_in_the_trailer() {
         let after = Duration::from_millis(1500);
         let status = Refusal::Starting(after).status("7");
         assert_eq!(status.get_details_retry_info().and_then(|info| info.retry_delay), Some(after));
         assert_eq!(status.metadata().get(RETRY_PUSHBACK).unwrap(), "1500");
-        let gone = Refusal::Failed(EngineError::Gone).status("7");
-        assert_eq!(gone.message(), "the session is gone (request 7)");
-        assert_eq!(gone.get_details_request_info().unwrap().request_id, "7");
-        assert!(gone.get_details_retry_info().is_none() && gone.metadata().get(RETRY_PUSHBACK).is_none());
+        let failed = Refusal::Failed(EngineError::SessionEnded).status("7");
+        assert_eq!(failed.message(), "the session thread has ended (request 7)");
+        assert_eq!(failed.get_details_request_info().unwrap().request_id, "7");
+        assert!(failed.get_details_retry_info().is_none() && failed.metadata().get(RETRY_PUSHBACK).is_none());
         assert_eq!(Refusal::Failed(EngineError::Expired).status("7").code(), Code::DeadlineExceeded);
     }
 }

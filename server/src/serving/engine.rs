@@ -19,55 +19,51 @@ use crate::serving::queue::{Batching, Full, Queue, QueueSlot};
 use crate::telemetry::metrics::Metrics;
 use crate::transport::deadline::Deadline;
 
-/// One planner: its queue, and what is said of it. The sessions that take from the queue end when the engine is dropped.
+/// One model with its queue. Its session threads end when the engine is dropped.
 pub(crate) struct Engine {
     pub source: Source,
-    /// `name version`, as the log and the metrics have it.
+    /// `name version`, used in the log and the metrics.
     pub label: String,
-    /// What runs it.
     pub backend: Backend,
     queue: Arc<Queue<Job>>,
     service_time: Arc<ServiceTime>,
 }
 
-/// How a model's requests are served.
+/// Settings that all engines share.
 #[derive(Clone, Copy)]
 pub(crate) struct Serving {
-    /// Sessions.
+    /// Sessions per model.
     pub workers: usize,
-    /// How each runs the model.
     pub options: Options,
-    /// Requests that may wait.
+    /// Queue length, requests.
     pub capacity: usize,
-    /// How many a session takes at once.
     pub batching: Batching,
 }
 
-/// What is measured of a model's queue.
+/// The metrics of a model's queue.
 pub(crate) struct Gauges {
-    /// Requests that wait.
+    /// Queued requests.
     pub waiting: IntGauge,
-    /// Volumes in a batch.
+    /// Volumes per batch.
     pub batch: Histogram,
 }
 
-/// The threads of every engine's sessions.
+/// The session threads of all engines.
 #[derive(Default)]
 pub(crate) struct SessionThreads(Mutex<Vec<JoinHandle<()>>>);
 
-/// Why a volume was not taken.
+/// A request was refused because a queue or buffer is full.
 #[derive(Debug, Error)]
-#[error("{what}, no more are taken; come back in {retry_after:?}")]
+#[error("{reason}; retry after {retry_after:?}")]
 pub(crate) struct Overloaded {
-    /// What there is as much of as may be.
-    what: String,
-    /// When a place in the queue should be free again.
+    reason: String,
+    /// Estimated time until a slot is free.
     pub retry_after: Duration,
 }
 
-/// What a session made of a scene.
+/// A session's result for one scene, with its timings.
 pub(crate) struct SessionOutput<T> {
-    pub made: T,
+    pub value: T,
     pub queue: Duration,
     pub inference: Duration,
     pub postprocessing: Duration,
@@ -75,22 +71,21 @@ pub(crate) struct SessionOutput<T> {
 
 /// The grasps in a scene.
 pub(crate) struct Detection {
-    /// Best first, as many as were asked for.
+    /// Best first, at most as many as requested.
     pub grasps: Vec<Grasp>,
-    /// Whether the hand would meet something at each of them, where that was asked.
+    /// For each grasp, whether the hand collides; None if not requested.
     pub collides: Option<Vec<bool>>,
-    /// Why there are no others.
+    /// Counts of dropped candidates by reason.
     pub dropped: Dropped,
-    /// How many more there are.
+    /// Grasps beyond the requested number.
     pub over_limit: usize,
-    /// What was looked at.
     pub volume: Volume,
 }
 
 /// A network's [`OUTPUTS`](grasp_models::OUTPUTS), as bytes: f32, little-endian.
 pub(crate) struct Tensors(pub [Vec<u8>; 3]);
 
-/// Why a session could not answer.
+/// Why a session returned no result.
 #[derive(Clone, Debug, Error)]
 pub(crate) enum EngineError {
     #[error(transparent)]
@@ -99,11 +94,11 @@ pub(crate) enum EngineError {
     Decode(#[from] DecodeError),
     #[error("the session panicked: {0}")]
     Panic(String),
-    #[error("this planner has no network whose output could be told")]
+    #[error("the planner has no network, which ModelInfer requires")]
     NoNetwork,
-    #[error("the session is gone")]
-    Gone,
-    #[error("the deadline has passed before the answer was ready")]
+    #[error("the session thread has ended")]
+    SessionEnded,
+    #[error("the deadline passed before the request was finished")]
     Expired,
 }
 
@@ -112,15 +107,15 @@ impl From<PlanError> for EngineError {
         match error {
             PlanError::Run(error) => error.into(),
             PlanError::Decode(error) => error.into(),
-            // A session asks for as long as the deadline has not passed and the caller waits.
+            // Planning is cancelled when the deadline passes or the client cancels; the latter receives no response.
             PlanError::Cancelled => Self::Expired,
         }
     }
 }
 
-/// What a session's answer comes by. Who drops it has gone, and the volume is not looked at any more.
+/// The pending result of a queued scene. Dropping it removes the scene from the queue.
 pub(crate) struct Reply<T> {
-    answer: Receiver<T>,
+    receiver: Receiver<T>,
     _slot: QueueSlot<Job>,
 }
 
@@ -128,18 +123,18 @@ pub(super) type Sender<T> = oneshot::Sender<Result<SessionOutput<T>, EngineError
 type Receiver<T> = oneshot::Receiver<Result<SessionOutput<T>, EngineError>>;
 
 impl<T> Reply<T> {
-    /// Waits for it, but no longer than anybody waits for the reply.
+    /// Waits for the result until the deadline.
     pub async fn wait(self, deadline: Option<Deadline>) -> Result<SessionOutput<T>, EngineError> {
-        let Self { answer, _slot } = self;
-        let answer = match deadline {
-            None => answer.await,
+        let Self { receiver, _slot } = self;
+        let result = match deadline {
+            None => receiver.await,
             Some(Deadline(deadline)) => {
-                let waited = tokio::time::timeout_at(deadline.into(), answer).await;
-                waited.map_err(|_| EngineError::Expired)?
+                let result = tokio::time::timeout_at(deadline.into(), receiver).await;
+                result.map_err(|_| EngineError::Expired)?
             }
         };
-        // A session that is gone drops what it had: that is told, too.
-        answer.unwrap_or(Err(EngineError::Gone))
+        // The sender is dropped without a result if the session thread has ended.
+        result.unwrap_or(Err(EngineError::SessionEnded))
     }
 }
 
@@ -151,10 +146,10 @@ pub(super) struct Job {
     pub submitted: Instant,
 }
 
-/// What is to be made of a scene.
+/// What a session computes from a scene.
 pub(super) enum Task {
     Grasps(Box<DetectParams>, Sender<Detection>),
-    /// The network's own output.
+    /// The network's raw output.
     Maps(Sender<Tensors>),
 }
 
@@ -166,7 +161,7 @@ impl Task {
         }
     }
 
-    /// Whoever asked may have gone meanwhile, which is counted on their side.
+    /// Sends an error. A failed send is ignored: the call counts as cancelled by the client.
     pub fn fail(self, error: EngineError) {
         match self {
             Self::Grasps(_, reply) => drop(reply.send(Err(error))),
@@ -175,11 +170,11 @@ impl Task {
     }
 }
 
-/// How long the last answer took: when the next place in the queue will be free.
+/// Time per scene of the last batch: the estimated time until a queue slot is free.
 pub(super) struct ServiceTime(AtomicU64);
 
 impl Engine {
-    /// Loads the planner's sessions, has each of them answer once, and starts them behind its queue.
+    /// Loads and warms up the sessions, and starts their threads.
     pub fn start(
         source: Source,
         serving: &Serving,
@@ -193,28 +188,38 @@ impl Engine {
         let mut service_time = Duration::ZERO;
         for planner in &mut planners {
             if let Loaded::Network(network) = planner {
-                service_time =
-                    warm_up(network, batching.max).with_context(|| format!("the model {label} cannot answer"))?;
+                service_time = warm_up(network, batching.max)
+                    .with_context(|| format!("the warm-up inference of the model {label} failed"))?;
             }
         }
         let Gauges { waiting, batch } = metrics.gauges(&label);
         let queue = Arc::new(Queue::new(workers, capacity, waiting));
-        // From here on it closes its queue when it goes, which is what ends the sessions that have been started.
+        // Created before the threads, so that an early return drops it, which closes the queue and ends started
+        // threads.
         let engine = Self { source, label, backend, queue, service_time: Arc::new(ServiceTime::new(service_time)) };
         for (worker, planner) in planners.into_iter().enumerate() {
             let (queue, service_time) = (Arc::clone(&engine.queue), Arc::clone(&engine.service_time));
-            let own = engine.source.decode_params();
-            let session = Session { planner, own, queue, batching, batch: batch.clone(), service_time };
+            let defaults = engine.source.decode_params();
+            let session = Session { planner, defaults, queue, batching, batch: batch.clone(), service_time };
             sessions.spawn(format!("{} {worker}", engine.source.name()), session).with_context(|| {
                 format!("cannot start thread {worker} of {workers} for the model {}; lower --workers", engine.label)
             })?;
         }
-        let (Backend { provider, precision }, threads, took) = (backend, options.threads, started.elapsed());
-        info!(model = engine.label, sha256 = engine.source.sha256(), %provider, %precision, workers, threads, ?took, "loaded");
+        let (Backend { provider, precision }, threads, duration) = (backend, options.threads, started.elapsed());
+        info!(
+            model = engine.label,
+            sha256 = engine.source.sha256(),
+            %provider,
+            %precision,
+            workers,
+            threads,
+            took = ?duration,
+            "model loaded"
+        );
         Ok(engine)
     }
 
-    /// Queues a scene to look for grasps in it, or refuses at once.
+    /// Queues a scene for grasp detection. Refuses immediately if the queue is full.
     pub fn detect(
         &self,
         scene: Scene,
@@ -222,25 +227,25 @@ impl Engine {
         deadline: Option<Deadline>,
         span: Span,
     ) -> Result<Reply<Detection>, Overloaded> {
-        let (reply, answer) = oneshot::channel();
-        let slot = self.push(scene, Task::Grasps(Box::new(params), reply), deadline, span)?;
-        Ok(Reply { answer, _slot: slot })
+        let (sender, receiver) = oneshot::channel();
+        let slot = self.push(scene, Task::Grasps(Box::new(params), sender), deadline, span)?;
+        Ok(Reply { receiver, _slot: slot })
     }
 
-    /// Queues a volume to have a network's own output, or refuses at once.
+    /// Queues a volume for the network's raw output. Refuses immediately if the queue is full.
     pub fn maps(&self, volume: Volume, deadline: Option<Deadline>, span: Span) -> Result<Reply<Tensors>, Overloaded> {
-        let (reply, answer) = oneshot::channel();
-        let slot = self.push(Scene { volume, points: None }, Task::Maps(reply), deadline, span)?;
-        Ok(Reply { answer, _slot: slot })
+        let (sender, receiver) = oneshot::channel();
+        let slot = self.push(Scene { volume, points: None }, Task::Maps(sender), deadline, span)?;
+        Ok(Reply { receiver, _slot: slot })
     }
 
-    /// The most scenes that wait.
+    /// Queue length, requests.
     pub fn capacity(&self) -> usize {
         self.queue.capacity()
     }
 
-    /// Refuses where there is no place at this moment, so that nothing is prepared in vain.
-    pub fn check_place(&self) -> Result<(), Overloaded> {
+    /// Refuses if the queue is full now, before the caller converts and fuses data.
+    pub fn check_capacity(&self) -> Result<(), Overloaded> {
         if self.queue.is_full() { Err(self.full()) } else { Ok(()) }
     }
 
@@ -251,18 +256,22 @@ impl Engine {
         deadline: Option<Deadline>,
         span: Span,
     ) -> Result<QueueSlot<Job>, Overloaded> {
-        // The queue is closed only when the engine goes.
+        // The queue is open: only dropping the engine closes it.
         let job = Job { scene, task, deadline, span, submitted: Instant::now() };
         self.queue.push(job).map_err(|Full| self.full())
     }
 
     fn full(&self) -> Overloaded {
-        self.overloaded(format!("the model `{}` has {} requests waiting", self.source.name(), self.capacity()))
+        self.overloaded(format!(
+            "the queue of the model `{}` is full ({} requests)",
+            self.source.name(),
+            self.capacity()
+        ))
     }
 
-    /// Refuses what there is no place for, here or on the way: when there may be one, its service_time says.
-    pub fn overloaded(&self, what: String) -> Overloaded {
-        Overloaded { what, retry_after: self.service_time.get() }
+    /// A refusal with a retry hint from the current service time.
+    pub fn overloaded(&self, reason: String) -> Overloaded {
+        Overloaded { reason, retry_after: self.service_time.get() }
     }
 }
 
@@ -281,20 +290,20 @@ impl SessionThreads {
         Ok(())
     }
 
-    /// Waits for the sessions to end, which they do once their engine is dropped and they have answered what they have, but
-    /// no longer than this.
-    pub fn join(&self, patience: Duration) {
-        let until = Instant::now() + patience;
+    /// Waits until the session threads end, at most `timeout`. A session ends when its engine is dropped and its queue
+    /// is empty.
+    pub fn join(&self, timeout: Duration) {
+        let until = Instant::now() + timeout;
         let threads = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
         for thread in threads {
             while !thread.is_finished() && Instant::now() < until {
                 thread::sleep(Duration::from_millis(1));
             }
             if !thread.is_finished() {
-                warn!(session = thread.thread().name(), "is still computing, and left behind");
+                warn!(session = thread.thread().name(), "session thread still running at shutdown");
                 continue;
             }
-            // A session catches its panics, and one that did not has nothing left to be waited for.
+            // Fails only after a panic, which ended the thread.
             let _ = thread.join();
         }
     }
@@ -311,7 +320,7 @@ impl ServiceTime {
         self.0.store(duration.as_micros().try_into().unwrap_or(u64::MAX), Ordering::Relaxed);
     }
 
-    /// At least a millisecond, the unit in which clients are told.
+    /// At least one millisecond, the unit of the retry hint.
     fn get(&self) -> Duration {
         Duration::from_micros(self.0.load(Ordering::Relaxed)).max(Duration::from_millis(1))
     }

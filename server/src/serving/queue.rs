@@ -5,10 +5,10 @@ use std::time::{Duration, Instant};
 use grasp_models::batch_sizes;
 use prometheus::IntGauge;
 
-/// What waits for a model's sessions, first come, first served.
+/// A bounded FIFO queue of jobs for a model's sessions.
 pub(crate) struct Queue<T> {
     state: Mutex<State<T>>,
-    /// Something came, or nothing will any more.
+    /// Signals a new job or the closing of the queue.
     changed: Condvar,
     capacity: usize,
     gauge: IntGauge,
@@ -17,8 +17,7 @@ pub(crate) struct Queue<T> {
 struct State<T> {
     waiting: VecDeque<Waiting<T>>,
     next: u64,
-    /// Sessions that have answered what they took: for each a job more may wait, whatever the capacity, for it will be
-    /// taken at once.
+    /// Idle sessions. Each allows one job beyond the capacity, because it takes that job immediately.
     free: usize,
     closed: bool,
 }
@@ -29,45 +28,45 @@ struct Waiting<T> {
     job: T,
 }
 
-/// A place in the queue. Who drops it has gone: the job leaves the queue, if no session has taken it yet.
+/// A slot in the queue. Dropping it removes its job, if no session has taken it yet.
 pub(crate) struct QueueSlot<T> {
     queue: Arc<Queue<T>>,
     number: u64,
 }
 
-/// How many jobs a session takes at once.
+/// How a session forms batches.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Batching {
-    /// At most so many.
+    /// Maximum batch size, jobs.
     pub max: usize,
-    /// For so long, counted from the first, a session that could take more waits for them.
+    /// Maximum time that a session waits for a batch to fill, from the arrival of its first job.
     pub delay: Duration,
 }
 
 impl Batching {
-    /// How many of those that wait are taken: the largest of the [sizes](batch_sizes) that networks are made ready for, so
-    /// that nothing is computed only to fill a batch up, and no batch is the first of its size.
+    /// The batch size for this number of waiting jobs: the largest of the [sizes](batch_sizes) that the networks are
+    /// warmed up for, so that batches need no padding.
     fn fitting(self, waiting: usize) -> usize {
         batch_sizes(self.max).take_while(|&size| size <= waiting).last().unwrap_or(0)
     }
 }
 
-/// So many jobs wait that no more are taken.
+/// The queue is full.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Full;
 
 impl<T> Queue<T> {
-    /// A queue of so many sessions, in which `capacity` jobs may wait. They are counted in `gauge`, beside those of
-    /// other queues that share it, as a model's old and new sessions do.
+    /// A queue for this many sessions and `capacity` waiting jobs, which are counted in `gauge`. During a reload, the
+    /// old and the new queue of a model share a gauge.
     pub fn new(sessions: usize, capacity: usize, gauge: IntGauge) -> Self {
         let state = State { waiting: VecDeque::new(), next: 0, free: sessions, closed: false };
         Self { state: Mutex::new(state), changed: Condvar::new(), capacity, gauge }
     }
 
-    /// Appends a job, or refuses it at once. Not for a queue that is closed.
+    /// Appends a job, or refuses it immediately. Must not be called after [`close`](Self::close).
     pub fn push(self: &Arc<Self>, job: T) -> Result<QueueSlot<T>, Full> {
         let mut state = self.lock();
-        // A free session may not have woken up yet for a job that waits.
+        // An idle session may not have woken up yet for a waiting job.
         if state.waiting.len() >= self.capacity + state.free {
             return Err(Full);
         }
@@ -80,19 +79,18 @@ impl<T> Queue<T> {
         Ok(QueueSlot { queue: Arc::clone(self), number })
     }
 
-    /// How many may wait.
     pub fn capacity(&self) -> usize {
         self.capacity
     }
 
-    /// Whether [`push`](Self::push) would refuse at this moment.
+    /// Whether [`push`](Self::push) would refuse a job now.
     pub fn is_full(&self) -> bool {
         let state = self.lock();
         state.waiting.len() >= self.capacity + state.free
     }
 
-    /// Waits for jobs and takes them, the oldest first; none when the queue is closed and empty. The session is busy then,
-    /// until it is [`free`](Self::free).
+    /// Waits for jobs and takes a batch, oldest first; None when the queue is closed and empty. The session counts as
+    /// busy until it calls [`free`](Self::free).
     pub fn take(&self, batching: Batching) -> Option<Vec<T>> {
         let mut state = self.lock();
         let waiting = |state: &mut State<T>| state.waiting.is_empty() && !state.closed;
@@ -107,19 +105,19 @@ impl<T> Queue<T> {
         let (left, ended) = (!state.waiting.is_empty(), state.closed && jobs.is_empty());
         drop(state);
         if left {
-            // Whoever woke this session did not wake another.
+            // `push` woke only this session.
             self.changed.notify_one();
         }
         if ended { None } else { Some(jobs) }
     }
 
-    /// A session is about to answer what it took. It says so first, so that whoever gets the answer finds room for the
-    /// next request.
+    /// Marks a session as idle. The session calls it before it sends its results, so that a client that has received
+    /// one finds a slot for its next request.
     pub fn free(&self) {
         self.lock().free += 1;
     }
 
-    /// Waits until there are as many jobs as fit together, or the first has waited long enough.
+    /// Waits until the batch is full, or the delay has passed since the arrival of its first job.
     fn gather<'a>(&self, mut state: MutexGuard<'a, State<T>>, batching: Batching) -> MutexGuard<'a, State<T>> {
         while !state.closed && state.waiting.len() < batching.max {
             let Some(first) = state.waiting.front() else { break };
@@ -132,7 +130,7 @@ impl<T> Queue<T> {
         state
     }
 
-    /// Nothing is taken in any more; what waits is still given out.
+    /// Closes the queue. Waiting jobs can still be taken.
     pub fn close(&self) {
         self.lock().closed = true;
         self.changed.notify_all();
@@ -140,14 +138,14 @@ impl<T> Queue<T> {
 
     fn remove(&self, number: u64) {
         let mut state = self.lock();
-        // Sorted by number, as they came.
+        // Sorted by number, because jobs are appended in that order.
         if let Ok(index) = state.waiting.binary_search_by_key(&number, |waiting| waiting.number) {
             state.waiting.remove(index);
             self.gauge.dec();
         }
     }
 
-    /// A panic cannot leave it half changed: nothing that could panic is done with it.
+    /// Ignores poisoning: no code that holds the lock can panic halfway through a change.
     fn lock(&self) -> MutexGuard<'_, State<T>> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -168,14 +166,14 @@ mod tests {
     const ONE: Batching = Batching { max: 1, delay: Duration::ZERO };
 
     fn queue(sessions: usize, capacity: usize) -> (Arc<Queue<u32>>, IntGauge) {
-        let gauge = IntGauge::new("waiting", "How many wait.").unwrap();
+        let gauge = IntGauge::new("waiting", "Waiting jobs.").unwrap();
         (Arc::new(Queue::new(sessions, capacity, gauge.clone())), gauge)
     }
 
     #[test]
-    fn jobs_come_out_in_their_order_and_no_more_than_fit_wait() {
+    fn jobs_are_taken_in_order_and_limited_by_the_capacity() {
         let (queue, gauge) = queue(0, 3);
-        let _places: Vec<_> = (0..3).map(|job| queue.push(job).ok().unwrap()).collect();
+        let _slots: Vec<_> = (0..3).map(|job| queue.push(job).ok().unwrap()).collect();
         assert_eq!(queue.push(3).err(), Some(Full));
         assert_eq!(gauge.get(), 3);
         queue.free();
@@ -186,15 +184,15 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fill_a_batch_is_left_for_the_next() {
+    fn batches_have_only_the_sizes_that_are_warmed_up() {
         let (queue, _) = queue(2, 16);
-        let _places: Vec<_> = (0..17).map(|job| queue.push(job).ok().unwrap()).collect();
+        let _slots: Vec<_> = (0..17).map(|job| queue.push(job).ok().unwrap()).collect();
         let take = || queue.take(Batching { max: 6, ..ONE }).inspect(|_| queue.free()).map(|jobs| jobs.len());
         assert_eq!([take(), take(), take(), take()], [6, 6, 4, 1].map(Some));
     }
 
     #[test]
-    fn who_has_gone_leaves_the_queue() {
+    fn a_dropped_slot_removes_its_job() {
         let (queue, gauge) = queue(1, 2);
         let first = queue.push(1).ok().unwrap();
         let second = queue.push(2).ok().unwrap();
@@ -207,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn a_closed_queue_gives_out_what_it_has_and_ends() {
+    fn a_closed_queue_returns_its_jobs_and_then_none() {
         let (queue, _) = queue(1, 2);
         let _slot = queue.push(1).ok().unwrap();
         queue.close();
@@ -217,36 +215,36 @@ mod tests {
     }
 
     #[test]
-    fn a_free_session_is_a_place_more_until_it_takes_something() {
+    fn an_idle_session_adds_one_to_the_capacity() {
         let (queue, _) = queue(1, 1);
-        let mut places = vec![queue.push(1).ok().unwrap(), queue.push(2).ok().unwrap()];
+        let mut slots = vec![queue.push(1).ok().unwrap(), queue.push(2).ok().unwrap()];
         assert_eq!(queue.push(3).err(), Some(Full));
         assert_eq!(queue.take(ONE), Some(vec![1]));
-        assert_eq!(queue.push(3).err(), Some(Full), "it is busy, and one waits");
+        assert_eq!(queue.push(3).err(), Some(Full), "the session is busy and one job waits");
         queue.free();
-        places.push(queue.push(3).ok().unwrap());
+        slots.push(queue.push(3).ok().unwrap());
         assert_eq!(queue.take(ONE), Some(vec![2]));
     }
 
     #[test]
-    fn a_session_that_may_wait_takes_what_comes_meanwhile() {
+    fn with_a_delay_a_batch_fills_up() {
         let (queue, _) = queue(2, 4);
         let batching = Batching { max: 3, delay: Duration::from_secs(600) };
         let session = {
             let queue = Arc::clone(&queue);
             thread::spawn(move || queue.take(batching))
         };
-        // It would wait ten minutes for a third.
-        let _places: Vec<_> = (0..3).map(|job| queue.push(job).ok().unwrap()).collect();
+        // The session would wait ten minutes for a third job.
+        let _slots: Vec<_> = (0..3).map(|job| queue.push(job).ok().unwrap()).collect();
         assert_eq!(session.join().unwrap(), Some(vec![0, 1, 2]));
 
-        // And it does not wait any longer than it may.
+        // After the delay it takes an incomplete batch.
         let _slot = queue.push(7).ok().unwrap();
         assert_eq!(queue.take(Batching { max: 3, delay: Duration::from_millis(1) }), Some(vec![7]));
     }
 
     #[test]
-    fn every_job_is_given_out_once_however_many_sessions_take() {
+    fn concurrent_sessions_take_each_job_exactly_once() {
         let (queue, _) = queue(4, 10_000);
         let sessions: Vec<_> = (0..4)
             .map(|index| {
@@ -256,11 +254,11 @@ mod tests {
                 thread::spawn(move || std::iter::from_fn(take).flatten().collect::<Vec<u32>>())
             })
             .collect();
-        let places: Vec<_> = (0..10_000).map(|job| queue.push(job).ok().unwrap()).collect();
+        let slots: Vec<_> = (0..10_000).map(|job| queue.push(job).ok().unwrap()).collect();
         queue.close();
-        let mut taken: Vec<u32> = sessions.into_iter().flat_map(|session| session.join().unwrap()).collect();
-        taken.sort_unstable();
-        assert_eq!(taken, (0..10_000).collect::<Vec<_>>());
-        drop(places);
+        let mut jobs: Vec<u32> = sessions.into_iter().flat_map(|session| session.join().unwrap()).collect();
+        jobs.sort_unstable();
+        assert_eq!(jobs, (0..10_000).collect::<Vec<_>>());
+        drop(slots);
     }
 }

@@ -7,22 +7,22 @@ use crate::rpc::refusal::Refusal;
 use crate::serving::engine::Engine;
 use grasp_planner::Source;
 
-/// The models that are served now.
+/// The served models.
 #[derive(Default)]
 pub(crate) struct ModelRegistry(RwLock<Engines>);
 
-/// The default first, then by name, the newest version of a name before the older ones.
+/// The default network first, then the other networks by name, then the planners without a network; per name the newest
+/// version first.
 pub(crate) type Engines = Arc<[Arc<Engine>]>;
 
 impl ModelRegistry {
-    /// What is served at this moment. Whoever holds it can still ask it, even if others are served meanwhile.
+    /// The models served now. Engines in the returned list remain usable after they are replaced.
     pub fn now(&self) -> Engines {
         Arc::clone(&self.0.read().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// From now on serves these.
     pub fn replace(&self, mut engines: Vec<Arc<Engine>>, default: Option<&str>) {
-        // From the newest version to the oldest, as the sort by name is stable; what is no network answers only by name.
+        // The sort by name is stable, so versions remain sorted. Only networks can be the default.
         engines.sort_by(|a, b| b.source.by_version(&a.source));
         engines.sort_by_key(|engine| {
             let name = engine.source.name().to_owned();
@@ -31,7 +31,8 @@ impl ModelRegistry {
         *self.0.write().unwrap_or_else(PoisonError::into_inner) = engines.into();
     }
 
-    /// The planner that a request asks for, if it takes volumes of that resolution, where the request has one already.
+    /// Selects the model that a request names, or the default. `resolution` is that of the request's volume, if it has
+    /// one; the model must accept it.
     pub fn select(&self, name: &str, version: &str, resolution: Option<usize>) -> Result<Arc<Engine>, Refusal> {
         let served = self.now();
         let fits = |engine: &Arc<Engine>| match (engine.source.network(), resolution) {
@@ -39,22 +40,22 @@ impl ModelRegistry {
             (None, Some(resolution)) => resolution <= Source::MAX_RESOLUTION,
             (_, None) => true,
         };
-        let taken = |engine: &Engine| match engine.source.network() {
+        let accepted = |engine: &Engine| match engine.source.network() {
             Some(network) => format!("{} ({})", network.metadata.resolution, engine.label),
             None => format!("at most {} ({})", Source::MAX_RESOLUTION, engine.label),
         };
-        let wrong = |taken: &str| {
-            let needed = format_args!("the models that could answer take {taken}");
+        let wrong = |accepted: &str| {
+            let needed = format_args!("supported: {accepted}");
             Refusal::from(FieldError::new("volume.resolution", resolution.unwrap_or_default(), needed))
         };
         if name.is_empty() {
             if !version.is_empty() {
-                let needed = "which needs a `model` that it is a version of";
+                let needed = "which requires options.model";
                 return Err(FieldError::new("options.version", format_args!("`{version}`"), needed).into());
             }
             let networks: Vec<_> = served.iter().filter(|engine| engine.source.network().is_some()).collect();
             let engine = networks.iter().find(|engine| fits(engine)).map(|&engine| Arc::clone(engine));
-            return engine.ok_or_else(|| wrong(&describe(&networks, taken)));
+            return engine.ok_or_else(|| wrong(&describe(&networks, accepted)));
         }
         let is_named = |engine: &&Arc<Engine>| {
             engine.source.name() == name && (version.is_empty() || engine.source.version() == version)
@@ -62,10 +63,10 @@ impl ModelRegistry {
         let is_known = served.iter().any(|engine| engine.source.name() == name);
         let engine = served.iter().find(is_named).ok_or_else(|| Refusal::UnknownModel {
             field: if is_known { "options.version" } else { "options.model" },
-            wanted: on_a_line(format!("{name} {version}").trim_end()),
+            requested: on_a_line(format!("{name} {version}").trim_end()),
             available: describe(&served.iter().collect::<Vec<_>>(), |engine| engine.label.clone()),
         })?;
-        if fits(engine) { Ok(Arc::clone(engine)) } else { Err(wrong(&taken(engine))) }
+        if fits(engine) { Ok(Arc::clone(engine)) } else { Err(wrong(&accepted(engine))) }
     }
 }
 
@@ -73,15 +74,15 @@ fn describe(served: &[&Arc<Engine>], engine: impl Fn(&Engine) -> String) -> Stri
     served.iter().map(|served| engine(served)).collect::<Vec<_>>().join(", ")
 }
 
-/// A network trained for voxels of one size sees the world scaled when they have another.
+/// Checks that a volume has the voxel size that the network was trained with; another size would scale the scene.
 pub(crate) fn check_voxel_size(volume: &Volume, engine: &Engine) -> Result<(), FieldError> {
     let Some(network) = engine.source.network() else { return Ok(()) };
-    let (got, trained) = (volume.voxel_size(), network.metadata.voxel_size);
-    if (got - trained).abs() <= 1e-3 * trained {
+    let (actual, trained) = (volume.voxel_size(), network.metadata.voxel_size);
+    if (actual - trained).abs() <= 1e-3 * trained {
         return Ok(());
     }
-    let needed = format_args!("the model {} takes {trained} m, to one in a thousand", engine.label);
-    Err(FieldError::new("volume.voxel_size", got, needed))
+    let needed = format_args!("must be {trained} m (±0.1 %) for the model {}", engine.label);
+    Err(FieldError::new("volume.voxel_size", actual, needed))
 }
 
 impl From<&ModelRegistry> for pb::ListModelsResponse {
@@ -97,7 +98,7 @@ impl From<&Engine> for pb::Model {
         Self {
             name: source.name().to_owned(),
             version: source.version().to_owned(),
-            // A network larger than `Volume::MAX_RESOLUTION` could not have been warmed up.
+            // Fits: the warm-up fails for networks larger than `Volume::MAX_RESOLUTION`.
             resolution: network.map_or(0, |metadata| metadata.resolution as u32),
             voxel_size: network.map_or(0.0, |metadata| metadata.voxel_size),
             threshold: source.decode_params().threshold,

@@ -15,16 +15,16 @@ use crate::serving::registry::ModelRegistry;
 use crate::telemetry::metrics::Metrics;
 use grasp_planner::Source;
 
-/// In the folder of models.
+/// Subfolder of the model folder with GPD's classifiers.
 const CLASSIFIERS: &str = "classifiers";
 
-/// In it, too: the name of the model that answers requests which name none.
+/// File in the model folder with the name of the default model.
 const DEFAULT: &str = "default";
 
-/// Brings the models of a folder into service, and keeps them as the folder has them.
+/// Loads the models of a folder into the registry, and reloads them when files change.
 pub(crate) struct ModelFolder {
     directory: PathBuf,
-    /// From before it was read first.
+    /// Taken before the folder was first read.
     stamps: Stamps,
     default_model: Option<String>,
     serving: Serving,
@@ -48,7 +48,8 @@ impl ModelFolder {
         Self { directory, stamps, default_model, serving, models, sessions, metrics }
     }
 
-    /// Serves all of these and what needs no network, or says which cannot be served; or gives up where the process is to stop meanwhile.
+    /// Loads the networks `entries`, the classifiers and the planners without a file, and serves them. Returns early
+    /// when the server is draining.
     pub fn load(&self, entries: &[Entry], state: &watch::Receiver<State>) -> anyhow::Result<()> {
         let mut engines = Vec::new();
         let classifiers = classifiers(&self.directory)?;
@@ -65,24 +66,24 @@ impl ModelFolder {
         Ok(())
     }
 
-    /// Reads the folder anew at SIGHUP, and whenever its files have changed and then stayed the same from one look to
-    /// the next: who is still writing one is not disturbed. Without `every` nobody looks.
-    pub async fn watch(self, mut hangup: Signal, every: Option<Duration>) {
+    /// Reloads the folder at SIGHUP, and when its files have changed and were then unchanged for one interval, so that
+    /// files that are still being written are not loaded. Without an interval, only SIGHUP reloads.
+    pub async fn watch(self, mut hangup: Signal, interval: Option<Duration>) {
         let folder = Arc::new(self);
         let mut loaded = folder.stamps.clone();
         let mut last = loaded.clone();
         loop {
-            let told = tokio::select! {
+            let is_requested = tokio::select! {
                 _ = hangup.recv() => true,
-                () = tokio::time::sleep(every.unwrap_or_default()), if every.is_some() => false,
+                () = tokio::time::sleep(interval.unwrap_or_default()), if interval.is_some() => false,
             };
-            // A file system across a network may take its time.
-            let looking = Arc::clone(&folder);
-            let Ok(now) = tokio::task::spawn_blocking(move || stamps(&looking.directory)).await else { continue };
-            if told || (now != loaded && now == last) {
+            // On a blocking thread, because network file systems may be slow.
+            let polled = Arc::clone(&folder);
+            let Ok(now) = tokio::task::spawn_blocking(move || stamps(&polled.directory)).await else { continue };
+            if is_requested || (now != loaded && now == last) {
                 let reloading = Arc::clone(&folder);
                 if let Err(panic) = tokio::task::spawn_blocking(move || reloading.reload()).await {
-                    error!(%panic, "the models could not be loaded anew");
+                    error!(%panic, "reloading the models panicked; the served models are unchanged");
                     folder.metrics.reloaded(Err(()));
                 }
                 loaded.clone_from(&now);
@@ -91,22 +92,22 @@ impl ModelFolder {
         }
     }
 
-    /// Loads what is new and warms it up beside what is served, then serves it instead. A file that cannot be served
-    /// changes nothing: what it held before goes on being served.
+    /// Loads and warms up new models while the old ones are served, then replaces them. If a file cannot be loaded, the
+    /// model that was loaded from it before remains served.
     fn reload(&self) {
         let scans = Scan::read(&self.directory).and_then(|networks| Ok((networks, classifiers(&self.directory)?)));
         let (networks, classifiers) = match scans {
             Ok(scans) => scans,
             Err(error) => {
-                error!(%error, "the models stay as they are");
+                error!(%error, "cannot read the model folder; the served models are unchanged");
                 return self.metrics.reloaded(Err(()));
             }
         };
         let served = self.models.now();
-        let mut refused: Vec<PathBuf> = Vec::new();
+        let mut rejected: Vec<PathBuf> = Vec::new();
         for error in networks.rejected.into_iter().chain(classifiers.rejected) {
-            error!(%error, "cannot be served, what it held before is kept");
-            refused.push(error.path().to_owned());
+            error!(%error, "cannot load a model file; its previous version remains served");
+            rejected.push(error.path().to_owned());
         }
         let mut engines = Vec::new();
         for source in sources(networks.entries, classifiers.entries) {
@@ -118,25 +119,28 @@ impl ModelFolder {
             match self.start(source) {
                 Ok(engine) => engines.push(engine),
                 Err(error) => {
-                    error!(error = format!("{error:#}"), "cannot be served, what it held before is kept");
-                    refused.extend(path);
+                    error!(
+                        error = format!("{error:#}"),
+                        "cannot load a model file; its previous version remains served"
+                    );
+                    rejected.extend(path);
                 }
             }
         }
-        let is_refused = |path: &Path| refused.iter().any(|refused| refused == path);
-        let kept = served.iter().filter(|engine| engine.source.path().is_some_and(is_refused));
+        let is_rejected = |path: &Path| rejected.iter().any(|rejected| rejected == path);
+        let kept = served.iter().filter(|engine| engine.source.path().is_some_and(is_rejected));
         for kept in kept.cloned().collect::<Vec<_>>() {
             if !engines.iter().any(|engine| engine.label == kept.label) {
                 engines.push(kept);
             }
         }
         if engines.iter().all(|engine| engine.source.network().is_none()) {
-            warn!("nothing in the folder can be served, the models stay as they are");
+            warn!("the model folder contains no network that can be served; the served models are unchanged");
         } else {
             self.replace(engines);
         }
-        // Last, so that whoever sees it in the metrics is answered by what was loaded.
-        self.metrics.reloaded(Ok(refused.len()));
+        // Last, so that the new models are served before the metric changes.
+        self.metrics.reloaded(Ok(rejected.len()));
     }
 
     fn start(&self, source: Source) -> anyhow::Result<Arc<Engine>> {
@@ -148,24 +152,24 @@ impl ModelFolder {
         let default = self.default_model.clone().or_else(|| default_of(&self.directory));
         if let Some(name) = default.as_deref().filter(|name| engines.iter().all(|engine| engine.source.name() != *name))
         {
-            warn!(name, "the default model is not served, the first by name is it instead");
+            warn!(name, "the default model is not served; the first network by name is the default instead");
         }
         self.models.replace(engines, default.as_deref());
         let now = self.models.now();
         self.metrics.replaced(&before, &now);
-        for gone in before.iter().filter(|engine| !now.iter().any(|other| Arc::ptr_eq(engine, other))) {
-            info!(model = gone.label, sha256 = gone.source.sha256(), "no longer served");
+        for removed in before.iter().filter(|engine| !now.iter().any(|other| Arc::ptr_eq(engine, other))) {
+            info!(model = removed.label, sha256 = removed.source.sha256(), "model no longer served");
         }
     }
 }
 
-/// What the folder says of it, if it does.
+/// The name in the file [`DEFAULT`], if there is one.
 fn default_of(directory: &Path) -> Option<String> {
     let name = fs::read_to_string(directory.join(DEFAULT)).ok()?;
     Some(name.trim().to_owned()).filter(|name| !name.is_empty())
 }
 
-/// The folder's own folder of GPD's classifiers, which need not be there.
+/// The classifiers in the subfolder [`CLASSIFIERS`], which may be missing.
 fn classifiers(directory: &Path) -> Result<Scan, StoreError> {
     let none = || Scan { entries: Vec::new(), rejected: Vec::new() };
     let directory = directory.join(CLASSIFIERS);
@@ -178,26 +182,26 @@ fn classifiers(directory: &Path) -> Result<Scan, StoreError> {
     }
 }
 
-/// What is served of a folder: its networks, its classifiers, and what needs neither.
+/// The sources of all planners: networks, classifiers, and SHAF, which needs no file.
 fn sources(networks: Vec<Entry>, classifiers: Vec<Entry>) -> Vec<Source> {
     let networks = networks.into_iter().map(Source::Network);
     networks.chain(classifiers.into_iter().map(Source::Gpd)).chain([Source::Shaf]).collect()
 }
 
-/// What tells a folder's files from other ones without reading them: name, time of the last change, size.
+/// Path, modification time and size of each model file, to detect changes without reading the files.
 pub(crate) type Stamps = Vec<(PathBuf, Option<SystemTime>, u64)>;
 
 pub(crate) fn stamps(directory: &Path) -> Stamps {
     let stamp = |path: PathBuf| {
-        // Of what a link leads to: Kubernetes swaps links.
+        // `fs::metadata` follows symbolic links, which Kubernetes swaps to update a volume.
         let metadata = fs::metadata(&path).ok()?;
         Some((path, metadata.modified().ok(), metadata.len()))
     };
     let folders = [directory.to_owned(), directory.join(CLASSIFIERS)];
     let files = folders.iter().flat_map(fs::read_dir).flatten().flatten().map(|file| file.path());
-    let counts =
+    let is_watched =
         |path: &PathBuf| path.extension().is_some_and(|extension| extension == "onnx") || path.ends_with(DEFAULT);
-    let mut stamps: Vec<_> = files.filter(counts).filter_map(stamp).collect();
+    let mut stamps: Vec<_> = files.filter(is_watched).filter_map(stamp).collect();
     stamps.sort();
     stamps
 }

@@ -1,4 +1,4 @@
-//! Session threads: each owns a planner, takes jobs from its model's queue, and answers them.
+//! Session threads: each owns a planner, takes jobs from its model's queue, and sends the results.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -16,73 +16,76 @@ use super::engine::{Detection, EngineError, Job, Sender, ServiceTime, SessionOut
 use super::queue::{Batching, Queue};
 use crate::transport::deadline::Deadline;
 
-/// A thread's own planner and its end of the queue.
+/// The state of a session thread.
 pub(super) struct Session {
     pub planner: Loaded,
-    /// How its grasps are chosen, unless a request says otherwise.
-    pub own: DecodeParams,
+    /// Decoding parameters for requests without their own.
+    pub defaults: DecodeParams,
     pub queue: Arc<Queue<Job>>,
     pub batching: Batching,
     pub batch: Histogram,
     pub service_time: Arc<ServiceTime>,
 }
 
-/// When a session took its jobs, and how long the work on all of them took.
+/// When a session took a batch from the queue, and how long its inference took.
 #[derive(Clone, Copy)]
-struct Taken {
-    at: Instant,
+struct BatchTimes {
+    taken: Instant,
     inference: Duration,
 }
 
 impl Session {
     pub fn run(mut self) {
-        let alone = Batching { max: 1, delay: Duration::ZERO };
-        let batching = if matches!(self.planner, Loaded::Single(_)) { alone } else { self.batching };
+        let single = Batching { max: 1, delay: Duration::ZERO };
+        let batching = if matches!(self.planner, Loaded::Single(_)) { single } else { self.batching };
         while let Some(mut jobs) = self.queue.take(batching) {
             let now = Instant::now();
             let expired = |job: &mut Job| job.deadline.is_some_and(|Deadline(deadline)| deadline <= now);
             for job in jobs.extract_if(.., expired) {
-                // The caller's own timer may have been faster.
                 job.task.fail(EngineError::Expired);
             }
-            // Whoever has gone has left the queue, but for those who went this very moment.
+            // Cancelled jobs leave the queue on their own, except those that are cancelled while they are taken.
             jobs.retain(|job| !job.task.is_closed());
             if jobs.is_empty() {
                 self.queue.free();
                 continue;
             }
             self.batch.observe(jobs.len() as f64);
-            let Self { planner, own, queue, service_time, .. } = &mut self;
+            let Self { planner, defaults, queue, service_time, .. } = &mut self;
             let scenes = u32::try_from(jobs.len()).unwrap_or(u32::MAX);
             let done = |inference: Duration| {
                 queue.free();
-                Taken { at: now, inference }
+                BatchTimes { taken: now, inference }
             };
             match planner {
-                Loaded::Network(network) => infer(network, *own, jobs, done),
-                // One at a time: there is nothing to share.
+                Loaded::Network(network) => infer(network, *defaults, jobs, done),
                 Loaded::Single(planner) => {
                     if let Some(job) = jobs.pop() {
-                        plan(planner.as_mut(), *own, job, done);
+                        plan(planner.as_mut(), *defaults, job, done);
                     }
                 }
             }
-            // A place in the queue is free as often as a scene is done, with all that belongs to it.
+            // The time per scene, including decoding.
             service_time.set(now.elapsed() / scenes);
         }
     }
 }
 
-/// Runs the network over the batch, then makes of each output what is asked for.
-fn infer(network: &mut NetworkPlanner, own: DecodeParams, jobs: Vec<Job>, done: impl FnOnce(Duration) -> Taken) {
+/// Runs the network on a batch, then decodes or returns each output. `done` is called after the inference.
+fn infer(
+    network: &mut NetworkPlanner,
+    defaults: DecodeParams,
+    jobs: Vec<Job>,
+    done: impl FnOnce(Duration) -> BatchTimes,
+) {
     let started = Instant::now();
     let volumes: Vec<&Volume> = jobs.iter().map(|job| &job.scene.volume).collect();
     let output = caught(|| Ok(network.infer(&volumes)?));
-    let taken = done(started.elapsed());
+    let times = done(started.elapsed());
     for (index, Job { scene, task, deadline, span, submitted }) in jobs.into_iter().enumerate() {
         let _entered = span.enter();
         if task.is_closed() || deadline.is_some_and(Deadline::has_passed) {
-            // Those behind it in the batch need not wait for what nobody does.
+            // Skips the decoding, so that the other jobs of the batch finish earlier.
             task.fail(EngineError::Expired);
             continue;
         }
@@ -95,29 +98,29 @@ fn infer(network: &mut NetworkPlanner, own: DecodeParams, jobs: Vec<Job>, done: 
             }
         };
         match task {
-            Task::Grasps(params, reply) => answer(reply, submitted, taken, || {
-                let decoded = decode(&scene.volume, &output.maps(index), &params.decode_params(own))?;
-                Ok(found(decoded, scene.volume, &params))
+            Task::Grasps(params, reply) => send_result(reply, submitted, times, || {
+                let decoded = decode(&scene.volume, &output.maps(index), &params.decode_params(defaults))?;
+                Ok(detection(decoded, scene.volume, &params))
             }),
-            Task::Maps(reply) => answer(reply, submitted, taken, || Ok(tensors(output, index))),
+            Task::Maps(reply) => send_result(reply, submitted, times, || Ok(tensors(output, index))),
         }
     }
 }
 
-/// Has a planner without a network look at a scene.
-fn plan(planner: &mut dyn Planner, own: DecodeParams, job: Job, done: impl FnOnce(Duration) -> Taken) {
+/// Runs a planner without a network on a scene. `done` is called after the planning.
+fn plan(planner: &mut dyn Planner, defaults: DecodeParams, job: Job, done: impl FnOnce(Duration) -> BatchTimes) {
     let Job { scene, task, deadline, span, submitted } = job;
     let _entered = span.enter();
     match task {
         Task::Grasps(params, reply) => {
             let started = Instant::now();
-            let wanted = || !reply.is_closed() && !deadline.is_some_and(Deadline::has_passed);
+            let keep_going = || !reply.is_closed() && !deadline.is_some_and(Deadline::has_passed);
             let decoded = caught(|| {
-                let params = PlanParams { decode: params.decode_params(own), table: params.table };
-                Ok(planner.plan(&scene, &params, &wanted)?)
+                let params = PlanParams { decode: params.decode_params(defaults), table: params.table };
+                Ok(planner.plan(&scene, &params, &keep_going)?)
             });
-            let taken = done(started.elapsed());
-            answer(reply, submitted, taken, || Ok(found(decoded?, scene.volume, &params)));
+            let times = done(started.elapsed());
+            send_result(reply, submitted, times, || Ok(detection(decoded?, scene.volume, &params)));
         }
         Task::Maps(_) => {
             done(Duration::ZERO);
@@ -126,24 +129,29 @@ fn plan(planner: &mut dyn Planner, own: DecodeParams, job: Job, done: impl FnOnc
     }
 }
 
-/// Makes something and sends it to who asked for it.
-fn answer<T>(reply: Sender<T>, submitted: Instant, taken: Taken, make: impl FnOnce() -> Result<T, EngineError>) {
+/// Runs the post-processing and sends its result.
+fn send_result<T>(
+    reply: Sender<T>,
+    submitted: Instant,
+    times: BatchTimes,
+    postprocess: impl FnOnce() -> Result<T, EngineError>,
+) {
     let started = Instant::now();
-    let made = caught(make);
-    // Nobody waits for what came too late.
-    if let Err(error) = &made
+    let result = caught(postprocess);
+    // Expired requests are logged by their call.
+    if let Err(error) = &result
         && !matches!(error, EngineError::Expired)
     {
         error!(%error, "the session failed");
     }
-    let Taken { at, inference } = taken;
-    let (queue, postprocessing) = (at.duration_since(submitted), started.elapsed());
-    // The caller may have gone meanwhile, which is counted on their side.
-    let _ = reply.send(made.map(|made| SessionOutput { made, queue, inference, postprocessing }));
+    let BatchTimes { taken, inference } = times;
+    let (queue, postprocessing) = (taken.duration_since(submitted), started.elapsed());
+    // Fails if the client has cancelled, which the call counts.
+    let _ = reply.send(result.map(|value| SessionOutput { value, queue, inference, postprocessing }));
 }
 
-/// As many of the grasps as were asked for, and whether the hand would meet something there.
-fn found(decoded: Decoded, volume: Volume, params: &DetectParams) -> Detection {
+/// The requested number of grasps, with collision flags if requested.
+fn detection(decoded: Decoded, volume: Volume, params: &DetectParams) -> Detection {
     let Decoded { mut grasps, dropped } = decoded;
     let over_limit = grasps.len().saturating_sub(params.max_grasps);
     grasps.truncate(params.max_grasps);
@@ -161,14 +169,14 @@ fn tensors(output: &Output, index: usize) -> Tensors {
     )
 }
 
-/// Has a network answer a batch of each size, and says how long a single volume takes: the first inference of a size
-/// allocates and tunes, no caller should wait for that.
+/// Runs the network once for each batch size, because the first inference of a size allocates memory and tunes kernels.
+/// Returns the time of one volume.
 pub(super) fn warm_up(network: &mut NetworkPlanner, max_batch: usize) -> Result<Duration, EngineError> {
     let metadata = network.network().metadata();
     let values = vec![0.5; metadata.resolution.pow(3)];
     let volume = Volume::new(metadata.resolution, metadata.voxel_size, Isometry3::identity(), values);
     let resolution = metadata.resolution;
-    let volume = volume.expect("metadata has a positive resolution and voxel size, and 0.5 is a surface");
+    let volume = volume.expect("metadata has a positive resolution and voxel size, and 0.5 is a valid value");
     caught(|| {
         for size in batch_sizes(max_batch) {
             let output = network.infer(&vec![&volume; size])?;
@@ -180,13 +188,13 @@ pub(super) fn warm_up(network: &mut NetworkPlanner, max_batch: usize) -> Result<
     })
 }
 
-/// Turns a panic into an error of the one request that it happened in. The network's buffers are written anew for each
-/// volume, so what the panic leaves in them does no harm.
+/// Converts a panic to an error, so that the session thread continues. A panic cannot corrupt the network's buffers for
+/// later batches: each inference overwrites them.
 fn caught<T>(work: impl FnOnce() -> Result<T, EngineError>) -> Result<T, EngineError> {
     catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| {
         let text = panic.downcast_ref::<&str>().copied();
         let text = text.or_else(|| panic.downcast_ref::<String>().map(String::as_str));
-        Err(EngineError::Panic(text.unwrap_or("without a message").to_owned()))
+        Err(EngineError::Panic(text.unwrap_or("no message").to_owned()))
     })
 }
 
@@ -199,7 +207,7 @@ mod tests {
         let message = |work: fn() -> Result<(), EngineError>| caught(work).unwrap_err().to_string();
         assert_eq!(message(|| panic!("index {} of {}", 5, 4)), "the session panicked: index 5 of 4");
         assert_eq!(message(|| panic!("plain")), "the session panicked: plain");
-        assert_eq!(message(|| std::panic::panic_any(7)), "the session panicked: without a message");
+        assert_eq!(message(|| std::panic::panic_any(7)), "the session panicked: no message");
         assert!(caught(|| Ok(())).is_ok());
     }
 }

@@ -10,38 +10,38 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use crate::rpc::call::FrameStamp;
 use crate::rpc::refusal::Refusal;
 use crate::serving::engine::Engine;
-use crate::serving::scene::{FusionGrid, eyes};
+use crate::serving::scene::{FusionGrid, camera_positions};
 use grasp_planner::Scene;
 
-/// How many volumes are kept for calls of TrackGrasps, and for how long without a view.
+/// Limits on TrackGrasps streams: their number, and the time without a request.
 pub(crate) struct TrackedVolumes {
-    places: Arc<Semaphore>,
-    most: usize,
+    permits: Arc<Semaphore>,
+    limit: usize,
     timeout: Duration,
     gauge: IntGauge,
 }
 
-/// The place of one volume. Dropped, it is free.
+/// The permit of one stream.
 pub(crate) struct TrackPermit {
     _permit: OwnedSemaphorePermit,
     gauge: IntGauge,
 }
 
 impl TrackedVolumes {
-    pub fn new(most: usize, timeout: Duration, gauge: IntGauge) -> Self {
-        Self { places: Arc::new(Semaphore::new(most)), most, timeout, gauge }
+    pub fn new(limit: usize, timeout: Duration, gauge: IntGauge) -> Self {
+        Self { permits: Arc::new(Semaphore::new(limit)), limit, timeout, gauge }
     }
 
-    /// A place, if there is one.
-    pub fn place(&self) -> Result<TrackPermit, Refusal> {
-        let Ok(permit) = Arc::clone(&self.places).try_acquire_owned() else {
-            return Err(Refusal::TooManyTracked(self.most));
+    /// Takes a permit, or refuses immediately.
+    pub fn acquire(&self) -> Result<TrackPermit, Refusal> {
+        let Ok(permit) = Arc::clone(&self.permits).try_acquire_owned() else {
+            return Err(Refusal::TooManyTracked(self.limit));
         };
         self.gauge.inc();
         Ok(TrackPermit { _permit: permit, gauge: self.gauge.clone() })
     }
 
-    /// Returns when a volume has been kept for too long without a view.
+    /// Returns after the timeout, with the refusal that ends the stream.
     pub async fn expired(&self) -> Refusal {
         tokio::time::sleep(self.timeout).await;
         Refusal::TrackExpired(self.timeout)
@@ -54,22 +54,22 @@ impl Drop for TrackPermit {
     }
 }
 
-/// A volume that grows from view to view.
+/// The volume of a TrackGrasps stream, to which each request adds views.
 pub(crate) struct Track {
     grid: FusionGrid,
     fusion: Fusion,
     frame_from_task: Isometry3<f64>,
     origin: FrameStamp,
-    /// By the last request that asked for something.
+    /// The parameters of the latest request with options.
     pub params: DetectParams,
 }
 
-/// What is looked at next, what was asked of it, whence it comes, and how long fusing took.
+/// The scene, its parameters, frame and stamp, and the time that the fusion took.
 type Fused = (Scene, DetectParams, FrameStamp, Duration);
 
 impl Track {
-    /// Adds views to the volume, or to a new one where a workspace is given. What is wrong with a view leaves the volume
-    /// as the views before it made it.
+    /// Adds views to the volume, or to a new one if a workspace is given. An invalid view is an error; views before it
+    /// in the request may already be integrated.
     pub fn integrate(
         track: Option<Self>,
         engine: &Engine,
@@ -97,7 +97,7 @@ impl Track {
         }
     }
 
-    /// An empty one, and the views that it begins with.
+    /// An empty volume, and its first views.
     fn start(
         engine: &Engine,
         params: &DetectParams,
@@ -108,10 +108,10 @@ impl Track {
         let origin =
             FrameStamp::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
         let frame_from_task = workspace.frame_from_task;
-        // How the cube stands may depend on where they were taken from.
+        // The rotation of the grid may depend on the camera positions.
         check_count(views.len())?;
         let views = converted(views, &frame_from_task)?;
-        let grid = FusionGrid::of(&engine.source, &workspace, &eyes(&views))?;
+        let grid = FusionGrid::of(&engine.source, &workspace, &camera_positions(&views))?;
         Ok((Self { fusion: grid.fusion(), grid, frame_from_task, origin, params: params.clone() }, views))
     }
 
@@ -119,7 +119,7 @@ impl Track {
         let started = Instant::now();
         self.grid.check(&engine.source)?;
         self.grid.integrate(&mut self.fusion, views)?;
-        // Of a view long ago the volume has kept all there is.
+        // Without points: those of earlier views are not stored.
         let scene = self.grid.scene(&self.fusion, None)?;
         self.params = DetectParams { constraints: self.grid.within(params.constraints), ..params };
         Ok((scene, self.params.clone(), self.origin.clone(), started.elapsed()))

@@ -17,16 +17,17 @@ use crate::serving::engine::{Engine, Gauges};
 use crate::telemetry::timings::StageTimings;
 use crate::transport::connections::ConnectionLimit;
 
-/// Seconds. Dense from a cached wake-up to a large network on a slow CPU, whose queue is full.
+/// Seconds: from the fastest stages to a full queue of a large network on a slow CPU.
 const BUCKETS: [f64; 33] = [
     50e-6, 75e-6, 100e-6, 150e-6, 200e-6, 300e-6, 500e-6, 750e-6, 1e-3, 1.5e-3, 2e-3, 3e-3, 5e-3, 7.5e-3, 10e-3, 15e-3,
     20e-3, 30e-3, 50e-3, 75e-3, 100e-3, 150e-3, 200e-3, 300e-3, 500e-3, 750e-3, 1.0, 1.5, 2.0, 3.0, 5.0, 7.5, 10.0,
 ];
 
-/// Volumes.
+/// Volumes per batch.
 const BATCHES: [f64; 9] = [1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 16.0, 32.0, 64.0];
 
-/// What Prometheus sees. A model is labelled `name version`; requests that reached no model have an empty label.
+/// The Prometheus metrics. The label `model` is `name version`, and empty for requests that were refused before a model
+/// was selected.
 pub(crate) struct Metrics {
     registry: Registry,
     stages: HistogramVec,
@@ -43,71 +44,67 @@ pub(crate) struct Metrics {
     ready: IntGauge,
     tracked: IntGauge,
     dropped_lines: IntCounter,
-    /// Of which `dropped_lines` has counted so many.
+    /// The log's counter of dropped lines, and how many of them `dropped_lines` includes.
     dropped: (ErrorCounter, AtomicU64),
 }
 
 impl Metrics {
-    /// The format of [`render`](Self::render).
+    /// Content type of [`render`](Self::render).
     pub const CONTENT_TYPE: &str = TEXT_FORMAT;
 
-    /// `dropped`: the lines that the log lost.
+    /// `dropped` counts the lines that the log has lost.
     pub fn new(dropped: ErrorCounter) -> Self {
-        const VALID: &str = "the names below are valid and differ";
-        let stages = HistogramOpts::new("graspd_stage_duration_seconds", "Time a request spent in each stage.");
+        const VALID: &str = "the metric names below are valid and distinct";
+        let stages = HistogramOpts::new("graspd_stage_duration_seconds", "Duration of each stage of a request.");
         let metrics = Self {
             registry: Registry::new(),
             stages: HistogramVec::new(stages.buckets(BUCKETS.to_vec()), &["model", "stage"]).expect(VALID),
             requests: IntCounterVec::new(
-                Opts::new("graspd_requests_total", "Requests by their outcome, a gRPC status code."),
+                Opts::new("graspd_requests_total", "Requests by gRPC status code."),
                 &["model", "code"],
             )
             .expect(VALID),
-            grasps: IntCounterVec::new(Opts::new("graspd_grasps_total", "Grasps sent."), &["model"]).expect(VALID),
-            waiting: IntGaugeVec::new(
-                Opts::new("graspd_queue_requests", "Requests waiting for a session."),
-                &["model"],
-            )
-            .expect(VALID),
+            grasps: IntCounterVec::new(Opts::new("graspd_grasps_total", "Grasps returned to clients."), &["model"])
+                .expect(VALID),
+            waiting: IntGaugeVec::new(Opts::new("graspd_queue_requests", "Queued requests."), &["model"]).expect(VALID),
             batches: HistogramVec::new(
-                HistogramOpts::new("graspd_batch_size", "Volumes that a session took at once.")
-                    .buckets(BATCHES.to_vec()),
+                HistogramOpts::new("graspd_batch_size", "Volumes per batch.").buckets(BATCHES.to_vec()),
                 &["model"],
             )
             .expect(VALID),
             models: IntGaugeVec::new(
-                Opts::new("graspd_model_info", "1 for each model that is served: what runs it, in which numbers."),
+                Opts::new("graspd_model_info", "1 for each served model, with its provider, precision and file hash."),
                 &["model", "provider", "precision", "sha256"],
             )
             .expect(VALID),
             reloads: IntCounterVec::new(
                 Opts::new(
                     "graspd_reloads_total",
-                    "How often the folder of models was read anew: ok, or failed where not all of it can be served.",
+                    "Reloads of the model folder: ok, or failed if any file could not be loaded.",
                 ),
                 &["outcome"],
             )
             .expect(VALID),
             rejected: IntGauge::new(
                 "graspd_rejected_files",
-                "Model files that cannot be served, as of the last reload.",
+                "Model files that could not be loaded at the last reload.",
             )
             .expect(VALID),
-            connections: IntGauge::new("graspd_connections", "Connections to the gRPC listener that are open.")
+            connections: IntGauge::new("graspd_connections", "Open connections to the gRPC listener.").expect(VALID),
+            connections_limit: IntGauge::new("graspd_connections_limit", "Maximum number of open connections.")
                 .expect(VALID),
-            connections_limit: IntGauge::new("graspd_connections_limit", "Connections that may be open.").expect(VALID),
             connections_refused: IntCounter::new(
                 "graspd_connections_refused_total",
-                "Connections that were closed at once, for too many were open.",
+                "Connections refused because the limit was reached.",
             )
             .expect(VALID),
-            ready: IntGauge::new("graspd_ready", "1 while requests are taken, 0 while it warms up or shuts down.")
+            ready: IntGauge::new("graspd_ready", "1 while the server accepts requests, 0 during startup and shutdown.")
                 .expect(VALID),
-            tracked: IntGauge::new("graspd_tracked_volumes", "Volumes that are kept for calls of TrackGrasps.")
+            tracked: IntGauge::new("graspd_tracked_volumes", "Open TrackGrasps streams, each with one volume.")
                 .expect(VALID),
             dropped_lines: IntCounter::new(
                 "graspd_log_lines_dropped_total",
-                "Lines of the log that were lost, because it was not read as fast as it was written.",
+                "Log lines dropped because stderr was not read fast enough.",
             )
             .expect(VALID),
             dropped: (dropped, AtomicU64::new(0)),
@@ -128,18 +125,18 @@ impl Metrics {
         registry.register(Box::new(ready.clone())).expect(VALID);
         registry.register(Box::new(tracked.clone())).expect(VALID);
         registry.register(Box::new(dropped_lines.clone())).expect(VALID);
-        // What has not happened yet is 0, lest its first time goes unseen by who looks at increases.
+        // Series start at 0, so that `increase()` includes the first event.
         for outcome in ["ok", "failed"] {
             metrics.reloads.with_label_values(&[outcome]);
         }
-        // Of the process: CPU time, memory, open files.
+        // CPU time, memory and open files of the process.
         #[cfg(target_os = "linux")]
         registry.register(Box::new(ProcessCollector::for_self())).expect(VALID);
         metrics
     }
 
-    /// A request was answered.
-    pub fn answered(&self, model: &str, timings: &StageTimings, grasps: usize) {
+    /// Records a request that succeeded.
+    pub fn succeeded(&self, model: &str, timings: &StageTimings, grasps: usize) {
         for (stage, seconds) in timings.stages() {
             self.stages.with_label_values(&[model, stage]).observe(seconds);
         }
@@ -147,12 +144,12 @@ impl Metrics {
         self.ended(model, Code::Ok);
     }
 
-    /// A request came to an end.
+    /// Counts a request that ended with this status.
     pub fn ended(&self, model: &str, code: Code) {
         self.requests.with_label_values(&[model, code_name(code)]).inc();
     }
 
-    /// Other models are served than before.
+    /// Updates `graspd_model_info` after the served models have changed.
     pub fn replaced(&self, before: &[Arc<Engine>], now: &[Arc<Engine>]) {
         let labels = |engine: &Engine| {
             let Backend { provider, precision } = engine.backend;
@@ -162,13 +159,14 @@ impl Metrics {
         for labels in &now {
             self.models.with_label_values(labels).set(1);
         }
-        for gone in before.iter().map(|engine| labels(engine)).filter(|labels| !now.contains(labels)) {
-            // It was there, as whatever is served is.
-            let _ = self.models.remove_label_values(&gone.each_ref().map(String::as_str));
+        for removed in before.iter().map(|engine| labels(engine)).filter(|labels| !now.contains(labels)) {
+            // Fails only if the series does not exist.
+            let _ = self.models.remove_label_values(&removed.each_ref().map(String::as_str));
         }
     }
 
-    /// The folder of models was read anew; so many of its files, or the whole of it, cannot be served.
+    /// Records a reload of the model folder: the number of files that could not be loaded, or an error if the folder
+    /// could not be read.
     pub fn reloaded(&self, outcome: Result<usize, ()>) {
         let name = if outcome == Ok(0) { "ok" } else { "failed" };
         self.reloads.with_label_values(&[name]).inc();
@@ -177,7 +175,7 @@ impl Metrics {
         }
     }
 
-    /// What is measured of a model's queue.
+    /// The metrics of a model's queue.
     pub fn gauges(&self, model: &str) -> Gauges {
         for (stage, _) in StageTimings::default().stages() {
             self.stages.with_label_values(&[model, stage]);
@@ -188,29 +186,29 @@ impl Metrics {
         Gauges { waiting: self.waiting.with_label_values(&[model]), batch: self.batches.with_label_values(&[model]) }
     }
 
-    /// Of connections, of which so many may be open.
-    pub fn connections(&self, most: usize, patience: Duration) -> ConnectionLimit {
-        self.connections_limit.set(i64::try_from(most).unwrap_or(i64::MAX));
-        ConnectionLimit { most, patience, open: self.connections.clone(), refused: self.connections_refused.clone() }
+    /// A limit on open connections with its metrics.
+    pub fn connections(&self, limit: usize, timeout: Duration) -> ConnectionLimit {
+        self.connections_limit.set(i64::try_from(limit).unwrap_or(i64::MAX));
+        ConnectionLimit { limit, timeout, open: self.connections.clone(), refused: self.connections_refused.clone() }
     }
 
-    /// How many volumes are kept from one view to the next.
+    /// The gauge of open TrackGrasps streams.
     pub fn tracked(&self) -> IntGauge {
         self.tracked.clone()
     }
 
-    /// In Prometheus' text format.
+    /// The metrics in Prometheus' text format.
     pub fn render(&self, state: State) -> String {
         self.ready.set((state == State::Ready).into());
         let (lines, counted) = &self.dropped;
         let lines = lines.dropped_lines() as u64;
-        // Two may look at the same time: each adds what the other has not.
+        // `fetch_max` keeps concurrent scrapes from counting the same lines twice.
         self.dropped_lines.inc_by(lines.saturating_sub(counted.fetch_max(lines, Ordering::Relaxed)));
         TextEncoder::new().encode_to_string(&self.registry.gather()).expect("the encoder writes to memory")
     }
 }
 
-/// As the gRPC specification writes it; the codes that this server ends requests with.
+/// The name of a status code in the gRPC specification, for the codes that this server returns.
 pub(crate) fn code_name(code: Code) -> &'static str {
     match code {
         Code::Ok => "OK",

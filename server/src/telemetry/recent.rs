@@ -11,28 +11,28 @@ use tonic::Code;
 use crate::telemetry::metrics::code_name;
 use crate::telemetry::timings::StageTimings;
 
-/// The latest requests, for whoever looks at the page.
+/// The latest requests, for the web page.
 pub(crate) struct RecentRequests {
-    most: usize,
+    limit: usize,
     ended: Mutex<VecDeque<Arc<RecentRequest>>>,
-    /// The number of the last one.
+    /// The number of the latest request.
     last: watch::Sender<u64>,
 }
 
-/// A request that came to its end.
+/// A finished request.
 pub(crate) struct RecentRequest {
     number: u64,
     at: SystemTime,
     request_id: String,
-    /// The planner's label, empty if none was reached.
+    /// `name version` of the model, empty if none was selected.
     model: String,
     outcome: Outcome,
 }
 
-/// How it ended.
+/// How a request ended.
 pub(crate) enum Outcome {
-    Answered(Box<Answered>),
-    /// By a network's maps, which the caller decodes.
+    Detected(Box<Detected>),
+    /// A `ModelInfer` call, which returns the network's output without decoding it.
     Inferred(StageTimings),
     Refused {
         code: Code,
@@ -40,46 +40,46 @@ pub(crate) enum Outcome {
     },
 }
 
-/// What was seen, and the grasps in it.
-pub(crate) struct Answered {
+/// The scene and the grasps of a successful request.
+pub(crate) struct Detected {
     pub timings: StageTimings,
     /// `T_frame_volume`.
     pub pose: Isometry3<f64>,
-    /// Edge of the volume, metres.
+    /// Edge length of the volume, metres.
     pub size: f64,
-    /// None where it is too large to be kept.
+    /// None above [`MAX_RESOLUTION`](Self::MAX_RESOLUTION).
     pub volume: Option<Volume>,
-    /// In the frame of the volume's pose.
+    /// In the parent frame of `pose`.
     pub grasps: Vec<Grasp>,
     pub collides: Option<Vec<bool>>,
-    /// Length of the hand's fingers, metres.
+    /// Length of the fingers, metres.
     pub finger_depth: f64,
 }
 
-impl Answered {
-    /// The largest volumes that are kept, voxels along an edge: a request of 1 MB.
+impl Detected {
+    /// Maximum resolution of a stored volume, voxels along an edge: 1 MB per request.
     pub const MAX_RESOLUTION: usize = 64;
 }
 
 impl RecentRequests {
-    /// Keeps so many; none at all with 0.
-    pub fn new(most: usize) -> Self {
-        Self { most, ended: Mutex::default(), last: watch::Sender::new(0) }
+    /// Stores up to `limit` requests; 0 disables the page.
+    pub fn new(limit: usize) -> Self {
+        Self { limit, ended: Mutex::default(), last: watch::Sender::new(0) }
     }
 
-    /// Whether there is a page to look at.
-    pub fn is_kept(&self) -> bool {
-        self.most > 0
+    /// Whether requests are stored for the page.
+    pub fn is_enabled(&self) -> bool {
+        self.limit > 0
     }
 
-    /// The latest of all.
+    /// Stores a request and drops the oldest if the limit is reached.
     pub fn add(&self, request_id: String, model: String, outcome: Outcome) {
-        if self.most == 0 {
+        if self.limit == 0 {
             return;
         }
         let mut ended = self.lock();
         let number = ended.back().map_or(1, |last| last.number + 1);
-        if ended.len() == self.most {
+        if ended.len() == self.limit {
             ended.pop_front();
         }
         ended.push_back(Arc::new(RecentRequest { number, at: SystemTime::now(), request_id, model, outcome }));
@@ -87,21 +87,21 @@ impl RecentRequests {
         self.last.send_replace(number);
     }
 
-    /// The number of the last one, now and whenever there is another.
+    /// The number of the latest request.
     pub fn last(&self) -> watch::Receiver<u64> {
         self.last.subscribe()
     }
 
-    /// All of them in short, the latest first.
+    /// Summaries of all stored requests, newest first.
     pub fn list(&self) -> Value {
         let ended: Vec<_> = self.lock().iter().rev().cloned().collect();
-        ended.iter().map(|ended| ended.short()).collect()
+        ended.iter().map(|ended| ended.summary()).collect()
     }
 
-    /// One of them, with what was seen.
+    /// One request with its scene and grasps.
     pub fn get(&self, number: u64) -> Option<Value> {
         let ended = self.lock().iter().find(|ended| ended.number == number).cloned()?;
-        Some(ended.whole())
+        Some(ended.details())
     }
 
     fn lock(&self) -> MutexGuard<'_, VecDeque<Arc<RecentRequest>>> {
@@ -110,19 +110,19 @@ impl RecentRequests {
 }
 
 impl RecentRequest {
-    fn short(&self) -> Value {
+    fn summary(&self) -> Value {
         let at = self.at.duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64();
         let mut value = json!({ "number": self.number, "at": at, "request_id": self.request_id, "model": self.model });
         let more = match &self.outcome {
-            Outcome::Answered(answered) => json!({
+            Outcome::Detected(detected) => json!({
                 "code": "OK",
-                "grasps": answered.grasps.len(),
-                "best": answered.grasps.first().map(|grasp| grasp.quality),
-                "latency": answered.timings.stages().collect::<BTreeMap<_, _>>(),
+                "grasps": detected.grasps.len(),
+                "best": detected.grasps.first().map(|grasp| grasp.quality),
+                "latency": detected.timings.stages().collect::<BTreeMap<_, _>>(),
             }),
             Outcome::Inferred(timings) => json!({
                 "code": "OK",
-                "message": "The caller has the network's maps; no grasps were decoded here.",
+                "message": "ModelInfer returns the network's maps; no grasps were decoded.",
                 "latency": timings.stages().collect::<BTreeMap<_, _>>(),
             }),
             Outcome::Refused { code, message } => json!({ "code": code_name(*code), "message": message }),
@@ -133,12 +133,12 @@ impl RecentRequest {
         value
     }
 
-    /// With the observed surface and the grasps in the volume's own frame, metres: `vertices` has x, y, z of each corner,
-    /// `triangles` three indices of corners each; a grasp's pose is x, y, z and the quaternion's x, y, z, w.
-    fn whole(&self) -> Value {
-        let mut value = self.short();
-        if let (Some(object), Outcome::Answered(answered)) = (value.as_object_mut(), &self.outcome) {
-            let Answered { pose, size, volume, grasps, collides, finger_depth, .. } = &**answered;
+    /// The summary with the surface mesh and the grasps in the frame of the volume, metres. `vertices` has x, y, z per
+    /// vertex, `triangles` three vertex indices per triangle. A pose is x, y, z and the quaternion x, y, z, w.
+    fn details(&self) -> Value {
+        let mut value = self.summary();
+        if let (Some(object), Outcome::Detected(detected)) = (value.as_object_mut(), &self.outcome) {
+            let Detected { pose, size, volume, grasps, collides, finger_depth, .. } = &**detected;
             let mesh = volume.as_ref().map(|volume| Fusion::of(volume).mesh());
             let SurfaceMesh { vertices, triangles } = mesh.unwrap_or_default();
             let vertices = vertices.iter().flat_map(|v| [v.x, v.y, v.z].map(|number| (number * 1e4).round() / 1e4));

@@ -22,42 +22,44 @@ use tracing_subscriber::{EnvFilter, Layer};
 use crate::config::{Config, LogFormat};
 use crate::telemetry::timings::StageTimings;
 
-/// The name under which traces know this server.
+/// Service name in traces.
 const NAME: &str = env!("CARGO_PKG_NAME");
 
-/// The span of a request: the one that traces show.
+/// Name of the span of a request, the only span that is exported from `tracing`.
 pub(crate) const REQUEST: &str = "detect";
 
-/// How many lines of the log may wait to be written.
+/// Log lines that are buffered; further lines are dropped and counted.
 const LINES: usize = 8192;
 
-/// The log on its way to stderr. Dropping it writes what still waits, for a second at most.
+/// The log writer. Dropping it flushes the buffered lines, for at most one second.
 pub(crate) struct Log {
     _writer: WorkerGuard,
-    /// Lines that found no room, because whoever reads the log does not.
+    /// Lines dropped because the buffer was full.
     pub dropped: ErrorCounter,
 }
 
-/// Where spans go besides the log.
+/// The exporter of spans; None without a collector.
 pub(crate) struct Traces(Option<SdkTracerProvider>);
 
-/// Sends the log to stderr, as stdout is for the process that started this one; and the spans of requests to a collector of
-/// OpenTelemetry, where there is one. They travel on the runtime's threads; the log has one of its own, as a pipe that
-/// nobody reads holds up who writes to it.
+/// Sends the log to stderr (stdout is for the parent process) and the spans of requests to the OpenTelemetry collector,
+/// if one is set. Spans are sent on the runtime's threads. The log has its own thread, because writing to a pipe that
+/// is not read blocks.
 pub(crate) fn init(config: &Config, runtime: &Runtime) -> anyhow::Result<(Log, Traces)> {
     let (writer, guard) = NonBlockingBuilder::default().buffered_lines_limit(LINES).thread_name("log").finish(stderr());
     let dropped = writer.error_counter();
     let log = tracing_subscriber::fmt::layer()
         .with_writer(writer)
         .with_ansi(stderr().is_terminal())
-        // They would be told on stderr by the thread that met them, which is to wait for nobody.
+        // These errors are written to stderr by the logging thread itself, which would block on a full pipe.
         .log_internal_errors(false);
     let log = match config.log_format {
         LogFormat::Text => log.boxed(),
         LogFormat::Json => log.json().boxed(),
     };
     let provider = match &config.otlp {
-        Some(url) => Some(collector(url, runtime).with_context(|| format!("--otlp {url} cannot be used"))?),
+        Some(url) => {
+            Some(collector(url, runtime).with_context(|| format!("--otlp is `{url}`, cannot export traces to it"))?)
+        }
         None => None,
     };
     let traces = provider.as_ref().map(|provider| {
@@ -78,17 +80,17 @@ fn collector(url: &str, runtime: &Runtime) -> anyhow::Result<SdkTracerProvider> 
 }
 
 impl Traces {
-    /// Sends what has not been sent yet.
+    /// Sends the remaining spans.
     pub fn finish(&self) {
         if let Some(provider) = &self.0
             && let Err(error) = provider.shutdown()
         {
-            warn!(%error, "the last spans were lost");
+            warn!(%error, "cannot send the last spans to the collector (--otlp)");
         }
     }
 }
 
-/// The span of which a request is a part, as its caller says (W3C Trace Context).
+/// The parent span in a request's headers (W3C Trace Context).
 pub(crate) fn parent(metadata: &MetadataMap) -> Option<Context> {
     let context = TraceContextPropagator::new().extract(&Headers(metadata));
     context.has_active_span().then_some(context)
@@ -102,7 +104,7 @@ impl Extractor for Headers<'_> {
     }
 
     fn keys(&self) -> Vec<&str> {
-        // Only binary headers are not text.
+        // Binary headers are skipped: trace context is text.
         self.0
             .keys()
             .filter_map(|key| if let tonic::metadata::KeyRef::Ascii(key) = key { Some(key.as_str()) } else { None })
@@ -110,15 +112,15 @@ impl Extractor for Headers<'_> {
     }
 }
 
-/// Makes a span a part of its caller's, where there is one and somebody looks.
-pub(crate) fn adopt(span: &Span, parent: Option<Context>) {
+/// Sets the parent of a span.
+pub(crate) fn set_parent(span: &Span, parent: Option<Context>) {
     if let Some(parent) = parent {
-        // It fails where nobody looks.
+        // Fails if tracing is disabled.
         let _ = span.set_parent(parent);
     }
 }
 
-/// Adds a span for each stage of a request that ends now to the request's own, one after the other.
+/// Adds one child span per stage to the span of a request that ends now, in sequence.
 pub(crate) fn stages(span: &Span, timings: &StageTimings) {
     let context = span.context();
     if !context.span().span_context().is_sampled() {
@@ -134,9 +136,9 @@ pub(crate) fn stages(span: &Span, timings: &StageTimings) {
         ("postprocessing", Some(postprocessing)),
     ];
     let mut at = SystemTime::now() - total;
-    for (stage, took) in stages.into_iter().filter_map(|(stage, took)| Some((stage, took?))) {
+    for (stage, duration) in stages.into_iter().filter_map(|(stage, duration)| Some((stage, duration?))) {
         let builder = SpanBuilder::from_name(stage).with_start_time(at);
-        at += took;
+        at += duration;
         tracer.build_with_context(builder, &context).end_with_timestamp(at);
     }
 }

@@ -3,12 +3,12 @@ use std::time::Duration;
 use grasp_proto::pb;
 use tracing::Span;
 
-/// Where a request's time went: the one source of the reply's latency, the span's fields and the histograms.
+/// Durations of a request's stages, used for the response's latency, the span's fields and the histograms.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct StageTimings {
     pub queue: Duration,
     pub preprocessing: Duration,
-    /// Of depth images and points.
+    /// None for requests that contain a volume.
     pub fusion: Option<Duration>,
     pub inference: Duration,
     pub postprocessing: Duration,
@@ -16,7 +16,7 @@ pub(crate) struct StageTimings {
 }
 
 impl StageTimings {
-    /// Each stage that there was with its name, seconds.
+    /// Name and duration of each stage, seconds.
     pub fn stages(&self) -> impl Iterator<Item = (&'static str, f64)> {
         let stages = [
             ("queue", Some(self.queue)),
@@ -29,7 +29,7 @@ impl StageTimings {
         stages.into_iter().filter_map(|(stage, duration)| Some((stage, duration?.as_secs_f64())))
     }
 
-    /// Fills the fields that the request's span was created with.
+    /// Records the durations in the fields of the request's span.
     pub fn record(&self, span: &Span) {
         for (stage, seconds) in self.stages() {
             span.record(stage, seconds);

@@ -11,61 +11,61 @@ use tokio_stream::{Stream, StreamExt};
 use tonic::transport::server::{Connected, TcpConnectInfo, TcpIncoming};
 use tracing::warn;
 
-/// How many connections may be open, and what is counted of them.
+/// The limit on open connections, with its metrics.
 pub(crate) struct ConnectionLimit {
-    pub most: usize,
-    /// How long one may be open without a word.
-    pub patience: Duration,
+    pub limit: usize,
+    /// Maximum time until a client has sent the HTTP/2 preface.
+    pub timeout: Duration,
     pub open: IntGauge,
     pub refused: IntCounter,
 }
 
-/// The connections of a listener, of which no more than `most` are open at a time: a further one is closed at once, which
-/// clients see as the server being unavailable.
-pub(crate) fn accept(listener: TcpListener, doors: ConnectionLimit) -> impl Stream<Item = io::Result<Connection>> {
-    let ConnectionLimit { most, patience, open, refused } = doors;
-    // `Server::tcp_nodelay` does nothing for a listener that was bound before; without TCP_NODELAY a reply of several
-    // packets waits 40 ms for the client to acknowledge the first.
+/// Accepts the connections of a listener. Connections beyond the limit are closed immediately, which clients report as
+/// UNAVAILABLE.
+pub(crate) fn accept(listener: TcpListener, limit: ConnectionLimit) -> impl Stream<Item = io::Result<Connection>> {
+    let ConnectionLimit { limit, timeout, open, refused } = limit;
+    // `Server::tcp_nodelay` has no effect on a listener that is already bound. Without TCP_NODELAY, a response of
+    // several packets is delayed by 40 ms until the client acknowledges the first.
     let accepted = TcpIncoming::from(listener).with_nodelay(Some(true)).then(async |accepted| {
         if let Err(error) = &accepted {
-            // Most likely too many files are open; asked again at once, it would say the same.
-            warn!(%error, "a connection could not be taken");
-            sleep(PAUSE).await;
+            // The most likely cause is the limit of open files. An immediate retry would fail again.
+            warn!(%error, "cannot accept a connection");
+            sleep(ERROR_PAUSE).await;
         }
         accepted
     });
     accepted.filter_map(move |accepted| match accepted {
-        Ok(stream) if open.get() < i64::try_from(most).unwrap_or(i64::MAX) => {
-            Some(Ok(Connection::new(stream, patience, &open)))
+        Ok(stream) if open.get() < i64::try_from(limit).unwrap_or(i64::MAX) => {
+            Some(Ok(Connection::new(stream, timeout, &open)))
         }
         Ok(_) => {
             refused.inc();
-            warn!(open = open.get(), "too many connections, a further one was closed (--max-connections)");
+            warn!(open = open.get(), "connection refused: the limit is reached (--max-connections)");
             None
         }
         Err(error) => Some(Err(error)),
     })
 }
 
-/// After a connection could not be taken.
-const PAUSE: Duration = Duration::from_millis(100);
+/// Pause after an error of the listener.
+const ERROR_PAUSE: Duration = Duration::from_millis(100);
 
-/// What every client says first, before HTTP/2 (RFC 9113, section 3.4) and, longer than this, before TLS. From then on
-/// keep-alive pings and TLS's own timeout watch over the connection.
+/// Length of the HTTP/2 connection preface (RFC 9113, section 3.4), bytes. A TLS handshake starts with more. After it,
+/// keep-alive pings and the TLS handshake timeout close dead connections.
 const PREFACE: usize = 24;
 
-/// A connection, counted as long as it is open.
+/// A connection, counted in `open` until it is dropped.
 pub(crate) struct Connection {
     stream: TcpStream,
-    /// Bytes of the preface that are missing, and how long they may take.
-    greeting: Option<(usize, Pin<Box<Sleep>>)>,
+    /// Missing bytes of the preface and their timeout; None after the preface.
+    preface: Option<(usize, Pin<Box<Sleep>>)>,
     open: IntGauge,
 }
 
 impl Connection {
-    fn new(stream: TcpStream, patience: Duration, open: &IntGauge) -> Self {
+    fn new(stream: TcpStream, timeout: Duration, open: &IntGauge) -> Self {
         open.inc();
-        Self { stream, greeting: Some((PREFACE, Box::pin(sleep(patience)))), open: open.clone() }
+        Self { stream, preface: Some((PREFACE, Box::pin(sleep(timeout)))), open: open.clone() }
     }
 }
 
@@ -91,12 +91,12 @@ impl AsyncRead for Connection {
     ) -> Poll<io::Result<()>> {
         let before = buffer.filled().len();
         let read = Pin::new(&mut self.stream).poll_read(context, buffer)?;
-        if let Some((missing, patience)) = &mut self.greeting {
-            let come = buffer.filled().len() - before;
-            *missing = missing.saturating_sub(come);
+        if let Some((missing, timeout)) = &mut self.preface {
+            let received = buffer.filled().len() - before;
+            *missing = missing.saturating_sub(received);
             if *missing == 0 {
-                self.greeting = None;
-            } else if patience.as_mut().poll(context).is_ready() {
+                self.preface = None;
+            } else if timeout.as_mut().poll(context).is_ready() {
                 return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
             }
         }
@@ -139,18 +139,18 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn connections_are_counted_limited_and_do_not_wait_to_fill_packets() {
+    async fn connections_are_counted_and_limited_and_have_tcp_nodelay() {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
-        let open = IntGauge::new("open", "How many are open.").unwrap();
-        let refused = IntCounter::new("refused", "How many were closed at once.").unwrap();
-        let doors = ConnectionLimit {
-            most: 1,
-            patience: Duration::from_secs(10),
+        let open = IntGauge::new("open", "Open connections.").unwrap();
+        let refused = IntCounter::new("refused", "Refused connections.").unwrap();
+        let limit = ConnectionLimit {
+            limit: 1,
+            timeout: Duration::from_secs(10),
             open: open.clone(),
             refused: refused.clone(),
         };
-        let mut incoming = pin!(accept(listener, doors));
+        let mut incoming = pin!(accept(listener, limit));
 
         let _first = TcpStream::connect(address).await.unwrap();
         let connection = incoming.next().await.unwrap().unwrap();
@@ -159,7 +159,7 @@ mod tests {
 
         let mut second = TcpStream::connect(address).await.unwrap();
         let closed = async { second.read(&mut [0]).await.unwrap_or(0) };
-        let read = tokio::select! { read = closed => read, _ = incoming.next() => panic!("it was taken") };
+        let read = tokio::select! { read = closed => read, _ = incoming.next() => panic!("it was accepted") };
         assert_eq!((read, refused.get()), (0, 1));
 
         drop(connection);

@@ -1,4 +1,4 @@
-//! When a caller stops waiting, as its `grpc-timeout` header has it.
+//! Deadlines of requests from the `grpc-timeout` header.
 
 use std::time::{Duration, Instant};
 
@@ -7,10 +7,11 @@ use http::{Extensions, HeaderMap};
 /// The header (gRPC over HTTP/2, "Requests"): up to eight digits and a unit.
 const HEADER: &str = "grpc-timeout";
 
-/// So much earlier than the caller gives up it is told: tonic watches the same header, and calls what it ends cancelled.
+/// The server's deadline is earlier than the client's by this margin, because tonic applies the same header and ends
+/// expired requests as cancelled.
 const MARGIN: Duration = Duration::from_millis(2);
 
-/// A moment after which nobody waits for the answer.
+/// When a request expires.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Deadline(pub Instant);
 
@@ -20,17 +21,17 @@ impl Deadline {
     }
 }
 
-/// The deadline of a request whose headers have just come: the message may take a while.
+/// The deadline of a request whose headers were just received. Receiving the message may take longer.
 pub(crate) fn read(headers: &HeaderMap) -> Option<Deadline> {
     Some(Deadline(Instant::now() + timeout(headers)?.saturating_sub(MARGIN)))
 }
 
-/// The deadline that was read when the headers came.
+/// The deadline that was stored when the headers were received.
 pub(crate) fn of(extensions: &Extensions) -> Option<Deadline> {
     extensions.get().copied()
 }
 
-/// The timeout, if there is one that can be read.
+/// The timeout in the headers; None if it is missing or malformed.
 fn timeout(headers: &HeaderMap) -> Option<Duration> {
     let text = headers.get(HEADER)?.to_str().ok()?;
     let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
@@ -54,7 +55,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn timeouts_are_read_as_grpc_writes_them() {
+    fn timeouts_are_parsed_as_the_grpc_specification_defines() {
         let read = |text: &str| {
             let mut headers = HeaderMap::new();
             headers.insert(HEADER, text.parse().unwrap());
@@ -66,8 +67,8 @@ mod tests {
         assert_eq!(read("250m"), Some(Duration::from_millis(250)));
         assert_eq!(read("99999999u"), Some(Duration::from_micros(99_999_999)));
         assert_eq!(read("7n"), Some(Duration::from_nanos(7)));
-        for wrong in ["", "S", "10", "-1S", "1.5S", "123456789S", "5 S", "5s"] {
-            assert_eq!(read(wrong), None, "{wrong}");
+        for invalid in ["", "S", "10", "-1S", "1.5S", "123456789S", "5 S", "5s"] {
+            assert_eq!(read(invalid), None, "{invalid}");
         }
         assert_eq!(timeout(&HeaderMap::new()), None);
     }

@@ -18,55 +18,56 @@ use crate::rpc::grasp_service::GraspRpc;
 use crate::rpc::inference_service::InferenceRpc;
 use crate::telemetry::metrics::Metrics;
 use crate::transport::request_body::{Limits, RequestBody};
-use crate::transport::response_buffer::outgoing;
+use crate::transport::response_buffer::keep_permit;
 use crate::transport::tokens::Tokens;
 use crate::transport::{connections, deadline, request_body, tokens};
 
-/// HTTP/2's default of 64 KiB holds a quarter of a 40³ volume: the client would wait for us four times per request.
+/// HTTP/2's default of 64 KiB is a quarter of a 40³ volume: the client would wait for a window update four times per
+/// request.
 const STREAM_WINDOW: u32 = 4 << 20;
-/// For several volumes in flight on one connection.
+/// Several volumes in flight on one connection.
 const CONNECTION_WINDOW: u32 = 16 << 20;
-/// A volume in one frame instead of sixteen.
+/// One frame per 40³ volume instead of sixteen.
 const MAX_FRAME: u32 = 1 << 20;
-/// Clients that vanished without a word are noticed.
+/// Interval of keep-alive pings, which detect clients that disappeared without closing the connection.
 const KEEPALIVE: Duration = Duration::from_secs(30);
 
-/// Calls that one connection may have open at a time: far more than queues take, few enough to bound what they hold.
+/// Maximum number of concurrent calls per connection: more than a queue holds by default, and a bound on their memory.
 const MAX_STREAMS: u32 = 256;
 
-/// Who may connect and what is taken.
+/// Settings of the gRPC listener.
 pub(crate) struct GrpcConfig {
-    /// TLS, where it is spoken.
+    /// None for plaintext.
     pub tls: Option<ServerTlsConfig>,
-    /// The tokens that are taken, where one is needed.
+    /// None if requests need no token.
     pub tokens: Option<Arc<Tokens>>,
-    /// The most connections.
+    /// Maximum number of open connections.
     pub connections: usize,
     pub limits: Limits,
 }
 
-/// Serves until the state is draining and every request that was taken is answered.
+/// Serves until the state is draining and all accepted requests are finished.
 pub(crate) async fn serve(
     listener: TcpListener,
-    entrance: GrpcConfig,
+    config: GrpcConfig,
     service: GraspRpc,
     inference: InferenceRpc,
     metrics: Arc<Metrics>,
     state: watch::Receiver<State>,
 ) -> anyhow::Result<()> {
-    let GrpcConfig { tls, tokens, connections, limits } = entrance;
+    let GrpcConfig { tls, tokens, connections, limits } = config;
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
-    // The limit is kept by the intake, which counts what it refuses.
+    // `RequestBody` enforces the limit on messages and counts refusals.
     let grasps = GraspServiceServer::new(service).max_decoding_message_size(usize::MAX);
     let inference = GrpcInferenceServiceServer::new(inference).max_decoding_message_size(usize::MAX);
     let guard = tokens::guard(tokens, Arc::clone(&metrics));
     let incoming = connections::accept(listener, metrics.connections(connections, limits.stall));
     let counted = Arc::clone(&metrics);
-    let outgoing = MapResponseLayer::new(move |response| outgoing(request_body::unreadable(response, &counted)));
+    let outgoing = MapResponseLayer::new(move |response| keep_permit(request_body::unreadable(response, &counted)));
     let intake = MapRequestLayer::new(move |request: http::Request<Body>| {
         let (mut parts, body) = request.into_parts();
         let deadline = deadline::read(&parts.headers);
@@ -80,7 +81,7 @@ pub(crate) async fn serve(
     if let Some(tls) = tls {
         server = server
             .tls_config(tls.timeout(limits.stall))
-            .context("the certificate, its key or the clients' CA cannot be used")?;
+            .context("cannot use the files of --tls-cert, --tls-key and --tls-client-ca; check their PEM content")?;
     }
     server
         .layer(intake)
@@ -92,7 +93,7 @@ pub(crate) async fn serve(
         .http2_keepalive_interval(Some(KEEPALIVE))
         .add_service(InterceptedService::new(grasps, guard.clone()))
         .add_service(InterceptedService::new(inference, guard.clone()))
-        // Whoever watches over this process has no token.
+        // Without the guard: probes have no token.
         .add_service(HealthServer::new(Health(state.clone())))
         .add_service(InterceptedService::new(reflection().build_v1()?, guard.clone()))
         .add_service(InterceptedService::new(reflection().build_v1alpha()?, guard))

@@ -1,4 +1,4 @@
-//! Messages on their way in: what is too large, or stops in the middle, is refused before it is taken whole.
+//! Request bodies: messages that are too large, stall or arrive too slowly are refused before they are complete.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -15,91 +15,91 @@ use tonic::{Code, Status};
 use crate::telemetry::metrics::Metrics;
 use crate::transport::deadline::Deadline;
 
-/// A gRPC message's prefix: whether it is compressed, then its length, four bytes from the highest on.
+/// Length of a gRPC message's prefix: the compression flag, then the message's length as a big-endian u32.
 const PREFIX: usize = 5;
 
-/// How the methods end that take a stream of messages.
+/// Suffixes of the methods with a client stream.
 const STREAMS: [&str; 3] = ["Stream", "TrackGrasps", "ServerReflectionInfo"];
 
-/// What a message must come by at least, bytes a second: one that is fed a byte at a time never stands still.
-const SLOWEST: f64 = 65_536.0;
+/// Minimum rate of a message, bytes per second. It refuses clients that send single bytes and so never stall.
+const MIN_RATE: f64 = 65_536.0;
 
-/// What is taken of anybody.
+/// Limits on messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Limits {
-    /// The largest message, bytes.
+    /// Maximum message size, bytes.
     pub message_bytes: usize,
-    /// How long a message that has begun may stand still, and a connection before its first.
+    /// Maximum pause within a message, and before the HTTP/2 preface of a connection.
     pub stall: Duration,
 }
 
-/// The body of a request, held to the limits.
+/// The body of a request, checked against the limits.
 pub(crate) struct RequestBody {
     body: Body,
-    /// When the caller gives up. tonic watches over it, too, and calls what it ends cancelled.
+    /// Checked here because tonic ends expired requests as cancelled.
     deadline: Option<Deadline>,
     limits: Limits,
     metrics: Arc<Metrics>,
-    /// Whether messages may come whenever they like, as those of a stream do.
-    rests: bool,
+    /// Whether pauses between messages are allowed, as in a client stream.
+    is_stream: bool,
     message: Message,
-    /// Since when the client is waited for.
+    /// Since when the server has been waiting for the client.
     since: Option<Instant>,
-    /// For how long it was, in this message; what the server takes to read on is not the client's fault.
+    /// Time that the server has waited for the client within this message. Time in which the server does not read is
+    /// excluded.
     waited: Duration,
-    /// Ends the waiting.
-    patience: Pin<Box<Sleep>>,
+    timeout: Pin<Box<Sleep>>,
     state: State,
 }
 
 enum State {
     Open,
-    /// What came before is still handed on.
+    /// The data before the invalid message was passed on; the next poll returns the status.
     Refusing(Status),
     Refused,
 }
 
-/// Where in a message the body is.
+/// Position of the body within its messages.
 #[derive(Debug, Default, PartialEq, Eq)]
 struct Message {
-    /// Which message, from 1 on; 0 before the first.
+    /// Number of the current message, from 1; 0 before the first.
     number: usize,
     prefix: [u8; PREFIX],
-    /// Bytes of the prefix that have come.
+    /// Received bytes of the prefix.
     prefixed: usize,
-    /// Bytes of the message that have still to come.
+    /// Missing bytes of the message.
     missing: usize,
 }
 
 impl RequestBody {
     /// The body of a request for a method at `path`.
     pub fn new(path: &str, body: Body, deadline: Option<Deadline>, limits: Limits, metrics: Arc<Metrics>) -> Self {
-        let rests = STREAMS.iter().any(|stream| path.ends_with(stream));
+        let is_stream = STREAMS.iter().any(|stream| path.ends_with(stream));
         Self {
             body,
-            // Answers of a stream may be worth having although its end never comes.
-            deadline: deadline.filter(|_| !rests),
+            // Not for streams, whose responses are useful although the stream has not ended.
+            deadline: deadline.filter(|_| !is_stream),
             limits,
             metrics,
-            rests,
+            is_stream,
             message: Message::default(),
             since: None,
             waited: Duration::ZERO,
-            patience: Box::pin(sleep(Duration::ZERO)),
+            timeout: Box::pin(sleep(Duration::ZERO)),
             state: State::Open,
         }
     }
 
-    /// Whether there is something that the client should send at once.
-    fn is_owed(&self) -> bool {
-        self.message.has_begun() || !self.rests
+    /// Whether the client must send more data now.
+    fn expects_data(&self) -> bool {
+        self.message.has_begun() || !self.is_stream
     }
 
-    /// For how much longer the client is waited for.
-    fn left(&self) -> Duration {
+    /// Maximum time to wait for the next data.
+    fn remaining(&self) -> Duration {
         let Limits { stall, .. } = self.limits;
-        let slowest = 2 * stall + Duration::from_secs_f64(self.message.length() as f64 / SLOWEST);
-        stall.min(slowest.saturating_sub(self.waited))
+        let longest = 2 * stall + Duration::from_secs_f64(self.message.length() as f64 / MIN_RATE);
+        stall.min(longest.saturating_sub(self.waited))
     }
 
     fn refuse(&mut self, status: Status) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
@@ -110,33 +110,33 @@ impl RequestBody {
 
     fn stalled(&self) -> Status {
         let stall = self.limits.stall;
-        let lacks = match self.message.missing {
-            0 if self.message.number > 0 && !self.message.has_begun() => "the end of the request is".to_owned(),
-            0 => "its length is".to_owned(),
-            missing => format!("{missing} bytes of it are"),
+        let missing = match self.message.missing {
+            0 if self.message.number > 0 && !self.message.has_begun() => "the end of the request".to_owned(),
+            0 => "its length".to_owned(),
+            missing => format!("{missing} bytes"),
         };
-        let why = if self.left() < stall {
-            format!("comes more slowly than {SLOWEST} bytes a second")
+        let reason = if self.remaining() < stall {
+            format!("is slower than {MIN_RATE} bytes per second")
         } else {
-            format!("has stood still for {stall:?}")
+            format!("stalled for {stall:?} (--stall-timeout)")
         };
-        Status::deadline_exceeded(format!("the message {why}, {lacks} missing; send it anew"))
+        Status::deadline_exceeded(format!("the message {reason}, {missing} missing; send it again"))
     }
 
     fn too_large(&self, bytes: usize) -> Status {
         let longest = self.limits.message_bytes;
         Status::invalid_argument(format!(
-            "the message has {bytes} bytes, at most {longest} are taken (--max-message-bytes)"
+            "the message has {bytes} bytes, must have at most {longest} (--max-message-bytes)"
         ))
     }
 }
 
 fn late() -> Status {
-    Status::deadline_exceeded("the caller's time was up before its message had come")
+    Status::deadline_exceeded("the deadline passed before the message was received")
 }
 
-/// Of what is no message tonic says `INTERNAL`, as if it were to blame, and nobody counts it. Its own errors are told from
-/// ours by having no details.
+/// Counts malformed messages and changes their status to `INVALID_ARGUMENT`; tonic returns `INTERNAL` for them. tonic's
+/// errors differ from ours by having no details.
 pub(crate) fn unreadable(mut response: http::Response<Body>, metrics: &Metrics) -> http::Response<Body> {
     let headers = response.headers_mut();
     let is_tonics = !headers.contains_key(Status::GRPC_STATUS_DETAILS);
@@ -148,7 +148,7 @@ pub(crate) fn unreadable(mut response: http::Response<Body>, metrics: &Metrics) 
     response
 }
 
-/// The same of a message of a stream.
+/// The same for a message of a stream.
 pub(crate) fn unreadable_message(status: Status, metrics: &Metrics) -> Status {
     if status.code() != Code::Internal {
         return status;
@@ -157,16 +157,16 @@ pub(crate) fn unreadable_message(status: Status, metrics: &Metrics) -> Status {
     Status::invalid_argument(status.message())
 }
 
-/// A message that is longer than it may be.
+/// A message exceeds the limit.
 #[derive(Debug, PartialEq, Eq)]
 struct TooLarge {
     bytes: usize,
-    /// Where in what has come it begins, 0 also if it began before.
+    /// Offset of the message in the received data; 0 also if it began in earlier data.
     begins: usize,
 }
 
 impl Message {
-    /// Goes on by what has come.
+    /// Advances by received data. `longest` is the maximum message size, bytes.
     fn advance(&mut self, bytes: &[u8], longest: usize) -> Result<(), TooLarge> {
         let (mut at, mut begins) = (0, 0);
         while at < bytes.len() {
@@ -186,9 +186,9 @@ impl Message {
                     return Err(TooLarge { bytes: self.missing, begins });
                 }
             }
-            let taken = self.missing.min(bytes.len() - at);
-            self.missing -= taken;
-            at += taken;
+            let count = self.missing.min(bytes.len() - at);
+            self.missing -= count;
+            at += count;
             if self.missing == 0 {
                 self.prefixed = 0;
             }
@@ -200,7 +200,7 @@ impl Message {
         self.prefixed > 0
     }
 
-    /// Of the message, bytes; 0 until it is known.
+    /// Length of the message, bytes; 0 until its prefix is complete.
     fn length(&self) -> usize {
         let [_, a, b, c, d] = self.prefix;
         if self.prefixed == PREFIX { u32::from_be_bytes([a, b, c, d]) as usize } else { 0 }
@@ -223,16 +223,17 @@ impl http_body::Body for RequestBody {
             }
         }
         let Poll::Ready(frame) = Pin::new(&mut this.body).poll_frame(context) else {
-            if !this.is_owed() {
+            if !this.expects_data() {
                 return Poll::Pending;
             }
             if this.since.is_none() {
-                let (now, left) = (Instant::now(), this.left());
+                let now = Instant::now();
                 this.since = Some(now);
-                let until = this.deadline.map_or(now + left, |Deadline(deadline)| (now + left).min(deadline.into()));
-                this.patience.as_mut().reset(until);
+                let latest = now + this.remaining();
+                let until = this.deadline.map_or(latest, |Deadline(deadline)| latest.min(deadline.into()));
+                this.timeout.as_mut().reset(until);
             }
-            ready!(this.patience.as_mut().poll(context));
+            ready!(this.timeout.as_mut().poll(context));
             let is_late = this.deadline.is_some_and(Deadline::has_passed);
             return this.refuse(if is_late { late() } else { this.stalled() });
         };
@@ -241,9 +242,10 @@ impl http_body::Body for RequestBody {
         }
         let data = match &frame {
             Some(Ok(frame)) => frame.data_ref(),
-            // Who goes resets the stream, which hyper tells as its end; tonic would take it for a broken message.
+            // A client that cancels resets the stream, which hyper reports as its end. tonic would report a malformed
+            // message.
             Some(Err(_)) | None if this.message.has_begun() => {
-                let status = Status::cancelled("the caller has gone in the middle of the message");
+                let status = Status::cancelled("cancelled by the client within a message");
                 return this.refuse(status);
             }
             Some(Err(_)) | None => None,
@@ -278,7 +280,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn messages_are_followed_however_they_are_cut() {
+    fn message_boundaries_are_found_in_pieces_of_any_size() {
         let mut bytes = Vec::new();
         for length in [0_u32, 3, 0, 300, 7] {
             bytes.push(0);
@@ -298,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn a_message_over_the_limit_is_known_by_its_length() {
+    fn a_message_over_the_limit_is_refused_by_its_prefix() {
         let mut message = Message::default();
         assert_eq!(message.advance(&[0, 0, 0, 1], 300), Ok(()));
         assert!(message.has_begun());

@@ -1,4 +1,4 @@
-//! Large replies on their way out, which are in memory until their clients have read them.
+//! A limit on the memory of large responses that clients have not read yet.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -10,54 +10,55 @@ use tonic::Status;
 use tonic::body::Body;
 use tonic::codegen::Bytes;
 
-/// Bytes in one unit of what is counted: a semaphore's permits are `u32`.
+/// Bytes per permit: a semaphore counts in `u32`.
 const UNIT: usize = 1 << 10;
 
-/// HTTP/2 buffers whatever it is given at once, however little of it the client takes.
+/// Bytes per frame. A response is passed on in frames, because HTTP/2 buffers each frame completely, even if the client
+/// does not read.
 const PIECE: usize = 64 << 10;
 
-/// How much may wait for clients to read it.
+/// Memory for responses that clients have not read yet.
 #[derive(Clone)]
 pub(crate) struct ResponseBuffer(Arc<Semaphore>);
 
-/// The place of one reply in the outbox, an extension of its response.
+/// The memory of one response, stored as an extension of the response.
 #[derive(Clone)]
 pub(crate) struct ResponsePermit {
     _permit: Arc<OwnedSemaphorePermit>,
 }
 
 impl ResponseBuffer {
-    /// Bytes.
+    /// Capacity, bytes.
     pub const CAPACITY: usize = 256 << 20;
 
     pub fn new() -> Self {
         Self(Arc::new(Semaphore::new(Self::CAPACITY / UNIT)))
     }
 
-    /// A place for a reply of so many bytes, if there is one.
-    pub fn hold(&self, bytes: usize) -> Option<ResponsePermit> {
+    /// Reserves memory for a response; None if the buffer is full.
+    pub fn acquire(&self, bytes: usize) -> Option<ResponsePermit> {
         let units = u32::try_from(bytes.min(Self::CAPACITY).div_ceil(UNIT)).ok()?;
         let permit = Arc::clone(&self.0).try_acquire_many_owned(units).ok()?;
         Some(ResponsePermit { _permit: Arc::new(permit) })
     }
 }
 
-/// Has a reply keep its place until it has been read.
-pub(crate) fn outgoing(mut response: http::Response<Body>) -> http::Response<Body> {
+/// Keeps a response's permit until the client has read the response.
+pub(crate) fn keep_permit(mut response: http::Response<Body>) -> http::Response<Body> {
     match response.extensions_mut().remove::<ResponsePermit>() {
-        Some(held) => response.map(|body| Body::new(Outgoing { body, rest: Bytes::new(), _held: held })),
+        Some(permit) => response.map(|body| Body::new(PermitBody { body, rest: Bytes::new(), _permit: permit })),
         None => response,
     }
 }
 
-/// A body that is given away piece by piece.
-struct Outgoing {
+/// A body that is passed on in pieces and holds its permit until it is dropped.
+struct PermitBody {
     body: Body,
     rest: Bytes,
-    _held: ResponsePermit,
+    _permit: ResponsePermit,
 }
 
-impl http_body::Body for Outgoing {
+impl http_body::Body for PermitBody {
     type Data = Bytes;
     type Error = Status;
 
@@ -80,7 +81,7 @@ impl http_body::Body for Outgoing {
     }
 
     fn size_hint(&self) -> SizeHint {
-        // As long as nothing was taken from it.
+        // The body's hint is valid until its first frame is read.
         if self.rest.is_empty() { self.body.size_hint() } else { SizeHint::default() }
     }
 }
@@ -93,7 +94,7 @@ mod tests {
 
     use super::*;
 
-    /// All at once, as tonic has it.
+    /// A body of one frame, like tonic's.
     struct Whole(Option<Bytes>);
 
     impl http_body::Body for Whole {
@@ -106,21 +107,21 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_reply_keeps_its_place_until_it_was_read() {
-        let outbox = ResponseBuffer::new();
+    async fn a_response_keeps_its_permit_until_it_is_read() {
+        let buffer = ResponseBuffer::new();
         let all = vec![7; 3 * PIECE + 1];
         let mut response = http::Response::new(Body::new(Whole(Some(Bytes::from(all.clone())))));
-        response.extensions_mut().insert(outbox.hold(ResponseBuffer::CAPACITY).unwrap());
-        assert!(outbox.hold(1).is_none());
-        let mut body = outgoing(response).into_body();
+        response.extensions_mut().insert(buffer.acquire(ResponseBuffer::CAPACITY).unwrap());
+        assert!(buffer.acquire(1).is_none());
+        let mut body = keep_permit(response).into_body();
         let mut read = Vec::new();
         while let Some(frame) = poll_fn(|context| Pin::new(&mut body).poll_frame(context)).await {
             let piece = frame.unwrap().into_data().unwrap();
-            assert!(piece.len() <= PIECE && outbox.hold(1).is_none());
+            assert!(piece.len() <= PIECE && buffer.acquire(1).is_none());
             read.extend(piece);
         }
         assert_eq!(read, all);
         drop(body);
-        assert!(outbox.hold(ResponseBuffer::CAPACITY).is_some());
+        assert!(buffer.acquire(ResponseBuffer::CAPACITY).is_some());
     }
 }

@@ -1,4 +1,4 @@
-//! Who may ask: bearers of a token, where there is one.
+//! Authentication with bearer tokens.
 
 use std::fs;
 use std::path::PathBuf;
@@ -14,14 +14,13 @@ use tracing::{error, info};
 
 use crate::telemetry::metrics::Metrics;
 
-/// Before the token in the header `authorization` (RFC 6750, section 2.1; the scheme's case does not matter).
+/// Scheme of the header `authorization` (RFC 6750, section 2.1), case-insensitive.
 const SCHEME: &str = "bearer ";
 
-/// What a caller without a token is told to do.
 const NEEDED: &str = "send the header `authorization: Bearer TOKEN`";
 
-/// The tokens that are taken, read from a file with one in a line, so that an old and a new one can both be good for a
-/// while. Nothing here can show a token: only their hashes are kept.
+/// The accepted tokens, read from a file with one token per line. Several tokens allow a rotation without downtime.
+/// Only their hashes are stored, so no message can contain a token.
 pub(crate) struct Tokens {
     file: PathBuf,
     hashes: RwLock<Vec<Hash>>,
@@ -35,20 +34,22 @@ impl Tokens {
         Ok(Self { file, hashes })
     }
 
-    /// Reads the file anew at each SIGHUP; one that cannot be read changes nothing.
+    /// Reloads the file at each SIGHUP. If it cannot be read, the tokens are unchanged.
     pub async fn watch(self: Arc<Self>, mut hangup: Signal) {
         while hangup.recv().await.is_some() {
             match hashes(&self.file) {
                 Ok(hashes) => {
-                    info!(tokens = hashes.len(), "the tokens were read anew");
+                    info!(tokens = hashes.len(), "tokens reloaded");
                     *self.hashes.write().unwrap_or_else(PoisonError::into_inner) = hashes;
                 }
-                Err(error) => error!(error = format!("{error:#}"), "the tokens stay as they are"),
+                Err(error) => {
+                    error!(error = format!("{error:#}"), "cannot reload the tokens; the accepted tokens are unchanged")
+                }
             }
         }
     }
 
-    /// Lets a request pass, or says what it lacks; never what it had.
+    /// Checks the token of a request. Errors never contain the received token.
     pub fn check(&self, metadata: &MetadataMap) -> Result<(), Status> {
         let header = metadata.get("authorization");
         let header = header.ok_or_else(|| Status::unauthenticated(format!("no token; {NEEDED}")))?;
@@ -58,11 +59,15 @@ impl Tokens {
             .filter(|text| text.get(..SCHEME.len()).is_some_and(|scheme| scheme.eq_ignore_ascii_case(SCHEME)));
         let token = token.map(|text| text[SCHEME.len()..].trim());
         let token = token.ok_or_else(|| Status::unauthenticated(format!("no bearer token; {NEEDED}")))?;
-        // Every hash is looked at, and to its end, however early one differs: how long this takes tells nothing.
+        // Compares with every hash in constant time, so that the duration reveals nothing about the tokens.
         let hash: Hash = Sha256::digest(token).into();
         let hashes = self.hashes.read().unwrap_or_else(PoisonError::into_inner);
-        let known = hashes.iter().fold(Choice::from(0), |known, one| known | one.ct_eq(&hash));
-        if bool::from(known) { Ok(()) } else { Err(Status::unauthenticated("the token is not one that is taken")) }
+        let known = hashes.iter().fold(Choice::from(0), |known, accepted| known | accepted.ct_eq(&hash));
+        if bool::from(known) {
+            Ok(())
+        } else {
+            Err(Status::unauthenticated("invalid token; send one of the server's --token-file"))
+        }
     }
 }
 
@@ -70,11 +75,11 @@ fn hashes(file: &PathBuf) -> anyhow::Result<Vec<Hash>> {
     let text = fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()))?;
     let tokens = text.lines().map(str::trim).filter(|line| !line.is_empty());
     let hashes: Vec<Hash> = tokens.map(|token| Sha256::digest(token).into()).collect();
-    ensure!(!hashes.is_empty(), "{} holds no token; write one in a line", file.display());
+    ensure!(!hashes.is_empty(), "{} contains no token; write one token per line", file.display());
     Ok(hashes)
 }
 
-/// An interceptor that lets only bearers of a token pass, and everyone where there is none.
+/// An interceptor that refuses requests without a valid token; without `tokens` it accepts all requests.
 pub(crate) fn guard(
     tokens: Option<Arc<Tokens>>,
     metrics: Arc<Metrics>,
@@ -95,12 +100,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bearers_of_any_of_the_tokens_pass() {
+    fn requests_with_any_of_the_tokens_are_accepted() {
         let file = std::env::temp_dir().join(format!("graspd-tokens-{}", std::process::id()));
         fs::write(&file, "old\n\n  new \n").unwrap();
         let tokens = Tokens::read(file.clone()).unwrap();
         fs::write(&file, "\n").unwrap();
-        assert!(Tokens::read(file.clone()).err().unwrap().to_string().contains("holds no token"));
+        assert!(Tokens::read(file.clone()).err().unwrap().to_string().contains("contains no token"));
         fs::remove_file(&file).unwrap();
         assert!(Tokens::read(file).err().unwrap().to_string().starts_with("cannot read"));
 
@@ -111,14 +116,14 @@ mod tests {
             }
             tokens.check(&metadata).map_err(|status| status.message().to_owned())
         };
-        for good in ["Bearer old", "bearer new", "BEARER  old "] {
-            assert_eq!(check(Some(good)), Ok(()), "{good}");
+        for valid in ["Bearer old", "bearer new", "BEARER  old "] {
+            assert_eq!(check(Some(valid)), Ok(()), "{valid}");
         }
-        let said = |header| check(header).unwrap_err();
-        assert!(said(None).starts_with("no token"));
-        assert!(said(Some("Basic old")).starts_with("no bearer token"));
-        for wrong in ["Bearer secret", "Bearer ", "Bearer ol", "Bearer oldd", "Bearer"] {
-            assert!(!said(Some(wrong)).contains("secret"), "{wrong}");
+        let error = |header| check(header).unwrap_err();
+        assert!(error(None).starts_with("no token"));
+        assert!(error(Some("Basic old")).starts_with("no bearer token"));
+        for invalid in ["Bearer secret", "Bearer ", "Bearer ol", "Bearer oldd", "Bearer"] {
+            assert!(!error(Some(invalid)).contains("secret"), "{invalid}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Meshes, what a depth camera sees of them, and shaded pictures of scenes and grasps. Knows no physics.
+//! Meshes, a depth camera renderer, and shaded pictures of scenes and grasps. This crate has no physics.
 
 mod mesh;
 mod picture;

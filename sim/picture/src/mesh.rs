@@ -1,15 +1,15 @@
-//! Triangle meshes: what objects are made of, and what the camera sees.
+//! Triangle meshes.
 
 use std::f64::consts::TAU;
 
 use nalgebra::{Isometry3, Point3, Vector3};
 
-/// A triangle mesh in metres; triangles run counter-clockwise seen from outside.
+/// A triangle mesh; triangles are counter-clockwise seen from outside.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Mesh {
-    /// Corners, metres.
+    /// Vertices, metres.
     pub vertices: Vec<Point3<f64>>,
-    /// Three indices into `vertices` for each triangle.
+    /// Three indices into `vertices` per triangle.
     pub triangles: Vec<[u32; 3]>,
 }
 
@@ -27,10 +27,10 @@ impl Mesh {
         Mesh { vertices, triangles }
     }
 
-    /// The solid of revolution about z of a profile of `(radius, z)` pairs, with `sides` sides.
+    /// The solid of revolution about z of a profile of `(radius, z)` pairs, approximated with `sides` sides.
     ///
-    /// The profile runs so that the solid lies on its left: up the outside, and for a hollow
-    /// object down the inside again. Where its ends are not on the axis they are closed by discs.
+    /// The solid lies to the left of the profile: up the outside and, for a hollow object, down the inside. Profile
+    /// ends off the axis are closed with discs.
     pub fn lathe(profile: &[(f64, f64)], sides: u32) -> Mesh {
         let mut mesh = Mesh::default();
         let mut previous: Option<Vec<u32>> = None;
@@ -48,12 +48,12 @@ impl Mesh {
         Mesh::lathe(&[(radius, -length / 2.0), (radius, length / 2.0)], sides)
     }
 
-    /// A sphere about the origin, `sides` around and half as many bands from pole to pole.
+    /// A sphere around the origin with `sides` sides around and half as many bands from pole to pole.
     pub fn sphere(radius: f64, sides: u32) -> Mesh {
         let bands = (sides / 2).max(2);
         let profile: Vec<_> = (0..=bands)
             .map(|i| (TAU / 2.0 * f64::from(i) / f64::from(bands)).sin_cos())
-            // Sines a rounding error off zero are the poles.
+            // Sines within rounding error of zero are the poles.
             .map(|(sin, cos)| (if sin < 1e-9 { 0.0 } else { radius * sin }, -radius * cos))
             .collect();
         Mesh::lathe(&profile, sides)
@@ -73,7 +73,7 @@ impl Mesh {
         self.triangles.extend(other.triangles.iter().map(|t| t.map(|i| i + offset)));
     }
 
-    /// The mesh with every vertex moved by `f`, which must keep the orientation.
+    /// The mesh with `f` applied to every vertex; `f` must preserve the orientation.
     pub fn mapped(&self, f: impl Fn(Point3<f64>) -> Point3<f64>) -> Mesh {
         Mesh { vertices: self.vertices.iter().map(|&p| f(p)).collect(), triangles: self.triangles.clone() }
     }
@@ -83,13 +83,13 @@ impl Mesh {
         self.mapped(|p| p * factor)
     }
 
-    /// The mesh moved by `pose`.
+    /// The mesh transformed by `pose`.
     pub fn transformed(&self, pose: &Isometry3<f64>) -> Mesh {
         self.mapped(|p| pose * p)
     }
 
-    /// The lowest and the highest corner of the axis-aligned bounding box; both the origin for
-    /// a mesh without vertices.
+    /// The lower and the upper corner of the axis-aligned bounding box; both are the origin for a mesh without
+    /// vertices.
     pub fn bounds(&self) -> (Point3<f64>, Point3<f64>) {
         let Some(&first) = self.vertices.first() else { return Default::default() };
         self.vertices.iter().fold((first, first), |(low, high), p| (low.inf(p), high.sup(p)))
@@ -101,12 +101,12 @@ impl Mesh {
         high - low
     }
 
-    /// The enclosed volume in m³, for a closed mesh.
+    /// The enclosed volume in m³. The mesh must be closed.
     pub fn volume(&self) -> f64 {
         self.tetrahedra().map(|(volume, _)| volume).sum()
     }
 
-    /// The centre of mass of the enclosed solid, for a closed mesh of some volume.
+    /// The centre of mass of the enclosed solid. The mesh must be closed and its volume above 0.
     pub fn centroid(&self) -> Point3<f64> {
         let moment: Vector3<f64> = self.tetrahedra().map(|(volume, centre)| volume * centre).sum();
         (moment / self.volume()).into()
@@ -131,7 +131,7 @@ impl Mesh {
         })
     }
 
-    /// Adds one ring of a lathe; a ring of no radius is a single vertex, named `sides` times.
+    /// Adds one ring of a lathe. A ring of radius 0 is a single vertex, whose index is repeated `sides` times.
     fn push_ring(&mut self, (radius, z): (f64, f64), sides: u32) -> Vec<u32> {
         let first = self.vertices.len() as u32;
         if radius == 0.0 {
@@ -145,7 +145,7 @@ impl Mesh {
         (first..first + sides).collect()
     }
 
-    /// Joins two rings by a band of triangles, leaving out those that collapse on the axis.
+    /// Joins two rings with a band of triangles, without those that degenerate on the axis.
     fn stitch(&mut self, below: &[u32], above: &[u32]) {
         for i in 0..below.len() {
             let j = (i + 1) % below.len();
@@ -155,7 +155,7 @@ impl Mesh {
     }
 }
 
-/// The profile of a lathe with its two ends brought to the axis.
+/// The profile of a lathe with both ends connected to the axis.
 fn closed_on_axis(profile: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let bottom = profile.first().filter(|(radius, _)| *radius > 0.0).map(|&(_, z)| (0.0, z));
     let top = profile.last().filter(|(radius, _)| *radius > 0.0).map(|&(_, z)| (0.0, z));
@@ -167,7 +167,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn volumes_and_centroids_are_those_of_the_solids() {
+    fn volumes_and_centroids_match_the_solids() {
         let cuboid = Mesh::cuboid(Vector3::new(0.1, 0.2, 0.3));
         assert!((cuboid.volume() - 0.006).abs() < 1e-12);
         let moved = cuboid.transformed(&Isometry3::translation(1.0, 2.0, 3.0));

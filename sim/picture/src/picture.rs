@@ -1,7 +1,7 @@
-//! Shaded pictures of scenes and grasps, for people.
+//! Shaded pictures of scenes and grasps.
 //!
-//! Light comes from a few dozen lamps spread over the sky, most of it from one side; each lamp
-//! has a shadow map, made with the depth camera. Together they give soft shadows and dim corners.
+//! A few dozen lamps spread over the sky, most of them on one side, light the scene. Each lamp has a shadow map,
+//! rendered with the depth camera. Together they give soft shadows and ambient occlusion.
 
 use std::collections::HashMap;
 use std::f64::consts::PI;
@@ -19,18 +19,19 @@ use crate::raster::{Instance, View};
 
 /// Subpixels along each side of a pixel.
 const SUPERSAMPLING: usize = 2;
-/// Lamps over the whole sky, and lamps close together that make the sunny side.
+/// Lamps over the whole sky.
 const SKY: usize = 28;
+/// Lamps close together that act as the sun.
 const SUN: usize = 12;
 /// The sun's share of the light.
 const SUN_SHARE: f64 = 0.68;
 /// Pixels along each side of a lamp's shadow map.
 const SHADOW_MAP: usize = 768;
-/// Surfaces that meet at a smaller angle than this are shaded as one smooth surface.
+/// Surfaces that meet at a smaller angle than this are shaded as one smooth surface, radians.
 const CREASE: f64 = 0.7;
-/// What stands for "no surface" among the things drawn.
+/// Item index of pixels without a surface.
 const BACKGROUND: u32 = u32::MAX;
-/// What stands for the table among the things drawn.
+/// Item index of pixels that show the table.
 const TABLE: u32 = u32::MAX - 1;
 
 /// A colour: red, green and blue in sRGB, 0–255.
@@ -54,12 +55,12 @@ const PALETTE: [Color; 12] = [
     [110, 122, 150],
 ];
 
-/// The colour of the object number `index` of a scene.
+/// The colour of object `index` of a scene.
 pub fn object_color(index: usize) -> Color {
     PALETTE[index % PALETTE.len()]
 }
 
-/// The colour of a grasp's quality: red at 0, yellow halfway, green at 1.
+/// The colour of a quality: red at 0, yellow at 0.5, green at 1.
 pub fn quality_color(quality: f64) -> Color {
     let q = quality.clamp(0.0, 1.0);
     let mix = |low: f64, high: f64, t: f64| (low + (high - low) * t) as u8;
@@ -68,7 +69,7 @@ pub fn quality_color(quality: f64) -> Color {
     std::array::from_fn(|i| mix(from[i], to[i], t))
 }
 
-/// A picture could not be written.
+/// A picture file could not be written.
 #[derive(Debug, Error)]
 #[error("cannot write the picture {}: {source}; check that its folder exists and is writable", path.display())]
 pub struct PictureError {
@@ -76,7 +77,7 @@ pub struct PictureError {
     source: png::EncodingError,
 }
 
-/// A picture in the making: add things to it, then [`Picture::save`] it.
+/// A picture that is rendered by [`Picture::save`] from the added items.
 #[derive(Clone, Debug)]
 pub struct Picture {
     camera: Intrinsics,
@@ -85,27 +86,27 @@ pub struct Picture {
     items: Vec<Item>,
 }
 
-/// A thing in the picture.
+/// An item in the picture.
 #[derive(Clone, Debug)]
 struct Item {
-    /// In the task frame.
+    /// Mesh in the task frame.
     mesh: Mesh,
-    /// A normal for each corner of each triangle.
+    /// One normal per corner of each triangle.
     normals: Vec<[Vector3<f64>; 3]>,
     color: Color,
-    /// Whether it is drawn over the scene: it neither casts a shadow nor stands in one.
+    /// Whether the item is an annotation: it casts and receives no shadow.
     note: bool,
 }
 
 impl Picture {
-    /// An empty picture through a camera; `camera_from_task` takes task points into it (z
-    /// forward, x right, y down).
+    /// An empty picture with a camera. `camera_from_task` maps task points into the camera frame (z forward, x right, y
+    /// down).
     pub fn new(camera: Intrinsics, camera_from_task: Isometry3<f64>) -> Picture {
         Picture { camera, camera_from_task, table: None, items: Vec::new() }
     }
 
-    /// An empty picture of `width` × `height` pixels from `eye` towards `target` (task frame),
-    /// `view` radians from top to bottom.
+    /// An empty picture of `width` × `height` pixels from `eye` towards `target` (task frame, metres), with a vertical
+    /// field of view of `view` radians.
     pub fn looking_at(width: usize, height: usize, view: f64, eye: Point3<f64>, target: Point3<f64>) -> Picture {
         let focal = height as f64 / 2.0 / (view / 2.0).tan();
         let (cx, cy) = (width as f64 / 2.0 - 0.5, height as f64 / 2.0 - 0.5);
@@ -113,7 +114,7 @@ impl Picture {
         Picture::new(camera, toward(eye, target))
     }
 
-    /// An empty picture of the 0.3 m task cube from a good corner, with its table.
+    /// A picture of the 0.3 m workspace with its table, seen from above a corner.
     pub fn of_workspace(width: usize, height: usize, table: f64) -> Picture {
         let (eye, target) = (Point3::new(0.50, -0.30, 0.52), Point3::new(0.16, 0.14, 0.12));
         let mut picture = Picture::looking_at(width, height, 0.42, eye, target);
@@ -121,26 +122,26 @@ impl Picture {
         picture
     }
 
-    /// Adds the table, an endless plane at `height` (task frame, metres).
+    /// Adds the table, an infinite plane at `height` (task frame, metres).
     pub fn table(&mut self, height: f64) -> &mut Self {
         self.table = Some(height);
         self
     }
 
-    /// Adds a mesh, scaled and then moved by `pose` into the task frame.
+    /// Adds a mesh, scaled and then transformed by `pose` into the task frame.
     pub fn mesh(&mut self, mesh: &Mesh, pose: &Isometry3<f64>, scale: f64, color: Color) -> &mut Self {
         self.add(mesh.scaled(scale).transformed(pose), color, false)
     }
 
-    /// Adds a slender gripper, of which many may show at once.
+    /// Adds a slender gripper, for pictures with many grasps.
     ///
-    /// Its frame: z towards the object, fingers apart along y, origin at the base of the fingers, which are `depth` metres
-    /// long; `width` metres between them.
+    /// Its frame: z is the approach, the fingers close along y, the origin is at the base of the fingers. The fingers
+    /// are `depth` metres long and `width` metres apart.
     pub fn gripper(&mut self, pose: &Isometry3<f64>, width: f64, depth: f64, color: Color) -> &mut Self {
         self.add(fork(width, depth, [0.006, 0.005]).transformed(pose), color, true)
     }
 
-    /// Adds a stout hand with the frame of [`Picture::gripper`] and the Panda's fingers, for the one that stands out.
+    /// Adds a solid hand in the frame of [`Picture::gripper`] with the fingers of the Panda, to highlight one grasp.
     pub fn hand(&mut self, pose: &Isometry3<f64>, width: f64, color: Color) -> &mut Self {
         let mut hand = fork(width, grasp::FINGER_DEPTH, [0.02, 0.009]);
         let palm = Mesh::cuboid(Vector3::new(0.026, 0.10, 0.018));
@@ -156,7 +157,7 @@ impl Picture {
         self
     }
 
-    /// Renders the picture: red, green, blue of each pixel, row by row from the top left.
+    /// Renders the picture: red, green and blue of each pixel, row by row from the top left.
     pub fn pixels(&self) -> Vec<u8> {
         let n = SUPERSAMPLING;
         let fine = refined(&self.camera);
@@ -204,16 +205,16 @@ impl Picture {
     /// Renders the picture and writes it as a PNG.
     ///
     /// # Errors
-    /// A file that cannot be created or written.
+    /// [`PictureError`] if the file cannot be created or written.
     pub fn save(&self, path: &Path) -> Result<(), PictureError> {
         write(path, self.camera.width, self.camera.height, &self.pixels())
     }
 }
 
-/// Renders pictures of one size and writes them side by side as a PNG, so many in a row.
+/// Renders pictures of one size and writes them as one PNG with `columns` pictures per row.
 ///
 /// # Errors
-/// A file that cannot be created or written.
+/// [`PictureError`] if the file cannot be created or written.
 pub fn save_sheet(path: &Path, pictures: &[&Picture], columns: usize) -> Result<(), PictureError> {
     let Some(Intrinsics { width, height, .. }) = pictures.first().map(|picture| picture.camera) else {
         return Ok(());
@@ -252,7 +253,7 @@ impl Item {
         Instance { mesh: &self.mesh, pose: Isometry3::identity(), scale: 1.0, id: 0 }
     }
 
-    /// The smooth normal at a point of a triangle.
+    /// The interpolated normal at a point of a triangle.
     fn normal(&self, triangle: usize, point: &Point3<f64>) -> Vector3<f64> {
         let [a, b, c] = self.mesh.corners(self.mesh.triangles[triangle]);
         let across = (b - a).cross(&(c - a));
@@ -264,7 +265,7 @@ impl Item {
     }
 }
 
-/// The lamps about a scene.
+/// The lamps of a scene.
 struct Light {
     lamps: Vec<Lamp>,
     centre: Point3<f64>,
@@ -280,13 +281,13 @@ struct Lamp {
 }
 
 impl Light {
-    /// Lamps on a dome over the things that cast shadows.
+    /// Lamps on a dome over the items that cast shadows.
     fn over(items: &[Item], table: Option<f64>) -> Light {
         let casters: Vec<_> = items.iter().filter(|item| !item.note).collect();
         let boxes: Vec<_> = casters.iter().flat_map(|item| <[_; 2]>::from(item.mesh.bounds())).collect();
         let (low, high) = Mesh { vertices: boxes, triangles: Vec::new() }.bounds();
         let centre = nalgebra::center(&low, &high);
-        // Shadows fall beside the things too.
+        // A margin for the shadows beside the items.
         let radius = (high - low).norm() / 2.0 + 0.05;
 
         let spiral = |i: usize, n: usize, least: f64| {
@@ -305,28 +306,29 @@ impl Light {
         Light { lamps: directions.into_par_iter().map(lamp).collect(), centre, radius }
     }
 
-    /// The light on a surface.
+    /// Light at a point of a surface.
     fn at(&self, point: &Point3<f64>, normal: &Vector3<f64>) -> f64 {
-        // A step off the surface, wider than a shadow map's pixel, keeps it from shading itself.
+        // The point is lifted off the surface by more than a pixel of the shadow map, so that the surface does not
+        // shade itself.
         let lifted = point + normal * (self.radius * 3.5 / SHADOW_MAP as f64);
         let from = |lamp: &Lamp| lamp.strength * normal.dot(&lamp.direction).max(0.0) * lamp.reaches(&lifted);
         0.06 + self.lamps.iter().map(from).sum::<f64>()
     }
 
-    /// The light on a surface where nothing is in the way, and bright all round.
+    /// Light on an annotation: without shadows and with a high ambient part.
     fn unshaded(&self, normal: &Vector3<f64>) -> f64 {
         0.55 + 0.45 * normal.dot(&self.lamps[SKY].direction).max(0.0)
     }
 
-    /// A soft glint of the sun.
+    /// Specular reflection of the sun.
     fn gloss(&self, normal: &Vector3<f64>, toward_eye: &Vector3<f64>) -> f64 {
         let sun = self.lamps[SKY].direction;
         let halfway = (sun + toward_eye).normalize();
         0.12 * normal.dot(&halfway).max(0.0).powi(40)
     }
 
-    /// The table with its grid, which fades into the paper far from the scene; `footprint` is
-    /// the size of a pixel there.
+    /// The colour of the table with its grid, which fades into the background far from the scene. `footprint` is the
+    /// size of a pixel on the table, metres.
     fn table(&self, point: &Point3<f64>, footprint: f64) -> Vector3<f64> {
         let to_line = |x: f64| (x / 0.05 - (x / 0.05).round()).abs() * 0.05;
         let distance = to_line(point.x).min(to_line(point.y));
@@ -356,7 +358,7 @@ impl Lamp {
         for item in casters {
             view.draw(&item.instance(), |_, _| ());
         }
-        // The table shades what is below it.
+        // The table also shades items below it.
         if let Some(height) = table {
             view.draw_table(height, |_| ());
         }
@@ -364,7 +366,7 @@ impl Lamp {
         Lamp { direction, strength, camera, camera_from_task, depth }
     }
 
-    /// 1 where the lamp's light reaches, 0 in shadow; outside its map nothing casts a shadow.
+    /// 1 if the lamp lights the point, 0 in shadow. Points outside the shadow map are lit.
     fn reaches(&self, point: &Point3<f64>) -> f64 {
         let p = self.camera_from_task * point;
         let u = (self.camera.fx * p.x / p.z + self.camera.cx).round();
@@ -375,10 +377,10 @@ impl Lamp {
     }
 }
 
-/// The pose of a camera at `eye` that looks at `target` with z up in its picture.
+/// `T_camera_task` of a camera at `eye` that looks at `target`, with z up in its picture.
 fn toward(eye: Point3<f64>, target: Point3<f64>) -> Isometry3<f64> {
     let forward = (target - eye).normalize();
-    // Straight down, any direction will do for up.
+    // For a vertical view any up direction works.
     let up = if forward.xy().norm() < 1e-6 { Vector3::y() } else { Vector3::z() };
     // look_at_rh has y up and z backward; the optical frame has y down and z forward.
     UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI) * Isometry3::look_at_rh(&eye, &target, &up)
@@ -387,7 +389,7 @@ fn toward(eye: Point3<f64>, target: Point3<f64>) -> Isometry3<f64> {
 /// The camera with [`SUPERSAMPLING`] times the pixels along each side.
 fn refined(camera: &Intrinsics) -> Intrinsics {
     let n = SUPERSAMPLING as f64;
-    // Pixel centres are whole numbers: the image's corner is at (−½, −½) before and after.
+    // Pixel centres are whole numbers: the corner of the image is at (−½, −½) in both.
     let centre = |c: f64| (c + 0.5) * n - 0.5;
     Intrinsics {
         width: camera.width * SUPERSAMPLING,
@@ -399,7 +401,7 @@ fn refined(camera: &Intrinsics) -> Intrinsics {
     }
 }
 
-/// Two fingers, the bar between them and a stem, in the grasp frame.
+/// A gripper in the grasp frame: two fingers, a bar between them and a stem.
 fn fork(width: f64, depth: f64, [breadth, thickness]: [f64; 2]) -> Mesh {
     let part =
         |size: [f64; 3], y: f64, z: f64| Mesh::cuboid(size.into()).transformed(&Isometry3::translation(0.0, y, z));
@@ -410,7 +412,7 @@ fn fork(width: f64, depth: f64, [breadth, thickness]: [f64; 2]) -> Mesh {
     Mesh::union([&finger(1.0), &finger(-1.0), &bar, &stem])
 }
 
-/// For each corner of each triangle the mean normal of the surfaces that meet there smoothly.
+/// For each corner of each triangle, the mean normal of the surfaces that meet there smoothly.
 fn smooth_normals(mesh: &Mesh) -> Vec<[Vector3<f64>; 3]> {
     let key = |p: Point3<f64>| p.coords.map(|x| (x * 1e5).round() as i64);
     let faces: Vec<_> = mesh.triangles.iter().map(|&t| mesh.area_normal(t)).collect();
@@ -430,12 +432,12 @@ fn smooth_normals(mesh: &Mesh) -> Vec<[Vector3<f64>; 3]> {
     triangles.map(|(face, &triangle)| mesh.corners(triangle).map(|corner| normal(face, corner))).collect()
 }
 
-/// From sRGB to amounts of light.
+/// Converts sRGB to linear light.
 fn linear(color: Color) -> Vector3<f64> {
     Vector3::from(color.map(|c| (f64::from(c) / 255.0).powf(2.2)))
 }
 
-/// From amounts of light to sRGB.
+/// Converts linear light to sRGB.
 fn srgb(light: Vector3<f64>) -> Color {
     light.map(|x| (x.clamp(0.0, 1.0).powf(1.0 / 2.2) * 255.0).round() as u8).into()
 }
@@ -446,7 +448,7 @@ mod tests {
 
     const BLUE: Color = [30, 60, 220];
 
-    /// A blue cube on the table, small, from above.
+    /// A small picture of a blue cube on the table, from above.
     fn cube() -> Picture {
         let mut picture = Picture::looking_at(64, 48, 0.6, Point3::new(0.0, 0.0, 0.5), Point3::origin());
         picture.table(0.0).mesh(
@@ -459,7 +461,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_shows_what_was_added_where_it_is() {
+    fn a_picture_shows_its_items_at_their_positions() {
         let pixels = cube().pixels();
         assert_eq!(pixels.len(), 64 * 48 * 3);
         let at = |u: usize, v: usize| <Color>::try_from(&pixels[(v * 64 + u) * 3..][..3]).unwrap();
@@ -478,7 +480,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gripper_reaches_its_width_and_depth() {
+    fn a_gripper_has_its_width_and_depth() {
         let (low, high) = fork(0.04, grasp::FINGER_DEPTH, [0.006, 0.005]).bounds();
         assert!((high.z - 0.05).abs() < 1e-12 && (high.y - 0.025).abs() < 1e-12 && (low.y + 0.025).abs() < 1e-12);
     }

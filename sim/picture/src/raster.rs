@@ -1,55 +1,55 @@
 //! The depth camera: a z-buffer rasteriser.
 //!
-//! Pixel (u, v) samples the ray through ((u − cx)/fx, (v − cy)/fy, 1) in the camera frame:
-//! z forward, x right, y down, pixel centres at whole coordinates. The depth of a pixel is that
-//! of its triangle's plane along the ray, so it is as exact as the mesh.
+//! Pixel (u, v) samples the ray through ((u − cx)/fx, (v − cy)/fy, 1) in the camera frame: z forward, x right, y down,
+//! pixel centres at whole coordinates. The depth of a pixel is that of the triangle's plane along the ray, so it is
+//! exact for the mesh.
 
 use grasp::Intrinsics;
 use nalgebra::{Isometry3, Point3, Vector3};
 
 use crate::mesh::Mesh;
 
-/// The id of pixels that see nothing.
+/// The id of pixels without a surface.
 pub const NOTHING: u16 = u16::MAX;
-/// The id of pixels that see the table.
+/// The id of pixels that show the table.
 pub const TABLE: u16 = u16::MAX - 1;
 
-/// Screen coordinates are rounded to this fraction of a pixel, so that coverage is decided in
-/// integers: two triangles agree exactly on the edge they share.
+/// Screen coordinates are rounded to this fraction of a pixel, so that coverage is computed in integers and two
+/// triangles agree exactly on their shared edge.
 const SUBPIXELS: f64 = 256.0;
-/// Screen coordinates are held within ± this many pixels, so that products of them fit 64 bits.
+/// Screen coordinates are clamped to ± this many pixels, so that their products fit into 64 bits.
 const FARTHEST_PIXEL: f64 = 4_194_304.0;
 
 /// A mesh in the scene.
 #[derive(Clone, Copy, Debug)]
 pub struct Instance<'a> {
-    /// The surface. Both sides of it are seen.
+    /// The surface. Both sides are visible.
     pub mesh: &'a Mesh,
-    /// Mesh frame → task frame, applied after the scale.
+    /// `T_task_mesh`, applied after the scale.
     pub pose: Isometry3<f64>,
     /// Scale of the mesh about its own origin.
     pub scale: f64,
-    /// The id its pixels get.
+    /// The id of its pixels.
     pub id: u16,
 }
 
-/// What the camera saw; both images row by row from the top left.
+/// The images of the camera, row by row from the top left.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
-    /// Pixels in a row.
+    /// Pixels per row.
     pub width: usize,
     /// Rows.
     pub height: usize,
-    /// Metres along the optical axis; 0 where nothing was seen.
+    /// Metres along the optical axis; 0 where there is no surface.
     pub depth: Vec<f32>,
-    /// The [`Instance::id`] seen, [`TABLE`] or [`NOTHING`].
+    /// The [`Instance::id`] of each pixel, [`TABLE`] or [`NOTHING`].
     pub ids: Vec<u16>,
 }
 
-/// Sees the instances, and the endless horizontal plane at the height `table` (task frame,
-/// metres) if there is one, between the depths `near` and `far`.
+/// Renders the instances, and optionally the infinite horizontal plane at the height `table` (task frame, metres),
+/// between the depths `near` and `far` (metres).
 ///
-/// `camera_from_task` takes task coordinates into the camera.
+/// `camera_from_task` is `T_camera_task`.
 pub fn render(
     instances: &[Instance],
     table: Option<f64>,
@@ -76,10 +76,10 @@ pub(crate) struct View<'a> {
     camera: &'a Intrinsics,
     camera_from_task: &'a Isometry3<f64>,
     near: f64,
-    /// Depth of the nearest surface so far, row by row; infinite where there is none.
+    /// Depth of the nearest surface so far, row by row; infinite without one.
     pub(crate) depth: Vec<f32>,
     far: f64,
-    /// Vertices of the instance being drawn, camera frame; kept between instances for its memory.
+    /// Vertices of the current instance in the camera frame. Kept between instances to reuse the allocation.
     vertices: Vec<Point3<f64>>,
 }
 
@@ -89,7 +89,7 @@ impl<'a> View<'a> {
         View { camera, camera_from_task, near, depth, far, vertices: Vec::new() }
     }
 
-    /// Draws an instance and calls `hit(pixel, triangle)` wherever it is the nearest so far.
+    /// Draws an instance and calls `hit(pixel, triangle)` for every pixel where it is the nearest so far.
     pub(crate) fn draw(&mut self, instance: &Instance, mut hit: impl FnMut(usize, usize)) {
         let camera_from_mesh = self.camera_from_task * instance.pose;
         let mut vertices = std::mem::take(&mut self.vertices);
@@ -101,7 +101,8 @@ impl<'a> View<'a> {
         self.vertices = vertices;
     }
 
-    /// Draws the plane z = `height` of the task frame and calls `hit(pixel)` where it is nearest.
+    /// Draws the plane z = `height` of the task frame and calls `hit(pixel)` for every pixel where it is the nearest so
+    /// far.
     pub(crate) fn draw_table(&mut self, height: f64, mut hit: impl FnMut(usize)) {
         let normal = self.camera_from_task * Vector3::z();
         let offset = normal.dot(&(self.camera_from_task * Point3::new(0.0, 0.0, height)).coords);
@@ -118,7 +119,7 @@ impl<'a> View<'a> {
         }
     }
 
-    /// Draws one triangle given in the camera frame, cut off at the near plane.
+    /// Draws one triangle given in the camera frame, clipped at the near plane.
     fn draw_triangle(&mut self, corners: [Point3<f64>; 3], mut hit: impl FnMut(usize)) {
         let normal = (corners[1] - corners[0]).cross(&(corners[2] - corners[0]));
         let inverse_depth = self.inverse_depth(normal, normal.dot(&corners[0].coords));
@@ -141,14 +142,14 @@ impl<'a> View<'a> {
         };
         let Some((columns, rows)) = self.covered([a, b, c]) else { return };
         let edges = [Edge::new(a, b), Edge::new(b, c), Edge::new(c, a)];
-        // At a grazing triangle's rim the plane runs off within the rounding of coverage;
-        // the depth stays between those of the corners.
+        // At the rim of a triangle seen edge-on, the rounding of coverage can extrapolate the plane far. The depth is
+        // clamped to those of the corners.
         let nearest = corners.iter().fold(f64::INFINITY, |z, p| z.min(p.z));
         let farthest = corners.iter().fold(0.0, |z: f64, p| z.max(p.z));
         for v in rows {
             let mut sides = edges.each_ref().map(|edge| edge.at(columns.start, v));
             for u in columns.clone() {
-                // Inside when no side is negative, so when no sign bit is set.
+                // Inside if no side is negative, that is, if no sign bit is set.
                 if sides[0] | sides[1] | sides[2] >= 0 {
                     let depth = (1.0 / inverse_depth.at(u, v)).clamp(nearest, farthest);
                     let pixel = v * self.camera.width + u;
@@ -164,13 +165,13 @@ impl<'a> View<'a> {
         }
     }
 
-    /// Where a point in front of the camera appears, in parts of a pixel.
+    /// Projects a point in front of the camera, in units of 1 / [`SUBPIXELS`] pixel.
     fn project(&self, p: Point3<f64>) -> [i64; 2] {
         let screen = [self.camera.fx * p.x / p.z + self.camera.cx, self.camera.fy * p.y / p.z + self.camera.cy];
         screen.map(|x| (x.clamp(-FARTHEST_PIXEL, FARTHEST_PIXEL) * SUBPIXELS).round() as i64)
     }
 
-    /// Columns and rows of the image that the box about a screen triangle covers.
+    /// Columns and rows covered by the bounding box of a screen triangle.
     fn covered(&self, corners: [[i64; 2]; 3]) -> Option<(std::ops::Range<usize>, std::ops::Range<usize>)> {
         let span = |axis: usize, size: usize| {
             let [a, b, c] = corners.map(|corner| corner[axis]);
@@ -181,7 +182,7 @@ impl<'a> View<'a> {
         Some((span(0, self.camera.width)?, span(1, self.camera.height)?))
     }
 
-    /// 1 / depth of the plane normal · x = offset (camera frame), which is affine in the pixel.
+    /// 1 / depth of the plane normal · x = offset (camera frame), an affine function of the pixel.
     fn inverse_depth(&self, normal: Vector3<f64>, offset: f64) -> Affine {
         let (u, v) = (normal.x / self.camera.fx, normal.y / self.camera.fy);
         let constant = normal.z - u * self.camera.cx - v * self.camera.cy;
@@ -203,7 +204,7 @@ impl Affine {
     }
 }
 
-/// One side of a screen triangle that turns clockwise as seen (y down).
+/// One side of a screen triangle in clockwise order on the screen (y down).
 struct Edge {
     from: [i64; 2],
     direction: [i64; 2],
@@ -220,19 +221,19 @@ impl Edge {
         Edge { from, direction, bias: if owns { 0 } else { -1 }, step: -direction[1] * SUBPIXELS as i64 }
     }
 
-    /// Not negative where the centre of pixel (u, v) is inside.
+    /// At least 0 if the centre of pixel (u, v) is inside.
     fn at(&self, u: usize, v: usize) -> i64 {
         let [x, y] = [u, v].map(|pixel| pixel as i64 * SUBPIXELS as i64);
         self.direction[0] * (y - self.from[1]) - self.direction[1] * (x - self.from[0]) + self.bias
     }
 }
 
-/// Twice the signed area of a screen triangle; positive if it turns clockwise as seen (y down).
+/// Twice the signed area of a screen triangle; positive if it is clockwise on the screen (y down).
 fn turn(a: [i64; 2], b: [i64; 2], c: [i64; 2]) -> i64 {
     (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 }
 
-/// The part of a triangle with z ≥ `near`: up to four corners, and how many.
+/// The part of a triangle with z ≥ `near`: up to four corners, and their number.
 fn clip(corners: [Point3<f64>; 3], near: f64) -> ([Point3<f64>; 4], usize) {
     let mut polygon = [Point3::origin(); 4];
     let mut count = 0;
@@ -246,7 +247,7 @@ fn clip(corners: [Point3<f64>; 3], near: f64) -> ([Point3<f64>; 4], usize) {
             push(p);
         }
         if (p.z >= near) != (q.z >= near) {
-            // Always from the same end, so that neighbours get the same point.
+            // Always interpolated from the same end, so that neighbouring triangles get the same point.
             let (p, q) = if p.z < q.z { (p, q) } else { (q, p) };
             let mut cut = p + (q - p) * ((near - p.z) / (q.z - p.z));
             cut.z = near;
@@ -273,7 +274,7 @@ mod tests {
     }
 
     impl Optical for Isometry3<f64> {
-        /// From y up and z backward to y down and z forward.
+        /// Converts from y up and z backward to y down and z forward.
         fn then_y_down(self) -> Self {
             UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI) * self
         }
@@ -287,7 +288,7 @@ mod tests {
         Vector3::new((u as f64 - CAMERA.cx) / CAMERA.fx, (v as f64 - CAMERA.cy) / CAMERA.fy, 1.0)
     }
 
-    /// Compares a frame with the depth along every ray; `None` where the rim makes it unsure.
+    /// Compares a frame with the expected depth along every ray; `None` skips pixels at a rim.
     fn assert_depths(frame: &Frame, tolerance: f64, expected: impl Fn(usize, usize) -> Option<f64>) {
         let mut compared = 0;
         for v in 0..frame.height {
@@ -315,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sphere_is_as_deep_as_a_sphere() {
+    fn a_sphere_has_the_depth_of_a_sphere() {
         let (radius, centre) = (0.1, Vector3::new(0.03, -0.02, 0.3));
         let mesh = Mesh::sphere(radius, 400);
         let sphere = instance(&mesh, Isometry3::translation(centre.x, centre.y, centre.z));
@@ -333,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn a_box_hides_what_is_behind_it_and_covers_its_silhouette() {
+    fn a_box_occludes_objects_behind_it_and_fills_its_silhouette() {
         // Faces at z = 0.4 and 0.5, edges at x, y = ±0.1.
         let mesh = Mesh::cuboid(Vector3::new(2.0, 2.0, 1.0));
         let near = Instance { mesh: &mesh, pose: Isometry3::translation(0.0, 0.0, 0.45), scale: 0.1, id: 1 };
@@ -374,14 +375,14 @@ mod tests {
     }
 
     #[test]
-    fn the_near_plane_cuts_and_the_far_plane_hides() {
-        // The camera stands inside a long floor that reaches behind it.
+    fn surfaces_are_clipped_at_the_near_and_the_far_plane() {
+        // The camera is above a long floor that extends behind it.
         let floor = Mesh::cuboid(Vector3::new(10.0, 1.0, 10.0));
         let floor = instance(&floor, Isometry3::translation(0.0, 0.6, 0.0));
         let frame = render(&[floor], None, &CAMERA, &Isometry3::identity(), 0.3, 1.5);
         assert_depths(&frame, 1e-6, |_, v| {
             let depth = 0.1 * CAMERA.fy / (v as f64 - CAMERA.cy);
-            // Where the floor is cut, its far underside shows through, beyond the far plane.
+            // Where the floor is clipped, its underside is visible but lies beyond the far plane.
             Some(if (0.3..=1.5).contains(&depth) { depth } else { 0.0 })
         });
     }

@@ -19,12 +19,12 @@ use serde::Serialize;
 
 use super::{SceneArgs, show};
 
-/// The scenes depend on the seed alone, so every planner meets the same ones.
+/// The scenes depend only on the seed, so that all planners are evaluated on the same scenes.
 #[derive(Args)]
 pub struct Bench {
-    /// The planners: `random`; an .onnx network; `grpc:ADDRESS`, a running graspd; `shaf`, the highest place where the
-    /// hand fits; `shaf:FILE`, the highest of a network's proposals above 0.5; `gpd:FILE`, places where the hand fits,
-    /// scored by a classifier of `grasp-train classify`.
+    /// Planner; can be repeated: `random`; the path of an .onnx network; `grpc:ADDRESS` (a running graspd); `shaf` (the
+    /// highest candidate); `shaf:FILE` (the highest of a network's proposals with a quality above 0.5); `gpd:FILE`
+    /// (candidates scored by a classifier of `grasp-train classify`).
     #[arg(long = "planner", required = true)]
     planners: Vec<String>,
 
@@ -34,40 +34,40 @@ pub struct Bench {
     #[command(flatten)]
     decoding: DecodingArgs,
 
-    /// Scenes to clear for each seed.
+    /// Rounds (scenes) per seed.
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
     rounds: u64,
 
-    /// Play so many times, with --seed and the numbers after it: the papers use 5.
+    /// Number of seeds, starting with --seed. The papers use 5.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     seeds: u64,
 
-    /// Objects a scene.
+    /// Initial number of objects per scene.
     #[arg(long, default_value_t = 5)]
     count: usize,
 
-    /// What runs the networks: cpu, openvino, cuda, tensorrt, or auto, the fastest there is.
+    /// Execution provider of the networks: cpu, openvino, cuda, tensorrt, or auto (the fastest available).
     #[arg(long, default_value = "cpu")]
     provider: Choice<Provider>,
 
-    /// The numbers in which it runs them: fp32, bf16, fp16, int8, or auto.
+    /// Number format of the networks: fp32, bf16, fp16, int8, or auto.
     #[arg(long, default_value = "auto")]
     precision: Choice<Precision>,
 
-    /// Print a JSON object or a Markdown row a planner.
+    /// Print a JSON object or a Markdown row per planner.
     #[arg(long, value_enum, default_value = "json")]
     format: Format,
 
-    /// Also write every attempt to this file, as JSON lines: which grasp, the object nearest to it, and what became of it.
+    /// Also write every attempt to this file, as JSON lines: the grasp, the nearest object and the outcome.
     #[arg(long)]
     attempts: Option<PathBuf>,
 
-    /// Also draw every attempt into this folder: the scene, the proposals, and the hand, green where it lifted an object
-    /// and red where it failed.
+    /// Also draw every attempt into this folder: the scene, the proposals and the hand, green for a success and red for
+    /// a failure.
     #[arg(long)]
     pictures: Option<PathBuf>,
 
-    /// Also draw the first six failures of the last planner on one sheet, and say what they are.
+    /// Also draw the first six failures of the last planner into this file and print their outcomes.
     #[arg(long)]
     failures: Option<PathBuf>,
 }
@@ -78,15 +78,15 @@ enum Format {
     Markdown,
 }
 
-/// Between a network's output and the grasps; by default as GIGA's evaluation has it. A running graspd takes the first
-/// two only.
+/// Decoding of a network's output; the defaults are those of GIGA's evaluation. A running graspd uses only the
+/// threshold and `force`.
 #[derive(Args, Serialize)]
 struct DecodingArgs {
     /// Smallest quality of a grasp (ε).
     #[arg(long, default_value_t = 0.9)]
     threshold: f32,
 
-    /// Where nothing reaches the threshold, try the best voxel down to this quality; `none` for never.
+    /// If no grasp reaches the threshold, execute the best grasp if its quality is at least this; `none` disables this.
     #[arg(long, default_value = "0.5", value_parser = parse_force)]
     force: Force,
 
@@ -94,11 +94,11 @@ struct DecodingArgs {
     #[arg(long, default_value_t = 0.1)]
     out_th: f32,
 
-    /// Believe grasps at the borders of the volume too.
+    /// Keep grasps at the borders of the volume.
     #[arg(long)]
     no_border: bool,
 
-    /// Drop grasps whose open hand would meet what was observed.
+    /// Drop grasps whose open hand would collide with the observed surface.
     #[arg(long)]
     clear: bool,
 }
@@ -109,7 +109,7 @@ struct Force(Option<f32>);
 fn parse_force(text: &str) -> Result<Force, String> {
     match text {
         "none" => Ok(Force(None)),
-        number => number.parse().map(|floor| Force(Some(floor))).map_err(|_| "a number or `none`".to_owned()),
+        number => number.parse().map(|floor| Force(Some(floor))).map_err(|_| "must be a number or `none`".to_owned()),
     }
 }
 
@@ -122,8 +122,8 @@ impl fmt::Display for DecodingArgs {
             None => f.write_str("no force, ")?,
         }
         write!(f, "out_th {out_th}")?;
-        f.write_str(if *no_border { ", borders too" } else { "" })?;
-        f.write_str(if *clear { ", hands clear of what was observed" } else { "" })
+        f.write_str(if *no_border { ", with borders" } else { "" })?;
+        f.write_str(if *clear { ", collision check" } else { "" })
     }
 }
 
@@ -153,7 +153,7 @@ impl Bench {
             seed: self.scene.seed,
         };
         let setup = format!(
-            "{}, objects {}{}, views {}, noise {}, {} objects a scene, {} rounds, seed {}",
+            "{}, objects {}{}, views {}, noise {}, {} objects per scene, {} rounds, seed {}",
             self.scene.scene.name(),
             self.scene.objects.as_deref().unwrap_or("test"),
             self.scene.part.suffix(),
@@ -211,7 +211,7 @@ const MARKDOWN_HEAD: &str = "\
 rounds ended: cleared, unseen, no proposal, gave up | fusion ms, p50 / p95 | planning ms, p50 / p95 |
 |---|---|---|---|---|---|---|---|";
 
-/// A row under [`MARKDOWN_HEAD`]: mean ± std over the seeds, or with one seed the 95 % interval.
+/// A row of the table: mean ± standard deviation over the seeds, or with one seed the 95 % interval.
 fn markdown(planner: &str, whole: &Summary, gsr: Option<Spread>, dr: Option<Spread>) -> String {
     let figure = |spread: Option<Spread>, pooled: f64, interval: f64| match spread {
         Some(spread @ Spread { std: Some(_), .. }) => spread.percent(),
@@ -231,20 +231,20 @@ fn markdown(planner: &str, whole: &Summary, gsr: Option<Spread>, dr: Option<Spre
     )
 }
 
-/// Keeps what was asked for of every attempt.
+/// Records attempts as `--attempts`, `--pictures` and `--failures` specify.
 struct Watcher<'a> {
     lines: Option<(&'a Path, Mutex<BufWriter<File>>)>,
     pictures: Option<&'a Path>,
-    /// The first failures: of which seed, round and attempt, what became of it, and how it looked.
+    /// The first failures by seed, round and attempt: outcome and picture.
     failures: Option<Mutex<BTreeMap<Number, (&'static str, Picture)>>>,
-    /// The first that could not be kept.
+    /// The first error while recording.
     error: Mutex<Option<anyhow::Error>>,
 }
 
 /// Seed, round and number of an attempt.
 type Number = (u64, u64, usize);
 
-/// Failures on a sheet, and in a row of it.
+/// Failures on a sheet, and per row.
 const FAILURES: usize = 6;
 const FAILURES_IN_A_ROW: usize = 3;
 
@@ -303,7 +303,7 @@ impl<'a> Watcher<'a> {
             picture().save(&folder.join(name))?;
         }
         if let Some(failures) = self.failures.as_ref().filter(|_| !attempt.outcome.is_success()) {
-            // Rounds are played in no order; the first are the first in every run.
+            // Rounds run in parallel. Sorting by number makes the choice the same in every run.
             let mut failures = failures.lock().unwrap_or_else(PoisonError::into_inner);
             failures.insert((seed, *round, *number), (outcome, picture()));
             if failures.len() > FAILURES {
@@ -325,7 +325,7 @@ impl<'a> Watcher<'a> {
         Ok(())
     }
 
-    /// What went wrong so far; the lines are on disk then.
+    /// Returns the first error, and flushes the lines to disk.
     fn finish(&self) -> anyhow::Result<()> {
         if let Some(error) = self.error.lock().unwrap_or_else(PoisonError::into_inner).take() {
             return Err(error);

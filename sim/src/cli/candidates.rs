@@ -9,22 +9,22 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::SceneArgs;
 
-/// What `grasp-train classify` learns from: an .npz with `images`, `labels` and `scenes`. The same seed gives the same
-/// file on any number of threads.
+/// Writes the training data of `grasp-train classify`: an .npz with `images`, `labels` and `scenes`. The same seed
+/// gives the same file on any number of threads.
 #[derive(Args)]
 pub struct Candidates {
     #[command(flatten)]
     scene: SceneArgs,
 
-    /// How many scenes. Their images are in memory together: 43 kB a candidate.
+    /// Number of scenes. All images are kept in memory: 43 kB per candidate.
     #[arg(long)]
     scenes: u64,
 
-    /// Candidates to try in each scene, drawn from all there are.
+    /// Maximum number of randomly drawn candidates per scene.
     #[arg(long, default_value_t = 50)]
     candidates: usize,
 
-    /// File to write.
+    /// Output file, .npz.
     #[arg(long)]
     out: PathBuf,
 }

@@ -10,32 +10,32 @@ use nalgebra::Isometry3;
 
 use super::label::Format;
 
-/// From raw to processed or packed, its depth images fused and grasps at the borders dropped, as VGN's scripts do; or
+/// From raw to processed or packed: fuses the depth images and drops grasps at the borders, as VGN's scripts do. Also
 /// between processed and packed.
 #[derive(Args)]
 pub struct Convert {
-    /// Folder to read: VGN's or GIGA's, or one of ours.
+    /// Input folder: a data set of VGN, GIGA or `label`.
     #[arg(long)]
     from: PathBuf,
 
-    /// Folder to write into.
+    /// Output folder.
     #[arg(long)]
     out: PathBuf,
 
-    /// In which form.
+    /// Output format.
     #[arg(long, value_enum, default_value = "packed")]
     format: Format,
 }
 
-/// Grasps nearer to the workspace's faces are dropped (VGN's clean-up), metres.
+/// Grasps closer to the faces of the workspace are dropped (as in VGN's clean-up), metres.
 const BORDER: f64 = 0.02;
 
 impl Convert {
     pub fn run(self) -> anyhow::Result<()> {
         if self.format == Format::Raw {
-            bail!("--format raw: depth images cannot be made of volumes; `grasp-sim label --format raw` writes them");
+            bail!("--format raw is not possible: volumes have no depth images; use `grasp-sim label --format raw`");
         }
-        anyhow::ensure!(self.from != self.out, "--from and --out are the same folder");
+        anyhow::ensure!(self.from != self.out, "--from and --out are the same folder; use another --out");
         let setup = Setup::read(&self.from)?;
         let mut writer = Writer::open(&self, &setup)?;
         match Form::of(&self.from)? {
@@ -94,7 +94,7 @@ impl Convert {
     }
 }
 
-/// The volume of a scene; `None` if nothing of it was seen.
+/// The volume of a scene; `None` if nothing was observed.
 fn fuse(reader: &raw::Reader, id: &str) -> anyhow::Result<Option<Vec<f32>>> {
     let mut fusion = Fusion::new(RESOLUTION, reader.setup().size);
     for view in reader.views(id)? {
@@ -119,11 +119,11 @@ impl Writer {
             Self::Processed(writer) => writer.next().is_some(),
             Self::Packed(writer) => writer.next().is_some(),
         };
-        anyhow::ensure!(!begun, "{} holds scenes already; use another folder", convert.out.display());
+        anyhow::ensure!(!begun, "--out {} already contains scenes; use another folder", convert.out.display());
         Ok(writer)
     }
 
-    /// The packed form numbers scenes; a name that is no number gives way to `index`.
+    /// Appends a scene. The packed format needs a number: `id` if it is one, else `index`.
     fn append(&mut self, index: u64, id: &str, volume: &[f32], trials: &[Trial]) -> anyhow::Result<()> {
         match self {
             Self::Processed(writer) => writer.append(id, volume, trials)?,

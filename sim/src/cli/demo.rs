@@ -18,21 +18,21 @@ use super::{SceneArgs, show};
 /// Rows of the table of grasps.
 const SHOWN: usize = 8;
 
-/// Starts graspd, shows it a simulated scene, and executes the best of the grasps it answers with.
+/// Start graspd, send it the depth images of a simulated scene and execute the best grasp in simulation.
 #[derive(Args)]
 pub struct Demo {
-    /// The server's binary.
+    /// Path of the graspd binary.
     #[arg(long)]
     graspd: PathBuf,
 
-    /// The server's models.
+    /// Folder of the server's models.
     #[arg(long)]
     models: PathBuf,
 
     #[command(flatten)]
     scene: SceneArgs,
 
-    /// Where the picture goes.
+    /// Output file of the picture, PNG.
     #[arg(long, default_value = "demo.png")]
     picture: PathBuf,
 }
@@ -51,7 +51,7 @@ impl Demo {
         let (world, mut rng) = benchmark.scene(0);
         let observation = benchmark
             .observe(&world, &mut rng)
-            .context("the cameras see nothing of this scene; another --seed makes another one")?;
+            .context("the cameras see no object in this scene; try another --seed")?;
         println!("a {:?} scene of {} objects, seed {}", self.scene.kind(), world.objects().len(), self.scene.seed);
         println!("seen in {} depth image(s) of 640×480 pixels", observation.views.len());
 
@@ -61,13 +61,13 @@ impl Demo {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let detection = runtime.block_on(async {
             let client = Client::connect(server.grpc().to_string()).await?;
-            // Lower than anyone would execute: a picture should show what is weighed up, too.
+            // A low threshold, so that the picture also shows grasps that would not be executed.
             let detect = DetectOptions { threshold: Some(0.5), ..DetectOptions::default() };
             let options = Options { detect, ..Options::default() };
             let views: Vec<DepthView> = observation.views.iter().map(depth_view).collect();
             client.detect_from_depth(&views, &Workspace::default(), options).await
         })?;
-        // With its runtime the client's connection closes, which the server would wait for when it is told to stop.
+        // Closes the client's connection, because the server waits for open connections when it shuts down.
         drop(runtime);
         print_detection(&detection);
 
@@ -77,7 +77,7 @@ impl Demo {
                 println!("the best one, executed: lifted {} ({:.0} mm wide)", name.unwrap_or("it"), width * 1e3);
             }
             Some(failure) => println!("the best one, executed: {}", failure.name().replace('_', " ")),
-            None => println!("nothing to execute: {:?}; another --seed makes another scene", detection.dropped),
+            None => println!("no grasp to execute ({:?}); try another --seed", detection.dropped),
         }
 
         draw(&world, &detection).save(&self.picture)?;
@@ -128,7 +128,7 @@ fn angle_off_vertical(rotation: &UnitQuaternion<f64>) -> f64 {
     (rotation * Vector3::z()).angle(&-Vector3::z())
 }
 
-/// The scene, every proposal coloured by its quality, and the one that was executed as a solid hand.
+/// The scene with all grasps coloured by quality; the executed grasp is a solid hand.
 fn draw(world: &World, detection: &Detection) -> Picture {
     let mut picture = Picture::of_workspace(1200, 900, TABLE_HEIGHT);
     show(&mut picture, world);

@@ -11,49 +11,49 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{SceneArgs, refuse_looks};
 
-/// What scenes are made of unless the command says otherwise.
+/// Default of `--objects`.
 const OBJECTS: &str = "train";
 
-/// The same seed gives the same data on any number of threads; a run that was cut off goes on where it stopped, also
-/// with more scenes.
+/// The same seed gives the same data on any number of threads. An interrupted run continues where it stopped, also with
+/// a larger number of scenes.
 #[derive(Args)]
 pub struct Label {
     #[command(flatten)]
     scene: SceneArgs,
 
-    /// How many scenes.
+    /// Number of scenes.
     #[arg(long)]
     scenes: u64,
 
-    /// Number of the first: machines that share the work take a range each, and `merge` joins them.
+    /// Number of the first scene. To share the work, give each machine its own range and join the results with `merge`.
     #[arg(long, default_value_t = 0)]
     first: u64,
 
-    /// Grasp points a scene, each tried at six yaws.
+    /// Grasp points per scene, each tried at six yaws.
     #[arg(long, default_value_t = 120)]
     points: usize,
 
-    /// Observations of each scene, with other views and other noise; only the packed form keeps more than one.
+    /// Observations of each scene, with different views and noise; more than one needs the packed format.
     #[arg(long, default_value_t = 1)]
     observations: usize,
 
     #[arg(long, hide = true, value_parser = refuse_looks)]
     looks: Option<String>,
 
-    /// Folder to write into.
+    /// Output folder.
     #[arg(long)]
     out: PathBuf,
 
-    /// In which form: VGN's depth images, VGN's volumes, or the same packed.
+    /// Format: VGN's depth images (raw), VGN's volumes (processed), or volumes in few large files (packed).
     #[arg(long, value_enum, default_value = "packed")]
     format: Format,
 
-    /// Also write every scene and its trials to this file, as JSON lines.
+    /// Also write every scene with its trials to this file, as JSON lines.
     #[arg(long)]
     export: Option<PathBuf>,
 }
 
-/// The forms of a data set.
+/// The formats of a data set.
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Format {
     Raw,
@@ -66,7 +66,7 @@ impl Label {
         let several = self.observations != 1 && self.format != Format::Packed;
         anyhow::ensure!(
             !several && self.observations > 0,
-            "--observations is {}; only --format packed takes several",
+            "--observations is {}, must be greater than 0; only --format packed stores more than 1",
             self.observations
         );
         let config = SceneConfig {
@@ -93,7 +93,8 @@ impl Label {
         let next = writer.next().unwrap_or(0).max(self.first);
         let mut export = self.export.as_deref().map(|path| Export::open(path, next)).transpose()?;
 
-        let end = self.first.checked_add(self.scenes).context("--first and --scenes are too large")?;
+        let end =
+            self.first.checked_add(self.scenes).context("--first + --scenes exceeds 2^64 - 1; use smaller numbers")?;
         let style = "{wide_bar} {pos}/{len} scenes, {per_sec}, {eta} left";
         let progress = ProgressBar::new(self.scenes).with_style(ProgressStyle::with_template(style)?);
         progress.set_position(next - self.first);
@@ -149,7 +150,8 @@ impl Writer {
             Self::Processed(writer) => writer.append(&id, &scene.observations[0].volume, &trials(voxel_size))?,
             Self::Packed(writer) => {
                 let trials = trials(voxel_size);
-                let volumes: Vec<Vec<f32>> = scene.observations.drain(..).map(|look| look.volume).collect();
+                let volumes: Vec<Vec<f32>> =
+                    scene.observations.drain(..).map(|observation| observation.volume).collect();
                 writer.append(number, &volumes, &trials)?;
             }
         }

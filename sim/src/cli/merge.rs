@@ -3,14 +3,14 @@ use std::path::PathBuf;
 use clap::Args;
 use grasp_data::packed;
 
-/// All must come from the same `label` command but for the scenes' numbers, `--first` and `--scenes`.
+/// All folders must come from the same `label` command, except for `--first` and `--scenes`.
 #[derive(Args)]
 pub struct Merge {
-    /// Folders with a range of scenes each, packed.
+    /// Packed data sets, each with a range of scenes.
     #[arg(required = true, num_args = 1..)]
     folders: Vec<PathBuf>,
 
-    /// Folder to write into.
+    /// Output folder.
     #[arg(long)]
     out: PathBuf,
 }

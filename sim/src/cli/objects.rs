@@ -12,35 +12,35 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{Scene, parse_objects};
 
-/// Objects across and down, and the distance between them, metres.
+/// Columns and rows of the picture, and the distance between objects, metres.
 const COLUMNS: usize = 10;
 const ROWS: usize = 6;
 const PITCH: f64 = 0.16;
 
-/// What scenes are made of, to look at, or for another simulator.
+/// Draw the objects of scenes, or write them as files for another simulator.
 #[derive(Args)]
 pub struct Objects {
-    /// The objects: our own, `train`, `test` or `generated`, or a folder of URDF files.
+    /// Objects: the procedural sets `train`, `test` or `generated`, or a folder of URDF files.
     #[arg(long, default_value = "train", value_parser = parse_objects)]
     objects: String,
 
-    /// Of which scene the test objects are.
+    /// Scenario of the test objects.
     #[arg(long, value_enum, default_value = "packed")]
     scene: Scene,
 
-    /// Leave out so many at the beginning.
+    /// Skip this many objects at the beginning.
     #[arg(long, default_value_t = 0)]
     skip: usize,
 
-    /// How many, of objects without end.
+    /// Number of `generated` objects.
     #[arg(long, default_value_t = COLUMNS * ROWS)]
     count: usize,
 
-    /// Draw the first 60 on a table, row by row.
+    /// Draw the first 60 objects into this file, PNG.
     #[arg(long)]
     picture: Option<PathBuf>,
 
-    /// Write each into this folder.
+    /// Write the objects as URDF and OBJ into this folder.
     #[arg(long)]
     out: Option<PathBuf>,
 }

@@ -10,13 +10,13 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{Scene, VIEWS, parse_camera_words, parse_share, parse_views, refuse_looks};
 
-/// A fraction of the work of labelling: nothing is tried. A run that was cut off goes on where it stopped.
+/// Much faster than labelling, because no grasp is tried. An interrupted run continues where it stopped.
 #[derive(Args)]
 pub struct Observe {
-    /// Folder that `label` wrote, packed.
+    /// Packed data set written by `label`.
     data: PathBuf,
 
-    /// The cameras, as for `label`.
+    /// Cameras, as for `label`.
     #[arg(long, value_parser = parse_camera_words)]
     views: String,
 
@@ -27,29 +27,29 @@ pub struct Observe {
     #[arg(long, hide = true, value_parser = refuse_looks)]
     looks: Option<String>,
 
-    /// Share of the observations that carry the benchmark's depth noise.
+    /// Share of the observations with the benchmark's depth noise.
     #[arg(long, default_value_t = 1.0, value_parser = parse_share)]
     noise: f64,
 
-    /// Seed of the views and the noise; the scenes stay.
+    /// Seed of the views and the noise. The scenes stay the same.
     #[arg(long, default_value_t = 1)]
     seed: u64,
 
-    /// Folder to write into.
+    /// Output folder.
     #[arg(long)]
     out: PathBuf,
 }
 
 impl Observe {
     pub fn run(self) -> anyhow::Result<()> {
-        ensure!(self.observations > 0, "--observations is 0");
+        ensure!(self.observations > 0, "--observations is 0, must be greater than 0");
         let parse = |views: &str| parse_views(views).with_context(|| format!("--views is `{views}`: use {VIEWS}"));
         let views = parse(&self.views)?;
         let data = Reader::open(&self.data)?;
         let mut scenes: Vec<usize> = (0..data.len()).collect();
         scenes.sort_by_key(|&index| data.number(index));
 
-        let missing = || format!("{} does not say how its scenes were made", self.data.display());
+        let missing = || format!("{}: setup.json has no provenance; label the scenes again", self.data.display());
         let made = Setup::read(&self.data)?.provenance.with_context(missing)?;
         let scene = Scene::from_str(&made.scene, false).map_err(anyhow::Error::msg)?;
         let before = SceneConfig {
@@ -63,10 +63,10 @@ impl Observe {
         };
         if let Some(&first) = scenes.first() {
             let observations = before.observe_again(data.number(first), made.observation_seed.unwrap_or(made.seed));
-            let same = observations.first().is_some_and(|look| quantise(&look.volume) == data.volume(first, 0));
+            let same = observations.first().is_some_and(|first_of| quantise(&first_of.volume) == data.volume(first, 0));
             ensure!(
                 same,
-                "{} was labelled with another simulator, in which other scenes came out",
+                "{} was labelled with another simulator or version: its first scene differs; label the scenes again",
                 self.data.display()
             );
         }
@@ -92,7 +92,8 @@ impl Observe {
             |place, observations| {
                 let index = scenes[place as usize];
                 if !observations.is_empty() {
-                    let volumes: Vec<Vec<f32>> = observations.into_iter().map(|look| look.volume).collect();
+                    let volumes: Vec<Vec<f32>> =
+                        observations.into_iter().map(|observation| observation.volume).collect();
                     writer.append(data.number(index), &volumes, &data.trials(index))?;
                 }
                 progress.inc(1);

@@ -7,14 +7,15 @@ use grasp_sim::reliability::{Attempt, Reliability};
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
 
-/// Compares the quality of executed grasps with what became of them: a diagram, and the expected calibration error.
+/// Compare the predicted quality of executed grasps with their success rate: a diagram and the expected calibration
+/// error.
 #[derive(Args)]
 pub struct ReliabilityArgs {
-    /// What `bench --attempts` or `sim/pybullet/clear.py --attempts` wrote, and what to call it: NAME=FILE.
+    /// NAME=FILE: a label for the diagram, and a file of `bench --attempts` or `sim/pybullet/clear.py --attempts`.
     #[arg(required = true, num_args = 1.., value_parser = parse_named)]
     attempts: Vec<(String, PathBuf)>,
 
-    /// The diagram, a PNG.
+    /// Output file of the diagram, PNG.
     #[arg(long)]
     out: Option<PathBuf>,
 }
@@ -49,14 +50,14 @@ fn read(path: &Path) -> anyhow::Result<Vec<Attempt>> {
             serde_json::from_str(line).with_context(|| format!("{}, line {}", path.display(), index + 1))
         })
         .collect::<anyhow::Result<_>>()?;
-    ensure!(!attempts.is_empty(), "{} has no attempt", path.display());
+    ensure!(!attempts.is_empty(), "{} is empty; it must contain at least one attempt", path.display());
     Ok(attempts)
 }
 
 const COLORS: [RGBColor; 4] =
     [RGBColor(40, 110, 180), RGBColor(210, 110, 30), RGBColor(40, 140, 80), RGBColor(150, 60, 150)];
 
-/// Below, as many bins are left out as hold no attempt of any planner.
+/// Draws the diagram. The axis starts at the first bin with an attempt.
 fn draw(path: &Path, found: &[(&str, Reliability)]) -> anyhow::Result<()> {
     register_font("sans-serif", FontStyle::Normal, dejavu::sans::regular())
         .map_err(|_| anyhow!("the built-in font cannot be read"))?;
@@ -72,7 +73,7 @@ fn draw(path: &Path, found: &[(&str, Reliability)]) -> anyhow::Result<()> {
     chart
         .configure_mesh()
         .x_desc("quality")
-        .y_desc("share of the attempts that lifted an object")
+        .y_desc("success rate")
         .x_label_formatter(&|value| format!("{value:.2}"))
         .y_label_formatter(&|value| format!("{value:.1}"))
         .label_style(("sans-serif", 14))

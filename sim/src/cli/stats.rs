@@ -13,18 +13,18 @@ use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
 
-/// How the labels are balanced, over widths, heights, approach angles and objects: a table, and pictures.
+/// Prints and draws the distribution of the labels over widths, heights, approach angles and objects.
 #[derive(Args)]
 pub struct Stats {
-    /// Folders of volumes, packed or processed; several are counted together.
+    /// Data set folders, packed or processed; several are pooled.
     #[arg(required = true, num_args = 1..)]
     folders: Vec<PathBuf>,
 
-    /// What `label --export` wrote, to count by object.
+    /// File written by `label --export`, to count by object.
     #[arg(long)]
     export: Option<PathBuf>,
 
-    /// Folder for `statistics.json`, `statistics.png` and `objects.png`.
+    /// Output folder for `statistics.json`, `statistics.png` and `objects.png`.
     #[arg(long)]
     out: Option<PathBuf>,
 }
@@ -37,7 +37,7 @@ impl Stats {
             None => BTreeMap::new(),
         };
         match print(&statistics, &objects) {
-            // Nobody reads on, as after `| head`.
+            // A closed pipe, as after `| head`, is not an error.
             Err(error) if error.kind() == io::ErrorKind::BrokenPipe => {}
             printed => printed.context("cannot print")?,
         }
@@ -61,13 +61,13 @@ impl Stats {
 fn print(statistics: &Statistics, objects: &BTreeMap<String, Count>) -> io::Result<()> {
     let mut out = io::stdout().lock();
     let Statistics { scenes, volumes, observed, grasps, .. } = statistics;
-    writeln!(out, "{scenes} scenes seen {volumes} times, {:.1} % of the voxels near a surface", observed * 100.0)?;
+    writeln!(out, "{scenes} scenes, {volumes} observations, {:.1} % of the voxels near a surface", observed * 100.0)?;
     writeln!(out, "{} grasps, {} successes ({})", grasps.all(), grasps.successes, percent(*grasps))?;
     for histogram in [&statistics.widths, &statistics.heights, &statistics.approaches, &statistics.shares] {
         let mut table = table([histogram.quantity, histogram.counted, "share", "successes"]);
         let total: u64 = histogram.bins.iter().map(|bin| bin.all()).sum();
         let only_successes = histogram.bins.iter().all(|bin| bin.failures == 0);
-        // Two bins a row: the pictures have the rest.
+        // Two bins per row; the pictures show every bin.
         for (row, bins) in histogram.bins.chunks(2).enumerate() {
             let count = bins.iter().fold(Count::default(), |sum, bin| Count {
                 failures: sum.failures + bin.failures,
@@ -123,7 +123,7 @@ fn draw_histograms(path: &Path, statistics: &Statistics) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Bars of failures on bars of successes.
+/// Stacked bars of successes and failures.
 fn draw_histogram(area: &DrawingArea<BitMapBackend, Shift>, histogram: &Histogram) -> anyhow::Result<()> {
     let Histogram { quantity, counted, start, step, bins } = histogram;
     let highest = bins.iter().map(|bin| bin.all()).max().unwrap_or(0).max(1) as f64;
@@ -151,7 +151,7 @@ fn draw_histogram(area: &DrawingArea<BitMapBackend, Shift>, histogram: &Histogra
     Ok(())
 }
 
-/// A bar for each object, the easiest first.
+/// One bar per object, sorted by success rate.
 fn draw_objects(path: &Path, objects: &BTreeMap<String, Count>) -> anyhow::Result<()> {
     const ROW: u32 = 16;
     let mut rows: Vec<(&String, f64)> =
@@ -160,7 +160,7 @@ fn draw_objects(path: &Path, objects: &BTreeMap<String, Count>) -> anyhow::Resul
     let root = BitMapBackend::new(path, (900, 80 + ROW * rows.len() as u32)).into_drawing_area();
     root.fill(&WHITE)?;
     let mut chart = ChartBuilder::on(&root)
-        .caption("successes by object, %", ("sans-serif", 16))
+        .caption("success rate by object, %", ("sans-serif", 16))
         .margin(12)
         .x_label_area_size(30)
         .y_label_area_size(180)

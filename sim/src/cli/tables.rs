@@ -164,10 +164,12 @@ impl Tables {
 
     fn tasks(&self, entries: &[Entry], fingerprint: &str) -> anyhow::Result<Vec<Task>> {
         let mut tasks = Vec::new();
-        let others = self.others.iter().map(|folder| Ok((name_of(folder), hash_folder(folder)?)));
+        let others = self.others.iter().map(|folder| Ok((name_of(folder), hash_folder(folder, &["urdf", "obj"])?)));
         let others: Vec<(String, String)> = others.collect::<anyhow::Result<_>>()?;
         let there = match &self.pybullet {
-            Some(_) => Some(hash_folder(Path::new(FOLDER))? + &hash_folder(Path::new("sim/hand"))?),
+            Some(_) => {
+                Some(hash_folder(Path::new(FOLDER), &["py"])? + &hash_folder(Path::new("sim/hand"), &["urdf", "obj"])?)
+            }
             None => None,
         };
         for entry in entries {

@@ -1,7 +1,7 @@
-//! Household-like objects without end, each made from a seed.
+//! Household-like objects, each generated from a seed.
 //!
-//! A kind — a bottle, a mug, a pair of pliers — draws its proportions at random; then the size is
-//! drawn from that of real things, and a material gives the mass.
+//! A kind (bottle, mug, pliers) defines random proportions. The size is drawn from the range of real objects, and the
+//! density gives the mass.
 
 mod dice;
 mod food;
@@ -18,26 +18,26 @@ use dice::Dice;
 use grasp_picture::Mesh;
 use shape::Shape;
 
-/// Friction of everything, that of the public grasping sets.
+/// Friction of all objects, that of the public object sets for grasping.
 const FRICTION: f64 = 1.0;
-/// Ranges of the greatest length of the shortest, the middle and the longest side, metres. Real things are large
-/// for a gripper that opens 80 mm: of 88 household things, half are wider than that in two directions.
+/// Ranges of the maximum length of the shortest, middle and longest side, metres. Real objects are large for a gripper
+/// that opens 80 mm: of 88 household objects half are wider than that in two directions.
 const SIDES: [(f64, f64); 3] = [(0.055, 0.077), (0.05, 0.17), (0.12, 0.28)];
-/// The least length of the longest side, metres.
+/// Smallest length of the longest side, metres.
 const SMALLEST: f64 = 0.045;
-/// What an arm with such a gripper lifts, kg.
+/// Payload of an arm with such a gripper, kg.
 const HEAVIEST: f64 = 1.5;
 
-/// Seeds of the objects that are in no split.
+/// Seeds of generated objects, which are in no split.
 pub(super) const GENERATED: Range<u64> = 1 << 32..1 << 63;
 
 /// A kind of object.
 struct Kind {
     name: &'static str,
     make: fn(&mut Dice) -> Shape,
-    /// Least and greatest density of the solid, kg/m³; low for things that are hollow inside.
+    /// Smallest and greatest density, kg/m³; low for hollow objects.
     density: (f64, f64),
-    /// Whether it is one of the things a shelf holds upright.
+    /// Whether objects of this kind stand upright.
     upright: bool,
 }
 
@@ -45,7 +45,7 @@ const fn kind(name: &'static str, make: fn(&mut Dice) -> Shape, low: f64, high: 
     Kind { name, make, density: (low, high), upright }
 }
 
-/// Every kind; a seed's remainder picks one, so that any run of seeds is mixed.
+/// All kinds. The remainder of the seed selects one, so that consecutive seeds give different kinds.
 const KINDS: &[Kind] = &[
     kind("carton", packaging::carton, 150.0, 700.0, true),
     kind("screwdriver", tools::screwdriver, 900.0, 1800.0, false),
@@ -102,20 +102,20 @@ const KINDS: &[Kind] = &[
     kind("spool", toys::spool, 300.0, 1000.0, false),
 ];
 
-/// The object of a seed: any seed gives one, and the same seed always the same.
+/// The object of a seed.
 ///
-/// Its origin is the centre of its bounding box; z points up as it stands or lies best.
+/// Its origin is the centre of its bounding box. The z axis points up in its most stable pose.
 pub fn object(seed: u64) -> Object {
     let kind = kind_of(seed);
     let mut dice = Dice::new(seed);
     let shape = (kind.make)(&mut dice);
     let parts = fitted(shape, &mut dice).parts;
-    // Now and then one is full, or cast.
+    // A quarter of the objects is filled or massive.
     let filling = if dice.chance(0.25) { dice.between(1.5, 5.0) } else { 1.0 };
     let density = dice.between(kind.density.0, kind.density.1) * filling;
     let mass = (density * parts.iter().map(Mesh::volume).sum::<f64>()).min(HEAVIEST);
     let name = format!("{}_{seed}", kind.name);
-    // What the camera sees is exactly what the fingers touch.
+    // The visual mesh equals the collision shape.
     Object { name, visual: Mesh::union(&parts), parts, mass, friction: FRICTION }
 }
 
@@ -132,12 +132,12 @@ fn kind_of(seed: u64) -> &'static Kind {
     &KINDS[(seed % KINDS.len() as u64) as usize]
 }
 
-/// Whether an object suits a packed test: of a kind that stands upright, and 5–21 cm high.
+/// Whether an object suits packed scenes: its kind stands upright, and it is 5–21 cm high.
 fn is_upright(seed: u64) -> bool {
     kind_of(seed).upright && (0.05..0.21).contains(&object(seed).visual.extents().z)
 }
 
-/// A shape centred on its bounding box, and as large as the greatest lengths drawn for its sides allow.
+/// Centres a shape on its bounding box and scales it to the maximum lengths drawn for its sides.
 fn fitted(shape: Shape, dice: &mut Dice) -> Shape {
     let (low, high) = shape.bounds();
     let centre = nalgebra::center(&low, &high);
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn sets_have_their_sizes_and_share_nothing() {
+    fn sets_have_their_sizes_and_share_no_object() {
         let sizes =
             [Split::Train, Split::PileTest, Split::PackedTest].map(|split| ObjectSet::procedural(split).listed().len());
         assert_eq!(sizes, [303, 40, 16]);
@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn a_seed_always_gives_the_same_object_and_another_seed_another() {
+    fn an_object_depends_only_on_its_seed() {
         let shapes: Vec<_> = (0..200).map(object).collect();
         assert_eq!(shapes, (0..200).map(object).collect::<Vec<_>>());
         let kinds = KINDS.len();
@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn objects_are_centred_and_of_a_size_and_mass_to_lift() {
+    fn objects_are_centred_and_can_be_grasped_and_lifted() {
         for object in all() {
             let (low, high) = object.visual.bounds();
             assert!((low + high.coords).coords.norm() < 1e-6, "{}: off centre", object.name);
@@ -220,7 +220,7 @@ mod tests {
         }
     }
 
-    /// Whether the centre of mass is above the base, `margin` metres within its rim.
+    /// Whether the centre of mass is above the base, at least `margin` metres inside its rim.
     fn stands(object: &Object, margin: f64) -> bool {
         let volume: f64 = object.parts.iter().map(Mesh::volume).sum();
         let moment: nalgebra::Vector3<f64> =

@@ -1,6 +1,6 @@
-//! Objects from URDF files with OBJ meshes, of the kind the public grasping sets use.
+//! Objects from URDF files with OBJ meshes, as in the public object sets for grasping.
 //!
-//! One link per file. Every group (`o` or `g`) of a collision OBJ stands for one convex part.
+//! A file has one link. Every group (`o` or `g`) of a collision OBJ is one convex part.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -16,12 +16,12 @@ use super::Object;
 use crate::hull::convex_hull;
 use grasp_picture::Mesh;
 
-/// PyBullet's friction for a link that states none.
+/// PyBullet's default friction of a link.
 const DEFAULT_FRICTION: f64 = 0.5;
-/// Sides of the prisms and spheres that stand for URDF cylinders and spheres.
+/// Number of sides of the meshes of URDF cylinders and spheres.
 const SIDES: u32 = 32;
 
-/// Why objects could not be read.
+/// Why objects could not be read or written.
 #[derive(Debug, Error)]
 pub enum ObjectError {
     /// A file or folder could not be read.
@@ -29,48 +29,48 @@ pub enum ObjectError {
     Read {
         /// The file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// A folder without objects.
-    #[error("{} holds no .urdf file; name a folder with one URDF per object", path.display())]
+    #[error("{} contains no .urdf file; use a folder with one URDF file per object", path.display())]
     Empty {
         /// The folder.
         path: PathBuf,
     },
     /// A URDF that is not well-formed XML.
-    #[error("{} is not well-formed XML: {source}; mend or remove the file", path.display())]
+    #[error("{} is not well-formed XML: {source}; fix or remove the file", path.display())]
     Xml {
         /// The URDF.
         path: PathBuf,
-        /// Where and why.
+        /// The parser's error.
         source: roxmltree::Error,
     },
-    /// A URDF that lacks something, or states what an object cannot have.
+    /// A URDF with missing or invalid elements.
     #[error("{}: {what}", path.display())]
     Urdf {
         /// The URDF.
         path: PathBuf,
-        /// What is wrong, with the value, and what is expected.
+        /// The invalid element, with its value and what is expected.
         what: String,
     },
     /// A mesh file that could not be read.
     #[error("cannot read the mesh {}: {source}; check the file and the name in its URDF", path.display())]
     Mesh {
-        /// The OBJ.
+        /// The OBJ file.
         path: PathBuf,
-        /// Why.
+        /// The parser's error.
         source: tobj::LoadError,
     },
-    /// An object larger than the workspace, as one in millimetres is.
+    /// An object larger than the workspace; its meshes may be in millimetres.
     #[error(
-        "{}: its thinnest part is {:.0} mm thick, the workspace is {:.0} mm wide; scale the meshes down (are they in metres?)",
+        "{}: its thinnest part is {:.0} mm thick, the workspace is {:.0} mm wide; scale the meshes to metres",
         path.display(), thickness * 1e3, WORKSPACE_SIZE * 1e3
     )]
     TooLarge {
         /// The URDF.
         path: PathBuf,
-        /// Of the thinnest part, metres.
+        /// Thickness of the thinnest part, metres.
         thickness: f64,
     },
     /// A file that could not be written.
@@ -78,18 +78,18 @@ pub enum ObjectError {
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// A mesh file without faces.
-    #[error("the mesh {} has no faces; export it with its triangles", path.display())]
+    #[error("the mesh {} has no faces; export it with triangles", path.display())]
     NoFaces {
-        /// The OBJ.
+        /// The OBJ file.
         path: PathBuf,
     },
 }
 
-/// Reads every URDF of a folder, in the order of their names.
+/// Reads all URDF files of a folder, in the order of their names.
 pub(super) fn load_folder(dir: &Path) -> Result<Vec<Object>, ObjectError> {
     let unreadable = |source| ObjectError::Read { path: dir.into(), source };
     let entries: Vec<_> = fs::read_dir(dir).and_then(Iterator::collect).map_err(unreadable)?;
@@ -115,7 +115,7 @@ pub(super) fn load(path: &Path) -> Result<Object, ObjectError> {
     let mass = descend(link, &["inertial", "mass"]).ok_or_else(|| urdf.wrong("lacks <inertial><mass value=…/>"))?;
     let mass = urdf.number(mass, "value")?;
     if mass <= 0.0 {
-        return Err(urdf.wrong(format!("<mass value=\"{mass}\"/> must be more than 0 kg")));
+        return Err(urdf.wrong(format!("<mass value=\"{mass}\"/> must be greater than 0 kg")));
     }
     let friction = match descend(link, &["contact", "lateral_friction"]) {
         Some(node) => urdf.number(node, "value")?,
@@ -127,7 +127,7 @@ pub(super) fn load(path: &Path) -> Result<Object, ObjectError> {
 
     let mut parts = Vec::new();
     for collision in children(link, "collision") {
-        // Decompositions leave slivers without volume; they hold nothing up.
+        // Convex decompositions contain slivers without volume, which are ignored.
         parts.extend(urdf.geometry(collision)?.iter().filter_map(|mesh| convex_hull(&mesh.vertices)));
     }
     if parts.is_empty() {
@@ -148,7 +148,7 @@ pub(super) fn load(path: &Path) -> Result<Object, ObjectError> {
     Ok(Object { name, parts, visual, mass, friction })
 }
 
-/// Writes an object as URDF and OBJ, from which [`load`] makes the same.
+/// Writes an object as URDF and OBJ files that [`load`] reads.
 pub(super) fn save(object: &Object, dir: &Path) -> Result<(), ObjectError> {
     let Object { name, parts, visual, mass, friction } = object;
     let urdf = format!(
@@ -179,7 +179,7 @@ pub(super) fn save(object: &Object, dir: &Path) -> Result<(), ObjectError> {
     let files = [
         (format!("{name}_visual.obj"), obj(std::slice::from_ref(visual))),
         (format!("{name}_collision.obj"), obj(parts)),
-        // Last: a folder's URDF files are its objects.
+        // The URDF is written last, because each URDF file of a folder is an object.
         (format!("{name}.urdf"), urdf),
     ];
     for (file, text) in files {
@@ -207,7 +207,7 @@ fn obj(meshes: &[Mesh]) -> String {
     text
 }
 
-/// The file being read, for its errors and for the meshes beside it.
+/// The URDF file that is being read.
 struct Urdf<'a> {
     path: &'a Path,
 }
@@ -269,7 +269,7 @@ impl Urdf<'_> {
         if value > 0.0 {
             return Ok(value);
         }
-        Err(self.wrong(format!("<{} {name}=\"{value}\"/> must be more than 0", node.tag_name().name())))
+        Err(self.wrong(format!("<{} {name}=\"{value}\"/> must be greater than 0", node.tag_name().name())))
     }
 
     fn vector(&self, node: Node, name: &str) -> Result<Vector3<f64>, ObjectError> {
@@ -289,13 +289,13 @@ impl Urdf<'_> {
             return Ok(value);
         }
         let text = node.attribute(name).unwrap_or_default();
-        Err(self.wrong(format!("<{} {name}=\"{text}\"/> must be more than 0", node.tag_name().name())))
+        Err(self.wrong(format!("<{} {name}=\"{text}\"/> must be greater than 0", node.tag_name().name())))
     }
 }
 
 /// The groups of an OBJ that have faces.
 fn load_obj(path: &Path) -> Result<Vec<Mesh>, ObjectError> {
-    // One index for all attributes gives each group its own vertices.
+    // With `single_index` each group has its own vertices.
     let options = tobj::LoadOptions { single_index: true, triangulate: true, ..Default::default() };
     let (models, _) =
         tobj::load_obj(path, &options).map_err(|source| ObjectError::Mesh { path: path.into(), source })?;
@@ -368,7 +368,7 @@ f 5 7 6\nf 5 6 8\nf 6 7 8\nf 7 5 8
         assert_eq!((object.name.as_str(), object.mass, object.friction), ("thing", 0.25, 0.8));
         assert_eq!((object.parts.len(), object.visual.triangles.len()), (2, 8));
         assert!((object.parts[0].volume() - 0.1 * 0.2 * 0.1 / 6.0).abs() < 1e-9);
-        // A quarter turn about z takes y to −x.
+        // A rotation by 90° about z maps y to −x.
         let (low, high) = object.parts[1].bounds();
         assert!((low - Point3::new(-0.2, 0.0, 0.3)).norm() < 1e-6, "{low}");
         assert!((high - Point3::new(0.0, 0.1, 0.4)).norm() < 1e-6, "{high}");
@@ -383,15 +383,15 @@ f 5 7 6\nf 5 6 8\nf 6 7 8\nf 7 5 8
     }
 
     #[test]
-    fn errors_name_the_file_and_the_fault() {
+    fn errors_name_the_file_and_the_cause() {
         let cube = "<box size='0.1 0.1 0.1'/>";
         let cases = [
             ("<robot><link>".into(), "thing.urdf is not well-formed XML"),
             ("<robot/>".into(), "has 0 links"),
-            (urdf("-1", cube), "value=\"-1\"/> must be more than 0 kg"),
+            (urdf("-1", cube), "value=\"-1\"/> must be greater than 0 kg"),
             (urdf("heavy", cube), "value=\"heavy\"/> must be a finite number"),
             (urdf("1", "<box size='1 1'/>"), "size=\"1 1\"/> must be three finite numbers"),
-            (urdf("1", "<sphere radius='-2'/>"), "radius=\"-2\"/> must be more than 0"),
+            (urdf("1", "<sphere radius='-2'/>"), "radius=\"-2\"/> must be greater than 0"),
             (urdf("1", "<capsule/>"), "has a <capsule>"),
             (urdf("1", "<mesh filename='none.obj'/>"), "none.obj has no faces"),
             (urdf("1", "<mesh filename='lost.obj'/>"), "cannot read the mesh"),
@@ -405,7 +405,7 @@ f 5 7 6\nf 5 6 8\nf 6 7 8\nf 7 5 8
     }
 
     #[test]
-    fn what_is_written_is_read_again() {
+    fn written_objects_are_read_back() {
         let folder = tempfile::tempdir().unwrap();
         let object = crate::objects::procedural::object(14);
         save(&object, folder.path()).unwrap();

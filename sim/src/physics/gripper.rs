@@ -13,49 +13,50 @@ use super::{BodyId, STEPS_PER_SECOND, World};
 /// Force with which each finger closes, newtons.
 const FINGER_FORCE: f64 = 20.0;
 
-/// Velocity gain of the fingers' motor, N·s/m: at rest against an object it pushes with [`FINGER_FORCE`], free it closes
-/// with 0.5 m/s, about as fast as the reference's position control.
+/// Velocity gain of the fingers' motor, N·s/m. A blocked finger pushes with [`FINGER_FORCE`]; a free finger closes with
+/// 0.5 m/s, similar to the reference's position control.
 const MOTOR_DAMPING: f64 = 40.0;
 
-/// How fast a finger that lags behind the other catches up, 1/s: the hand's gear keeps both at the same opening.
+/// Rate at which a lagging finger catches up with the other, 1/s: the hand's gear keeps both at the same opening.
 const GEAR_GAIN: f64 = 195.0;
 
-/// Spinning friction of the fingers, metres: the torque about a contact's normal that a normal force of 1 N holds (the
-/// reference's hand: a soft pad does not let an object swing about the line between the fingers).
+/// Spinning friction of the fingers, metres: torque about the contact normal per normal force. It models the soft pads
+/// of the reference's hand, which prevent rotation about the line between the fingers.
 const SPINNING_FRICTION: f64 = 0.1;
 
-/// By how much the collision shape of a finger is larger than its mesh, metres: [`MARGIN`], less what the reference's soft
-/// finger (30 kN/m) gives way under [`FINGER_FORCE`].
+/// Margin of a finger's collision shape around its mesh, metres: [`MARGIN`] minus the deformation of the reference's
+/// soft finger (30 kN/m) under [`FINGER_FORCE`].
 const FINGER_MARGIN: f64 = MARGIN - FINGER_FORCE / 30_000.0;
 
-/// Friction of the fingers; an object's own is multiplied with it.
+/// Friction of the fingers; multiplied by that of the object.
 const FINGER_FRICTION: f32 = 1.0;
 
-/// Friction of the palm (Bullet's for a link that states none).
+/// Friction of the palm (Bullet's default).
 const PALM_FRICTION: f32 = 0.5;
 
 const FINGER_MASS: f32 = 0.15;
 const PALM_MASS: f32 = 0.81;
 
-/// The force with which the hand is held where it shall be, newtons: what is in its way for more pushes it off.
+/// Maximum force that holds the hand at its target, newtons. Greater contact forces displace it.
 const HOLDING_FORCE: f64 = 300.0;
 
-/// How fast the hand comes to where it shall be, 1/s: Bullet's constraint takes 20 % of the way in a step of 1/240 s.
+/// Rate at which the hand approaches its target, 1/s: Bullet's constraint covers 20 % of the distance per step of 1/240
+/// s.
 const HOLDING_RATE: f32 = 53.6;
 
-/// Engine units. Enough that the hand gives way by [`HOLDING_FORCE`] alone.
+/// Engine units. Large enough that only [`HOLDING_FORCE`] limits the force.
 const HOLDING_DAMPING: f32 = 1e4;
 
-/// Engine units. Enough that a brake gives way by its greatest torque alone.
+/// Engine units. Large enough that only the maximum torque limits a brake.
 const BRAKE_DAMPING: f32 = 1e7;
 
-/// A free-floating Panda hand in a world: a palm that is held at a target, and two fingers that push.
+/// A free-floating Panda hand in a world: a palm that is held at a target, and two fingers.
 pub struct Gripper {
     /// The target, a body without a shape.
     target: RigidBodyHandle,
     palm: RigidBodyHandle,
     fingers: [Finger; 2],
-    /// A brake on the turning, about the closing axis, of each object that was touched.
+    /// Brakes of the rotation of touched objects about the closing axis.
     brakes: Vec<(BodyId, ImpulseJointHandle)>,
 }
 
@@ -68,7 +69,7 @@ struct Finger {
 }
 
 impl Gripper {
-    /// Puts an open hand into `world` with its grasp frame at `pose`, on its way to `target` (both `T_task_grasp`).
+    /// Inserts an open hand with its grasp frame at `pose`, held at `target` (both `T_task_grasp`).
     #[must_use]
     pub fn insert(world: &mut World, pose: &Isometry3<f64>, target: &Isometry3<f64>) -> Self {
         world.grip();
@@ -93,7 +94,7 @@ impl Gripper {
             let body = world.bodies.insert(body);
             let part = &FINGERS[usize::from(side < 0.0)];
             let collider = insert_part(world, body, part, FINGER_MASS, FINGER_FRICTION, FINGER_MARGIN);
-            // Open at 0, closed at -travel: the joint's axis points outward.
+            // 0 is open, -travel is closed: the joint's axis points outward.
             let joint = PrismaticJointBuilder::new(Vector::new(0.0, side as f32, 0.0))
                 .local_anchor1(vector(&(offset * SCALE)))
                 .local_anchor2(Vector::ZERO)
@@ -103,14 +104,14 @@ impl Gripper {
                 .motor_max_force((1.5 * FINGER_FORCE * SCALE) as f32)
                 .contacts_enabled(false)
                 .build();
-            // An impulse joint: multibody joints were seen to lift a frictionless cube.
+            // An impulse joint, because with multibody joints the hand lifted a frictionless cube.
             let joint = world.joints.insert(palm, body, GenericJoint::from(joint), true);
             Finger { body, collider, joint, side }
         });
         Self { target, palm, fingers, brakes: Vec::new() }
     }
 
-    /// Lets the fingers push shut during the next step.
+    /// Closes the fingers during the next step.
     pub fn close(&mut self, world: &mut World) {
         self.brake(world);
         let joints = self.positions(world);
@@ -123,7 +124,7 @@ impl Gripper {
         }
     }
 
-    /// Sets the brakes by the forces of the last step.
+    /// Sets the torque of the brakes from the contact forces of the last step.
     fn brake(&mut self, world: &mut World) {
         let touched = self.touched(world);
         for &(id, _) in &touched {
@@ -140,18 +141,18 @@ impl Gripper {
         for (id, joint) in &self.brakes {
             let force = touched.iter().find(|(touched, _)| touched == id).map_or(0.0, |(_, force)| *force);
             if let Some(joint) = world.joints.get_mut(*joint, true) {
-                // Torques scale with the square of lengths; an engine's force holds one factor already.
+                // Torques scale with the square of lengths; the engine's force already contains one factor.
                 joint.data.set_motor_max_force(JointAxis::AngY, force * (SPINNING_FRICTION * SCALE) as f32);
             }
         }
     }
 
-    /// The objects the fingers press, and the force in engine units.
+    /// The objects in contact with the fingers, and the force in engine units.
     fn touched(&self, world: &World) -> Vec<(BodyId, f32)> {
         let mut touched: Vec<(BodyId, f32)> = Vec::new();
         for finger in &self.fingers {
             for pair in world.narrow_phase.contact_pairs_with(finger.collider) {
-                // The manifolds' distances are stale between steps; an impulse means that it was touched in this one.
+                // The manifolds' distances are stale between steps. An impulse indicates a contact in the last step.
                 let force = pair.total_impulse_magnitude() * STEPS_PER_SECOND as f32;
                 let other = if pair.collider1 == finger.collider { pair.collider2 } else { pair.collider1 };
                 if let Some(id) = world.object_of(other).filter(|_| force > 0.0) {
@@ -178,7 +179,7 @@ impl Gripper {
         grasp::MAX_OPENING + joints[0] + joints[1]
     }
 
-    /// The object the fingers press hardest, if they press any.
+    /// The object with the greatest contact force on the fingers.
     #[must_use]
     pub fn held(&self, world: &World) -> Option<BodyId> {
         self.touched(world).into_iter().max_by(|(_, a), (_, b)| a.total_cmp(b)).map(|(id, _)| id)
@@ -190,7 +191,8 @@ impl Gripper {
         from_engine(world.bodies[self.palm].position())
     }
 
-    /// Whether the hand can move on by `travel` (task frame, metres) with `held` in it, touching nothing else.
+    /// Whether the hand with the object `held` can move by `travel` (task frame, metres) without touching anything
+    /// else.
     #[must_use]
     pub fn is_free_to_move(&self, world: &World, held: BodyId, travel: &Vector3<f64>) -> bool {
         let fingers = self.fingers.each_ref().map(|finger| finger.collider);
@@ -200,7 +202,7 @@ impl Gripper {
         })
     }
 
-    /// Takes the hand out of the world.
+    /// Removes the hand from the world.
     pub fn remove(self, world: &mut World) {
         for finger in &self.fingers {
             world.remove_engine_body(finger.body);
@@ -229,7 +231,7 @@ fn insert_part(
     friction: f32,
     margin: f64,
 ) -> ColliderHandle {
-    // The parts of the hand pass through each other.
+    // Parts of the hand do not collide with each other.
     let groups = InteractionGroups::new(Group::GROUP_2, !Group::GROUP_2, InteractionTestMode::And);
     let collider = ColliderBuilder::new(part.shape.clone())
         .mass(mass)

@@ -14,7 +14,7 @@ const TCP: f64 = 0.062;
 /// Height of the fingers' frames above the hand's own, as in `hand.urdf`.
 const FINGER_ROOT: f64 = 0.0584;
 
-/// How far each finger travels.
+/// Travel of each finger, metres.
 pub(super) const FINGER_TRAVEL: f64 = grasp::MAX_OPENING / 2.0;
 
 /// A convex part of the hand in a frame: for the open hand the grasp frame, whose z is the approach and ±y the closing
@@ -29,7 +29,7 @@ pub struct HandPart {
 pub(super) static PALM: LazyLock<HandPart> =
     LazyLock::new(|| HandPart::of_file(include_str!("../../hand/palm.obj"), |p| p - Vector3::z() * TCP));
 
-/// The left (+y) and the right finger, in the frames that lie on the grasp frame when the hand is shut.
+/// The left (+y) and the right finger, in frames that coincide with the grasp frame when the hand is closed.
 pub(super) static FINGERS: LazyLock<[HandPart; 2]> = LazyLock::new(|| {
     [1.0, -1.0].map(|side| {
         HandPart::of_file(include_str!("../../hand/finger.obj"), |p| {
@@ -49,7 +49,7 @@ impl HandPart {
     /// The convex hull of these corners, metres.
     ///
     /// # Panics
-    /// When the corners enclose no volume.
+    /// If the corners enclose no volume.
     #[must_use]
     pub fn new(corners: Vec<Point3<f64>>) -> Self {
         let points: Vec<Vector> = corners.iter().map(|p| vector(&(p.coords * SCALE))).collect();
@@ -60,8 +60,9 @@ impl HandPart {
     /// The mesh of an OBJ file of the hand.
     fn of_file(text: &str, place: impl Fn(Point3<f64>) -> Point3<f64>) -> Self {
         let corner = |line: &str| {
-            let mut numbers = line.split(' ').map(|number| number.parse().expect("the file is ours and holds numbers"));
-            place(Point3::from(Vector3::from_fn(|_, _| numbers.next().expect("the file is ours: three numbers"))))
+            let mut numbers =
+                line.split(' ').map(|number| number.parse().expect("the files of the repository are valid"));
+            place(Point3::from(Vector3::from_fn(|_, _| numbers.next().expect("vertices have three coordinates"))))
         };
         Self::new(text.lines().filter_map(|line| line.strip_prefix("v ")).map(corner).collect())
     }
@@ -70,7 +71,7 @@ impl HandPart {
         Self::new(self.corners.iter().map(|corner| corner + by).collect())
     }
 
-    /// The space swept when the part comes from `distance` metres back along the approach.
+    /// The convex hull of the part's motion along the approach, starting `distance` metres back.
     #[must_use]
     pub fn swept(&self, distance: f64) -> Self {
         let back = Vector3::z() * distance;

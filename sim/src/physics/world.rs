@@ -14,44 +14,44 @@ use super::HandPart;
 use crate::TABLE_HEIGHT;
 use crate::objects::Object;
 
-/// Simulation steps in a second of simulated time, as in the reference (Bullet's default).
+/// Simulation steps per second, as in the reference (Bullet's default).
 pub const STEPS_PER_SECOND: u32 = 240;
 
 /// Engine units per metre.
 pub(super) const SCALE: f64 = 100.0;
 
-/// How much larger than its mesh the collision shape of a convex body is, metres: Bullet's margin.
+/// Margin of the collision shape of a convex body around its mesh, metres: that of Bullet.
 pub(super) const MARGIN: f64 = 0.001;
 
-/// The distance of two convex meshes from which they count as touching, metres. Bullet keeps a contact until its two
-/// shapes, each larger by its margin, are 2 % of the smaller one's size apart: 0.8 mm for a finger.
+/// Distance of two convex meshes below which they count as touching, metres. Bullet keeps a contact until the two
+/// shapes with their margins are 2 % of the smaller one's size apart: 0.8 mm for a finger.
 pub const CONTACT_GAP: f64 = 2.0 * MARGIN + 0.0008;
 
-/// Angular damping of objects while a scene is made, 1/s: without it round bodies roll for ever.
+/// Angular damping of objects during scene generation, 1/s. Without it round bodies do not stop rolling.
 const REST_DAMPING: f32 = 10.0;
 
-/// Angular damping from the first hand on, 1/s, as in the reference.
+/// Angular damping from the first trial on, 1/s, as in the reference.
 const TRIAL_DAMPING: f32 = 0.04;
 
-/// Friction of the table and the walls; an object's own is multiplied with it, as Bullet does.
+/// Friction of the table and the walls; multiplied by that of the object, as in Bullet.
 const TABLE_FRICTION: f32 = 0.5;
 
-/// One body's handle, valid in the world that made it and in its clones.
+/// Handle of a body, valid in its world and in clones of that world.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BodyId(pub(super) RigidBodyHandle);
 
 /// An object in a world.
 #[derive(Clone, Debug)]
 pub struct Body {
-    /// Its handle.
+    /// Handle.
     pub id: BodyId,
-    /// What it is.
+    /// Shape, mass and friction.
     pub object: Arc<Object>,
-    /// The factor its mesh was scaled by.
+    /// Scale of its mesh.
     pub scale: f64,
 }
 
-/// A table and what stands on it. Cloning takes microseconds: shapes are shared.
+/// A table with objects. Cloning takes microseconds, because clones share the shapes.
 pub struct World {
     pub(super) bodies: RigidBodySet,
     pub(super) colliders: ColliderSet,
@@ -78,7 +78,7 @@ impl Clone for World {
             broad_phase: self.broad_phase.clone(),
             islands: self.islands.clone(),
             multibody_joints: self.multibody_joints.clone(),
-            // Never used, and holding no state worth copying: soft bodies, and the pipelines' scratch memory.
+            // Unused soft bodies and scratch memory of the pipelines are not copied.
             soft_bodies: SoftBodySet::new(),
             ccd: CCDSolver::new(),
             pipeline: PhysicsPipeline::new(),
@@ -96,7 +96,7 @@ impl Default for World {
 }
 
 impl World {
-    /// A table whose top is at z = [`TABLE_HEIGHT`], with nothing on it.
+    /// An empty table whose top is at z = [`TABLE_HEIGHT`].
     #[must_use]
     pub fn new() -> Self {
         let mut world = Self {
@@ -142,11 +142,11 @@ impl World {
         id
     }
 
-    /// Solves contacts as a hand needs them, and at a price in rest and time that only a trial pays.
+    /// Sets the solver's parameters for trials. They are slower, and piles rest less well.
     ///
-    /// A pinched object creeps out of the hand unless friction is solved in both passes of a step and at each point of
-    /// contact, and the fingers push with two thirds of their force unless motors and contacts are iterated together.
-    /// Contacts are hard, but bodies that overlap (a hand may appear in an object or in the table) part slowly, as in
+    /// A grasped object creeps out of the hand unless friction is solved in both passes of a step and at every contact
+    /// point. The fingers push with two thirds of their force unless motors and contacts are iterated together.
+    /// Contacts are hard, but overlapping bodies (a hand inserted into an object or the table) separate slowly, as in
     /// Bullet.
     pub(super) fn grip(&mut self) {
         self.set_angular_damping(TRIAL_DAMPING);
@@ -161,7 +161,7 @@ impl World {
         };
     }
 
-    /// Goes back to the solver's settings that keep a pile at rest. The damping stays low: what was dropped tumbles.
+    /// Restores the solver's parameters that keep a pile at rest. The damping stays that of trials.
     pub(super) fn release(&mut self) {
         self.parameters = Self::parameters();
     }
@@ -172,13 +172,13 @@ impl World {
         }
     }
 
-    /// Takes an object away.
+    /// Removes an object.
     pub fn remove(&mut self, id: BodyId) {
         self.objects.retain(|body| body.id != id);
         self.remove_engine_body(id.0);
     }
 
-    /// Sets up four walls as an open box: `lower` and `upper` are the corners of its inside in x and y.
+    /// Adds four walls of an open box; `lower` and `upper` are its inner corners in x and y.
     pub fn add_walls(&mut self, lower: [f64; 2], upper: [f64; 2], height: f64) {
         const THICKNESS: f64 = 0.02;
         let middle = [0, 1].map(|axis| f64::midpoint(lower[axis], upper[axis]));
@@ -195,7 +195,7 @@ impl World {
         }
     }
 
-    /// Takes the walls away.
+    /// Removes the walls.
     pub fn remove_walls(&mut self) {
         for wall in std::mem::take(&mut self.walls) {
             self.remove_engine_body(wall);
@@ -221,16 +221,16 @@ impl World {
         );
     }
 
-    /// Puts the objects to sleep: they are not simulated, and cost no time, until something touches them.
+    /// Puts the objects to sleep: they are not simulated until something touches them.
     pub fn sleep(&mut self) {
         for body in &self.objects {
             self.bodies[body.id.0].sleep();
         }
-        // The engine takes them from those that it simulates in a step.
+        // The engine removes sleeping bodies from its active set in a step.
         self.step();
     }
 
-    /// The objects, in the order in which they came.
+    /// The objects, in the order of their insertion.
     #[must_use]
     pub fn objects(&self) -> &[Body] {
         &self.objects
@@ -261,8 +261,8 @@ impl World {
         }
     }
 
-    /// Whether any of the parts, given in the frame at `pose`, comes nearer than `gap` metres to an object's mesh, or as
-    /// near to the table as an object's mesh would lie on a shape that leaves this gap.
+    /// Whether any of the parts, in the frame `pose`, is closer than `gap` metres to an object's mesh, or closer than
+    /// `gap` minus [`MARGIN`] to the table, which has no margin.
     #[must_use]
     pub fn is_near(&self, parts: &[HandPart], pose: &Isometry3<f64>, gap: f64) -> bool {
         parts.iter().any(|part| part.lowest_point(pose) < TABLE_HEIGHT + gap - MARGIN) || {
@@ -271,7 +271,7 @@ impl World {
         }
     }
 
-    /// The distance of the nearest object's mesh from these parts in the frame at `pose`, at most `limit`, metres.
+    /// The smallest distance between the parts, in the frame `pose`, and the objects' meshes, at most `limit`, metres.
     #[must_use]
     pub fn clearance(&self, parts: &[HandPart], pose: &Isometry3<f64>, limit: f64) -> f64 {
         let (query, pose) = (self.objects_query(), to_engine(pose));
@@ -287,7 +287,7 @@ impl World {
         self.objects.iter().position(|body| body.id == id)
     }
 
-    /// The object that collider belongs to, if it is one.
+    /// The object that a collider belongs to.
     pub(super) fn object_of(&self, collider: ColliderHandle) -> Option<BodyId> {
         let handle = self.colliders.get(collider)?.parent()?;
         self.objects.iter().map(|body| body.id).find(|id| id.0 == handle)
@@ -297,7 +297,7 @@ impl World {
         self.bodies[handle].colliders().iter().copied()
     }
 
-    /// Whether `collider` presses on anything but `held` and the `fingers`.
+    /// Whether `collider` is in contact with anything except `held` and the `fingers`.
     pub(super) fn touches_another(&self, collider: ColliderHandle, held: BodyId, fingers: &[ColliderHandle]) -> bool {
         self.narrow_phase.contact_pairs_with(collider).any(|pair| {
             let other = if pair.collider1 == collider { pair.collider2 } else { pair.collider1 };
@@ -306,7 +306,7 @@ impl World {
         })
     }
 
-    /// Whether no object but `held` comes near where `collider` passes when it moves by `travel` metres.
+    /// Whether the bounding box swept by `collider` along `travel` (metres) intersects no object except `held`.
     pub(super) fn is_path_free(&self, collider: ColliderHandle, held: BodyId, travel: &Vector3<f64>) -> bool {
         let start = self.colliders[collider].compute_aabb();
         let swept = start.merged(&start.translated(vector(&(travel * SCALE))));
@@ -327,9 +327,9 @@ impl World {
         );
     }
 
-    /// The solver's settings are those that were found to keep piles at rest: stiffer contacts than the engine's
-    /// defaults, overdamped; no contact recycling, which lets pinched objects creep; no contact clustering, which sets
-    /// objects of many parts shaking (17 of 100 piles never came to rest with it, none without).
+    /// Parameters of the solver that keep piles at rest. Contacts are stiffer than the engine's defaults and
+    /// overdamped. Contact recycling is off, because grasped objects creep with it. Contact clustering is off, because
+    /// objects of many parts oscillate with it: 17 of 100 piles did not come to rest with it, all did without.
     fn parameters() -> IntegrationParameters {
         IntegrationParameters {
             dt: 1.0 / STEPS_PER_SECOND as f32,
@@ -340,8 +340,8 @@ impl World {
             num_internal_pgs_iterations: 2,
             contact_recycling: false,
             contact_clustering: false,
-            // 3 mm: two margins and 1 mm. With less contacts come and go between two margins and none, fingers chatter, and
-            // 4 of 10 piles never rest.
+            // 3 mm: two margins and 1 mm. With less, contacts appear and disappear, the fingers chatter, and 4 of 10
+            // piles do not come to rest.
             normalized_prediction_distance: 0.06,
             max_ccd_substeps: 0,
             friction_model: FrictionModel::Simplified,
@@ -371,14 +371,14 @@ impl World {
     }
 }
 
-/// Of each collider that is less than `limit` metres away from a shape, how far it is.
+/// The distances of the colliders that are closer than `limit` to a shape, metres.
 fn distances<'a>(
     query: &'a QueryPipeline<'_>,
     shape: &'a dyn Shape,
     pose: &'a Pose,
     limit: f64,
 ) -> impl Iterator<Item = f64> + 'a {
-    // With no reach at all the engine does not find what intersects a shape of several parts.
+    // With a reach of 0 the engine does not find intersections with compound shapes.
     const LEAST_REACH: f64 = 1e-5;
     let reach = (limit.max(LEAST_REACH) * SCALE) as f32;
     let nearby = query.intersect_aabb_conservative(shape.compute_aabb(pose).loosened(reach));
@@ -405,7 +405,7 @@ fn shape(object: &Object, scale: f64) -> (SharedShape, f32) {
         })
         .collect();
     let volume = parts.iter().map(|(_, part)| part.mass_properties(1.0).mass()).sum();
-    // A compound costs a tree; most objects are one part.
+    // A compound shape needs a tree; a single part does not.
     let shape = if parts.len() == 1 { parts.remove(0).1 } else { SharedShape::compound(parts) };
     (shape, volume)
 }

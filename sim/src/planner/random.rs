@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use super::Observation;
 use crate::label::{graspable, sample_pose};
 
-/// One grasp, or none where no surface can be reached.
+/// Proposes one random grasp, or none if there is no graspable surface.
 pub(super) fn plan(observation: &Observation, rng: &mut ChaCha8Rng) -> Vec<Grasp> {
     let surface = graspable(&observation.views);
     if surface.is_empty() {

@@ -6,7 +6,7 @@ use tokio::runtime::Runtime;
 use super::Observation;
 use crate::camera::View;
 
-/// A running graspd, which is sent the depth images.
+/// A running graspd, which receives the depth images.
 pub struct Server {
     runtime: Runtime,
     client: Client,
@@ -17,11 +17,10 @@ impl Server {
     /// Connects to the server at this address.
     ///
     /// # Errors
-    /// Where none answers.
+    /// If the server cannot be reached.
     pub fn connect(address: &str, params: &DecodeParams) -> anyhow::Result<Self> {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-        let client =
-            runtime.block_on(Client::connect(address)).with_context(|| format!("no graspd answers at {address}"))?;
+        let client = runtime.block_on(Client::connect(address)).with_context(|| format!("planner `grpc:{address}`"))?;
         Ok(Self { runtime, client, params: *params })
     }
 
@@ -36,13 +35,13 @@ impl Server {
     }
 }
 
-/// What the camera of the benchmark sends to a server.
+/// A view of the benchmark's camera as input of a server.
 #[must_use]
 pub fn depth_view(view: &View) -> DepthView {
     let Intrinsics { width, height, fx, fy, cx, cy } = Intrinsics::BENCHMARK;
     DepthView {
         depth: Depth::Metres(view.depth.clone()),
-        // 640 × 480.
+        // 640 × 480, so that the casts are lossless.
         width: width as u32,
         height: height as u32,
         k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],

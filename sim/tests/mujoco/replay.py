@@ -5,8 +5,8 @@
     grasp-sim label --scene packed --objects train --points 40 --scenes 8 --seed 77 --out packed --export packed.jsonl
     python replay.py objects pile.jsonl packed.jsonl > sim/tests/mujoco/trials.jsonl
 
-A line a scene: its objects, and for each grasp point the pose of its first yaw and what became of the five that differ:
-0 blocked on the approach, 1 failed later, 2 lifted.
+Each line is a scene: its objects, and for each grasp point the pose of its first yaw and the outcomes of the five
+different yaws: 0 blocked on the approach, 1 failed later, 2 lifted.
 """
 
 import json
@@ -23,7 +23,7 @@ TCP = 0.062
 TRAVEL = 0.04
 FORCE = 20.0
 DAMPING = 130.0
-# Where the fingers' own frames are in the hand's, see hand.urdf.
+# Height of the fingers' frames in the hand's frame, see hand.urdf.
 FINGER_ROOT = 0.0584
 HAND = Path(__file__).parents[2] / "hand"
 
@@ -48,7 +48,7 @@ def parts_of(folder, name):
 
 
 def hand_part(name, side, offset):
-    """The corners of a part of the hand in the grasp frame; the right finger is the left one turned about z."""
+    """The corners of a part of the hand in the grasp frame; the right finger is the left one rotated about z."""
     lines = (HAND / name).read_text().splitlines()
     corners = np.array([[float(number) for number in line.split()[1:4]] for line in lines if line.startswith("v ")])
     return corners * [side, side, 1] + offset
@@ -132,7 +132,7 @@ def trial(folder, scene, pose):
     approach = rotated(quaternion, [0, 0, 1])
     off = np.arccos(np.clip(-approach[2], -1, 1))
     lift = np.array([0, 0, 1.0]) if off > np.pi / 3 else -approach
-    # The hand slides along its approach first, to look for contacts on the way, and is then made anew to lift.
+    # First the hand slides along its approach to detect contacts. Then a new model slides it along the lift direction.
     hand_names = ["hand", "left", "right"]
     model = mujoco.MjModel.from_xml_string(scene_xml(folder, scene, pose, rotated(np.array([-1, -1, -1, 1]) * quaternion, approach)))
     data = mujoco.MjData(model)
@@ -168,7 +168,7 @@ def trial(folder, scene, pose):
 
 
 def turned(pose, yaw):
-    """The pose of a yaw, from that of yaw 0."""
+    """The pose rotated by `yaw` · 36° about its z axis."""
     half = yaw * np.pi / 5 / 2
     x, y, z, w = pose[3:]
     s, c = np.sin(half), np.cos(half)

@@ -1,8 +1,8 @@
-"""A client of graspd: volumes, depth images or point clouds in, 6-DoF grasps for a parallel-jaw hand out.
+"""Python client of graspd: detects 6-DoF grasps for a parallel-jaw hand in volumes, depth images or point clouds.
 
-`Client` asks and waits; `graspd.aio.Client` does the same in asyncio. Everywhere lengths are in metres, angles in
-radians, durations in seconds, moments in nanoseconds since 1970, quaternions x, y, z, w; a pose ``T_a_b`` maps points
-of frame b into frame a; arrays of voxels are indexed ``[x][y][z]``.
+`Client` is synchronous; `graspd.aio.Client` is its asyncio counterpart. Lengths are in metres, angles in radians,
+durations in seconds, time stamps in nanoseconds since 1970. Quaternions are x, y, z, w. A pose ``T_a_b`` maps points of
+frame b into frame a. Arrays of voxels are indexed ``[x][y][z]``.
 """
 
 from graspd.client import Client, Tracking

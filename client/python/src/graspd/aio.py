@@ -1,4 +1,4 @@
-"""The client for asyncio: what `graspd.Client` does, awaited."""
+"""The asyncio client: the same methods as `graspd.Client`, as coroutines."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from graspd.streams import Adding, Detecting
 
 
 class Client(Connection[grpc.aio.Channel]):
-    """A connection to graspd, to be made and used in one event loop. Calls may run at the same time.
+    """A connection to graspd. Create and use it in one event loop. Calls may run concurrently.
 
-    Arguments, answers and errors are those of `graspd.Client`.
+    Arguments, results and errors are those of `graspd.Client`.
     """
 
     async def __aenter__(self) -> Client:
@@ -36,14 +36,14 @@ class Client(Connection[grpc.aio.Channel]):
         await self.close()
 
     async def close(self) -> None:
-        """Ends what is still going on."""
+        """Closes the connection and cancels running calls."""
         await self._channel.close()
 
     async def detect(
         self, volume: Volume | NDArray[Any], options: Options | None = None, *, request_id: str = ""
     ) -> Detection:
-        """The grasps in a volume."""
-        return await self._ask(methods.DETECT, wire.detect_request(volume, options, request_id))
+        """Detects grasps in a volume."""
+        return await self._call(methods.DETECT, wire.detect_request(volume, options, request_id))
 
     async def detect_from_depth(
         self,
@@ -53,8 +53,8 @@ class Client(Connection[grpc.aio.Channel]):
         *,
         request_id: str = "",
     ) -> Detection:
-        """The grasps in what depth cameras see."""
-        return await self._ask(methods.DETECT_FROM_DEPTH, wire.depth_request(views, workspace, options, request_id))
+        """Detects grasps in depth images."""
+        return await self._call(methods.DETECT_FROM_DEPTH, wire.depth_request(views, workspace, options, request_id))
 
     async def detect_from_cloud(
         self,
@@ -64,17 +64,17 @@ class Client(Connection[grpc.aio.Channel]):
         *,
         request_id: str = "",
     ) -> Detection:
-        """The grasps in point clouds."""
-        return await self._ask(methods.DETECT_FROM_CLOUD, wire.cloud_request(views, workspace, options, request_id))
+        """Detects grasps in point clouds."""
+        return await self._call(methods.DETECT_FROM_CLOUD, wire.cloud_request(views, workspace, options, request_id))
 
     async def detect_stream(
         self, volumes: AsyncIterable[Volume | NDArray[Any]], options: Options | None = None
     ) -> AsyncIterator[Detection | Error]:
-        """The grasps in each of the volumes, in their order, or its `Error`."""
+        """Yields the grasps of each volume, or its `Error`, in the order of the volumes."""
         detecting = Detecting(options)
 
         async def requests() -> AsyncIterator[pb.DetectGraspsRequest]:
-            with detecting.asking():
+            with detecting.sending():
                 async for volume in volumes:
                     yield detecting.request(volume)
 
@@ -89,28 +89,28 @@ class Client(Connection[grpc.aio.Channel]):
         detecting.end()
 
     def track(self, workspace: Workspace = Workspace()) -> Tracking:
-        """Has the server keep a volume for a camera that moves."""
+        """Opens a tracked volume for a moving camera."""
         return Tracking(self._stream(methods.TRACK), workspace)
 
     async def models(self) -> tuple[Model, ...]:
-        """What can be asked for by name, the default first."""
-        return await self._ask(methods.LIST_MODELS, pb.ListModelsRequest())
+        """The models that the server serves; the default model is first."""
+        return await self._call(methods.LIST_MODELS, pb.ListModelsRequest())
 
     async def health(self) -> bool:
-        """Whether the server answers; it does not while it is warming up or shutting down."""
-        return await self._ask(methods.CHECK, HealthCheckRequest())
+        """Whether the server is ready; False while it is warming up or shutting down."""
+        return await self._call(methods.CHECK, HealthCheckRequest())
 
     def _open(self, target: str, credentials: grpc.ChannelCredentials | None) -> grpc.aio.Channel:
         if credentials is None:
             return grpc.aio.insecure_channel(target, OPTIONS)
         return grpc.aio.secure_channel(target, credentials, OPTIONS)
 
-    async def _ask(self, method: Method[Request, Response, Answer], request: Request) -> Answer:
-        ask = self._channel.unary_unary(method.path, method.serialize, method.parse)
+    async def _call(self, method: Method[Request, Response, Answer], request: Request) -> Answer:
+        call = self._channel.unary_unary(method.path, method.serialize, method.parse)
         attempts = 0
         while True:
             try:
-                return method.answer(await ask(request, timeout=self._timeout, metadata=self._metadata))
+                return method.answer(await call(request, timeout=self._timeout, metadata=self._metadata))
             except grpc.RpcError as status:
                 error = from_status(status)
             attempts += 1
@@ -127,7 +127,7 @@ class Client(Connection[grpc.aio.Channel]):
 
 
 class Tracking:
-    """A volume that the server keeps until this is closed, and the grasps in it."""
+    """A tracked volume. The server keeps it until this object is closed."""
 
     def __init__(
         self,
@@ -144,16 +144,16 @@ class Tracking:
         self.close()
 
     def close(self) -> None:
-        """Has the server forget the volume."""
+        """Ends the tracking. The server deletes the volume."""
         self._stream.cancel()
 
     async def add(
         self, views: Iterable[DepthView] = (), options: Options | None = None, *, request_id: str = ""
     ) -> Detection:
-        """Adds views to the volume: the grasps in all that was seen so far. One at a time."""
+        """Adds views to the volume and detects grasps in everything observed so far. Calls must not overlap."""
         request = self._adding.request(views, options, request_id)
         try:
-            # A server that hung up says why in its last reply.
+            # If the server has closed the stream, its last reply holds the reason.
             with suppress(asyncio.InvalidStateError):
                 await self._stream.write(request)
             reply = await self._stream.read()

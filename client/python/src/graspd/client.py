@@ -1,4 +1,4 @@
-"""The client that asks and waits."""
+"""The synchronous client."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 
 class Client(Connection[grpc.Channel]):
-    """A connection to graspd. Threads may share it.
+    """A connection to graspd. It is thread-safe.
 
-    What the server, or the connection to it, refuses is an `Error`; what cannot even be asked, such as a volume that is
-    no cube, a `ValueError`. `options` that are None leave everything to the server. `request_id`, at most 256 bytes,
-    names the request in the answer and the server's log.
+    Methods raise `Error` if the server refuses the request or the connection fails, and `ValueError` for arguments that
+    cannot be sent, such as a volume that is not a cube. With `options` of None the server's defaults apply.
+    `request_id`, at most 256 bytes, identifies the request in the reply and in the server's log.
     """
 
     def __enter__(self) -> Client:
@@ -40,14 +40,14 @@ class Client(Connection[grpc.Channel]):
         self.close()
 
     def close(self) -> None:
-        """Ends what is still going on."""
+        """Closes the connection and cancels running calls."""
         self._channel.close()
 
     def detect(
         self, volume: Volume | NDArray[Any], options: Options | None = None, *, request_id: str = ""
     ) -> Detection:
-        """The grasps in a volume; an array alone is a `Volume` of a cube of 0.3 m."""
-        return self._ask(methods.DETECT, wire.detect_request(volume, options, request_id))
+        """Detects grasps in a volume. An array is a `Volume` with an edge of 0.3 m."""
+        return self._call(methods.DETECT, wire.detect_request(volume, options, request_id))
 
     def detect_from_depth(
         self,
@@ -57,8 +57,8 @@ class Client(Connection[grpc.Channel]):
         *,
         request_id: str = "",
     ) -> Detection:
-        """The grasps in what depth cameras see, from 1 to 64 images."""
-        return self._ask(methods.DETECT_FROM_DEPTH, wire.depth_request(views, workspace, options, request_id))
+        """Detects grasps in 1 to 64 depth images."""
+        return self._call(methods.DETECT_FROM_DEPTH, wire.depth_request(views, workspace, options, request_id))
 
     def detect_from_cloud(
         self,
@@ -68,18 +68,18 @@ class Client(Connection[grpc.Channel]):
         *,
         request_id: str = "",
     ) -> Detection:
-        """The grasps in point clouds, from 1 to 64, each of one camera."""
-        return self._ask(methods.DETECT_FROM_CLOUD, wire.cloud_request(views, workspace, options, request_id))
+        """Detects grasps in 1 to 64 point clouds, each observed by one camera."""
+        return self._call(methods.DETECT_FROM_CLOUD, wire.cloud_request(views, workspace, options, request_id))
 
     def detect_stream(
         self, volumes: Iterable[Volume | NDArray[Any]], options: Options | None = None
     ) -> Iterator[Detection | Error]:
-        """The grasps in each of the volumes, in their order, while further ones are read by another thread. One that is
-        refused gives its `Error` instead, and the stream goes on; what ends it is raised."""
+        """Yields the grasps of each volume in the order of the volumes. Another thread iterates `volumes`. For a
+        refused volume it yields the `Error`, and the stream continues. An error that ends the stream is raised."""
         detecting = Detecting(options)
 
         def requests() -> Iterator[pb.DetectGraspsRequest]:
-            with detecting.asking():
+            with detecting.sending():
                 for volume in volumes:
                     yield detecting.request(volume)
 
@@ -94,28 +94,28 @@ class Client(Connection[grpc.Channel]):
         detecting.end()
 
     def track(self, workspace: Workspace = Workspace()) -> Tracking:
-        """Has the server keep a volume for a camera that moves."""
+        """Opens a tracked volume for a moving camera."""
         return Tracking(lambda requests: self._stream(methods.TRACK, requests), workspace)
 
     def models(self) -> tuple[Model, ...]:
-        """What can be asked for by name, the default first."""
-        return self._ask(methods.LIST_MODELS, pb.ListModelsRequest())
+        """The models that the server serves; the default model is first."""
+        return self._call(methods.LIST_MODELS, pb.ListModelsRequest())
 
     def health(self) -> bool:
-        """Whether the server answers; it does not while it is warming up or shutting down."""
-        return self._ask(methods.CHECK, HealthCheckRequest())
+        """Whether the server is ready; False while it is warming up or shutting down."""
+        return self._call(methods.CHECK, HealthCheckRequest())
 
     def _open(self, target: str, credentials: grpc.ChannelCredentials | None) -> grpc.Channel:
         if credentials is None:
             return grpc.insecure_channel(target, OPTIONS)
         return grpc.secure_channel(target, credentials, OPTIONS)
 
-    def _ask(self, method: Method[Request, Response, Answer], request: Request) -> Answer:
-        ask = self._channel.unary_unary(method.path, method.serialize, method.parse)
+    def _call(self, method: Method[Request, Response, Answer], request: Request) -> Answer:
+        call = self._channel.unary_unary(method.path, method.serialize, method.parse)
         attempts = 0
         while True:
             try:
-                return method.answer(ask(request, self._timeout, self._metadata))
+                return method.answer(call(request, self._timeout, self._metadata))
             except grpc.RpcError as status:
                 error = from_status(status)
             attempts += 1
@@ -130,7 +130,7 @@ class Client(Connection[grpc.Channel]):
 
 
 class Tracking:
-    """A volume that the server keeps until this is closed, and the grasps in it."""
+    """A tracked volume. The server keeps it until this object is closed."""
 
     def __init__(
         self,
@@ -148,18 +148,18 @@ class Tracking:
         self.close()
 
     def close(self) -> None:
-        """Has the server forget the volume."""
+        """Ends the tracking. The server deletes the volume."""
         self._requests.put(None)
         self._replies.cancel()
 
     def add(
         self, views: Iterable[DepthView] = (), options: Options | None = None, *, request_id: str = ""
     ) -> Detection:
-        """Adds views to the volume: the grasps in all that was seen so far. Without views it looks once more. `options`
-        that are None are those of the last call that had some.
+        """Adds views to the volume and detects grasps in everything observed so far. `views` may be empty. With
+        `options` of None the options of the previous call apply.
 
-        What is wrong with a view does not end the tracking. `Aborted` does, and at the first call `ResourceExhausted`,
-        where the server tracks as many volumes as it may; nothing is asked twice.
+        An invalid view does not end the tracking. `Aborted` ends it, and so does `ResourceExhausted` at the first call,
+        when the server's limit of tracked volumes is reached. Calls are not retried.
         """
         self._requests.put(self._adding.request(views, options, request_id))
         try:

@@ -1,4 +1,4 @@
-"""How both clients get in."""
+"""Channel options, TLS and authentication of both clients."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ Channel = TypeVar("Channel")
 File: TypeAlias = "str | PathLike[str]"
 
 OPTIONS = (
-    # A reply holds grasps, never volumes, but with a low threshold there may be tens of thousands of them.
+    # A low threshold can return tens of thousands of grasps.
     ("grpc.max_receive_message_length", -1),
-    # Who is lost is looked for again within the pauses of `Retry`, not after seconds.
+    # Reconnect within the pauses of `Retry`; gRPC's default is seconds.
     ("grpc.initial_reconnect_backoff_ms", 100),
     ("grpc.max_reconnect_backoff_ms", 500),
-    # Who vanished without a word is missed.
+    # Detect servers that disappear without closing the connection.
     ("grpc.keepalive_time_ms", 30_000),
     ("grpc.keepalive_timeout_ms", 10_000),
 )
 
 
 class Connection(Generic[Channel]):
-    """What the two clients have in common."""
+    """Base class of both clients."""
 
     def __init__(
         self,
@@ -39,16 +39,16 @@ class Connection(Generic[Channel]):
         timeout: float | None = 10.0,
         retry: Retry = Retry.RECOMMENDED,
     ) -> None:
-        """A connection to the graspd at `address`, such as ``127.0.0.1:50051`` or ``https://robot:50051``; the first
-        call makes it.
+        """Creates a client of the graspd at `address`, such as ``127.0.0.1:50051`` or ``https://robot:50051``. The
+        first call connects.
 
-        TLS is spoken where the address says so or one of its files, PEM, is given: `tls_ca`, the CA that signed the
-        server's certificate (without one, those that gRPC trusts), `tls_cert` and `tls_key`, which the server may want
-        to see of this client. `token` is the bearer's. `timeout` is how many seconds each attempt of a call may take,
-        as the server is told, too; streams and tracking may take as long as they want.
+        TLS is used if the address begins with ``https://`` or a PEM file is given: `tls_ca`, the CA that signed the
+        server's certificate (default: gRPC's root CAs), or `tls_cert` and `tls_key`, the client certificate for mutual
+        TLS. `token` is a bearer token. `timeout` limits each attempt of a call, seconds, and is sent to the server as
+        the deadline; it does not apply to streams and tracking.
         """
         if (tls_cert is None) != (tls_key is None):
-            raise ValueError("tls_cert and tls_key belong together")
+            raise ValueError("tls_cert and tls_key must be given together")
         ca, cert, key = (None if file is None else Path(file).read_bytes() for file in (tls_ca, tls_cert, tls_key))
         credentials = None
         if ca or cert or address.startswith("https://"):
@@ -64,7 +64,7 @@ class Connection(Generic[Channel]):
 
 def bearer(token: str) -> str:
     token = token.strip()
-    # What gRPC says of such a header would show it.
+    # Checked here, because gRPC's error message would contain the token.
     if not (token and token.isascii() and token.isprintable()):
-        raise ValueError("the token is empty or has characters that a header cannot carry")
+        raise ValueError("token is empty or contains characters that are not printable ASCII")
     return f"Bearer {token}"

@@ -1,4 +1,4 @@
-"""What comes back."""
+"""Results of requests."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from graspd.geometry import Pose
 
 @dataclass(frozen=True)
 class Grasp:
-    """A grasp, and the way there and away.
+    """A grasp with its pre-grasp and retreat poses.
 
-    z runs along the approach, the fingers close along ±y, the origin is at the finger base, unless `Convention` asked
-    for another frame of the hand. Turned by 180° about z it is the same grasp.
+    In the grasp frame, z is the approach direction, the fingers close along ±y and the origin is at the finger base,
+    unless the request's `Convention` selects another frame. A grasp rotated by 180° about z is the same grasp.
     """
 
     pose: Pose
@@ -21,103 +21,102 @@ class Grasp:
     width: float
     """Opening between the fingers, metres."""
     quality: float
-    """Predicted probability of success, [0, 1]."""
+    """Predicted probability of success, in [0, 1]."""
     pregrasp: Pose
-    """Where the hand waits, open, before it approaches."""
+    """Pre-grasp pose: the open hand approaches from here along its z axis."""
     retreat: Pose
-    """Where the hand goes with what it holds."""
+    """Pose to which the hand moves after it has closed."""
     collides: bool | None
-    """Whether the open hand would meet something, where ``CollisionCheck("flag")`` asked for that."""
+    """Whether the open hand would collide; None without ``CollisionCheck("flag")``."""
 
 
 @dataclass(frozen=True)
 class Latency:
-    """Where the time went in the server, seconds."""
+    """Duration of each stage in the server, seconds."""
 
     queue: float
-    """Waiting for a session."""
+    """Time in the queue of the model."""
     preprocessing: float
-    """Checking and widening what was sent."""
+    """Validation and conversion of the input."""
     fusion: float
-    """From depth images or points to a volume."""
+    """Fusion of depth images or points into a volume."""
     inference: float
-    """The network; of a planner without one, all of its work."""
+    """The network; for a planner without a network, the whole planner."""
     postprocessing: float
-    """From the network's output to the grasps."""
+    """Decoding of the network's output to grasps."""
     total: float
     """From the decoded request to the reply."""
 
 
 @dataclass(frozen=True)
 class Dropped:
-    """How many voxels hold no grasp, each counted once under the first reason that applied. Planners without a network
-    count the places where the hand fits."""
+    """Number of voxels without a grasp, each counted under the first reason that applies. Planners without a network
+    count grasp candidates instead of voxels."""
 
     below_threshold: int
-    """Of too little quality."""
+    """Quality below the threshold."""
     mask: int
     """Inside an object, or too far from any observed surface."""
     width: int
-    """Of a width that the gripper cannot open to."""
-    border: int
-    """At the border of the cube."""
+    """Width outside the range of the gripper."""
     region: int
-    """Outside of the workspace or the region."""
+    """Outside the workspace or the region."""
     approach: int
-    """From outside of the approach cone."""
+    """Approach direction outside the cone."""
     height: int
-    """The hand would be lower than `min_height`."""
+    """A corner of the open hand below `min_height`."""
     collision: int
-    """The open hand would meet what was observed, where ``CollisionCheck("filter")`` asked for that."""
+    """The open hand would collide; counted with ``CollisionCheck("filter")``."""
     suppressed: int
-    """Next to a better grasp."""
+    """A neighbouring grasp has a higher quality."""
     over_limit: int
-    """A grasp, but past `max_grasps`."""
+    """A grasp beyond `max_grasps`."""
 
 
 @dataclass(frozen=True)
 class Detection:
-    """The answer to what was seen."""
+    """The result of a request."""
 
     grasps: tuple[Grasp, ...]
     """Best first."""
     frame_id: str
-    """The frame of the grasps: the volume's or the workspace's."""
+    """Name of the frame of the grasps: that of the volume or workspace."""
     stamp: int | None
-    """The volume's or the workspace's, nanoseconds since 1970."""
+    """Time stamp of the volume or workspace, nanoseconds since 1970."""
     model: str
-    """The planner that answered."""
+    """Name of the model that found the grasps."""
     version: str
     latency: Latency
     dropped: Dropped | None
-    """Where `explain` asked for it, or there is no grasp."""
+    """Set if `Options.explain` is set or there is no grasp."""
     request_id: str
-    """The caller's, or the one by which the server's log knows the request."""
+    """The request id of the caller, or the one that the server generated; it is in the server's log."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A planner that the server has: a network, or one without."""
+    """A model that the server serves: a network with its decoding, or a planner without a network."""
 
     name: str
     version: str
     resolution: int
-    """Voxels along an edge of the volumes it takes; 0 if it takes any."""
+    """Voxels along an edge of its input volumes; 0: any."""
     voxel_size: float
-    """Edge of their voxels, metres; 0 if it takes any."""
+    """Edge of a voxel of its input volumes, metres; 0: any."""
     threshold: float
-    """Its own smallest quality of a grasp."""
+    """Default of `Options.threshold`."""
     sha256: str
-    """Of its file, hexadecimal; empty if it has none."""
+    """SHA-256 of the model file, hexadecimal; empty for planners without a file."""
     provenance: Mapping[str, str]
-    """Where its weights come from."""
+    """Origin of the weights."""
     provider: str
-    """What runs it: cpu, openvino, cuda or tensorrt."""
+    """ONNX Runtime execution provider: cpu, openvino, cuda or tensorrt."""
     precision: str
-    """In which numbers: fp32, bf16, fp16 or int8."""
+    """Number format of the inference: fp32, bf16, fp16 or int8."""
     voxel_origin: str
-    """Where in its voxel a network's grasp stands: ``corner``, at index · `voxel_size`, or ``center``, half a voxel
-    further; empty if it is none."""
+    """Point of a voxel that a network's grasp refers to: ``corner``, at index · `voxel_size`, or ``center``, half a
+    voxel further. Empty for planners without a network."""
     camera_azimuth: float | None
-    """Where the camera always stood in training, degrees about the vertical axis through the middle of the volume, from
-    x towards y; None: anywhere. Depth images and points are fused in a cube that is turned so; a volume should be."""
+    """Azimuth of the camera in the training data, degrees about the vertical axis through the middle of the volume,
+    from x towards y; None: any. For depth images and point clouds the server rotates the workspace accordingly; volumes
+    must be rotated by the caller."""

@@ -1,4 +1,4 @@
-"""Why there is no answer."""
+"""Errors of calls."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from graspd import grasp_pb2 as pb
 
 @dataclass(eq=False)
 class Error(Exception):
-    """The server, or the connection to it, refused. Those that one may want to tell apart have a class of their own."""
+    """The server refused the request, or the connection failed. Common status codes have subclasses."""
 
     code: StatusCode
     message: str
-    """What is wrong, with the value, and what is needed."""
+    """What is wrong, with the value, and what to do."""
     field: str | None = None
-    """The path of the field that is not what it must be, such as ``options.region.max.z``."""
+    """Path of the invalid field of the request, such as ``options.region.max.z``."""
     retry_after: float | None = None
-    """Seconds after which it is worth coming back, where the server says so."""
+    """The server's retry hint, seconds."""
     request_id: str | None = None
-    """By which the server's log knows the request, where it got that far."""
+    """Id of the request in the server's log; None if the request did not reach the server."""
 
     def __str__(self) -> str:
         return f"{self.code.name}: {self.message}"
 
 
 class InvalidArgument(Error):
-    """A field of the request is not what it must be."""
+    """A field of the request is invalid."""
 
 
 class NotFound(Error):
-    """No such model or version, as `field` says; the message lists those there are."""
+    """The model or version (see `field`) does not exist; the message lists the available ones."""
 
 
 class ResourceExhausted(Error):
-    """The model's queue is full, or as many volumes are tracked as may be."""
+    """The queue of the model is full, or the limit of tracked volumes is reached."""
 
 
 class DeadlineExceeded(Error):
@@ -47,19 +47,19 @@ class DeadlineExceeded(Error):
 
 
 class Aborted(Error):
-    """No view came for too long: the volume that was tracked is gone."""
+    """The server deleted the tracked volume, because it received no view for too long."""
 
 
 class Unavailable(Error):
-    """Nobody is there, or the server is warming up or shutting down."""
+    """The server is unreachable, warming up or shutting down."""
 
 
 class Unauthenticated(Error):
-    """The server wants a token, and not this one."""
+    """The token is missing or invalid."""
 
 
 class Internal(Error):
-    """The model failed on this request; the server's log has more under its id."""
+    """The model failed on this request; see the server's log for the request id."""
 
 
 CLASSES = {
@@ -76,16 +76,16 @@ CODES = {code.value[0]: code for code in StatusCode}
 
 
 def from_status(status: RpcError) -> Error:
-    """Why a call has ended."""
+    """The error of a failed call."""
     error = make(status.code(), status.details() or "")
-    wrong, pause, request = BadRequest(), RetryInfo(), RequestInfo()
+    violations, pause, request = BadRequest(), RetryInfo(), RequestInfo()
     trailers: Any = status.trailing_metadata() or ()
     for key, value in trailers:
         if key != "grpc-status-details-bin":
             continue
         for detail in Status.FromString(value).details:
-            if detail.Unpack(wrong):
-                error.field = wrong.field_violations[0].field
+            if detail.Unpack(violations):
+                error.field = violations.field_violations[0].field
             elif detail.Unpack(pause):
                 error.retry_after = pause.retry_delay.ToNanoseconds() * 1e-9
             elif detail.Unpack(request):
@@ -94,7 +94,7 @@ def from_status(status: RpcError) -> Error:
 
 
 def from_reply(reply: pb.DetectGraspsStreamResponse) -> Error:
-    """Why one request of a stream is refused."""
+    """The error of one refused request of a stream."""
     error = make(CODES[reply.error.code], reply.error.message)
     error.field = reply.error.field or None
     error.request_id = reply.request_id

@@ -1,4 +1,4 @@
-"""Where things are."""
+"""Poses and vectors."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ class Pose:
     """``T_a_b``: maps points of frame b into frame a."""
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of b's origin in a, metres."""
+    """Position of b's origin in a, metres."""
     quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-    """x, y, z, w, of unit length."""
+    """Unit quaternion x, y, z, w."""
 
     @classmethod
     def from_matrix(cls, matrix: NDArray[np.floating[Any]]) -> Pose:
-        """From the 4 × 4 matrix that maps points (x, y, z, 1). `ValueError` if it is not a rotation and a shift."""
+        """From the 4 × 4 matrix that maps points (x, y, z, 1). Raises `ValueError` if it is not a rigid transform."""
         matrix = np.asarray(matrix, np.float64)
         if matrix.shape != (4, 4):
-            raise ValueError(f"a pose is a 4 × 4 matrix, not one of shape {matrix.shape}")
+            raise ValueError(f"a pose must be a 4 × 4 matrix, got shape {matrix.shape}")
         rotation = matrix[:3, :3]
-        # As far off as quaternions may be.
+        # The server's tolerance for the norm of quaternions.
         is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
         if not (is_rotation and np.allclose(matrix[3], [0, 0, 0, 1])):
-            raise ValueError(f"a pose is a rotation and a shift, which this is not:\n{matrix}")
-        # The quaternion is the eigenvector with the largest eigenvalue of a symmetric matrix, of which this is the
-        # lower half (Bar-Itzhack 2000): stable at every angle.
+            raise ValueError(f"a pose must be a rotation and a translation, got\n{matrix}")
+        # The quaternion is the eigenvector of the largest eigenvalue of a symmetric matrix, whose lower half this is
+        # (Bar-Itzhack 2000). The method is stable at every angle.
         (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
         half = [
             [xx - yy - zz, 0, 0, 0],
@@ -60,4 +60,4 @@ class Pose:
 
 
 PoseLike: TypeAlias = Pose | NDArray[np.floating[Any]]
-"""A pose, or its 4 × 4 matrix."""
+"""A pose, or the equivalent 4 × 4 matrix."""

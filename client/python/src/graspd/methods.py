@@ -1,4 +1,4 @@
-"""What can be asked of a server."""
+"""The RPC methods with their message types."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Method(Generic[Request, Response, Answer]):
     request: type[Request]
     response: type[Response]
     answer: Callable[[Response], Answer]
-    """What users get of a response."""
+    """Converts a response to the result of the client's method."""
 
     def serialize(self, request: Request) -> bytes:
         return request.SerializeToString()

@@ -1,5 +1,5 @@
-"""What is asked of the grasps. Names are those of `grasp.v1`, so that the field that an `InvalidArgument` names is the
-attribute to look at; what is in them is checked by the server."""
+"""Options of requests. The names are those of `grasp.v1`, so that the `field` of an `InvalidArgument` is the path of an
+attribute. The server validates the values."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from graspd.geometry import PoseLike, Vector
 
 @dataclass(frozen=True)
 class Box:
-    """Along the axes of its frame, metres."""
+    """An axis-aligned box, metres."""
 
     min: Vector
     max: Vector
@@ -19,88 +19,90 @@ class Box:
 
 @dataclass(frozen=True)
 class Cone:
-    """Directions of the grasps' frame."""
+    """A cone of directions in the frame of the grasps."""
 
     axis: Vector
-    """The direction in its middle, of any length: (0, 0, -1) is straight down where z points up."""
+    """Axis of the cone, of any length. (0, 0, -1) is straight down if z points up."""
     angle: float
-    """The largest angle to it, radians, above 0 and at most π."""
+    """Half the opening angle, radians, greater than 0 and at most π."""
 
 
 @dataclass(frozen=True)
 class Gripper:
-    """An open parallel-jaw hand. Metres, above 0 and at most 0.5."""
+    """The shape of an open parallel-jaw hand. All lengths in metres, greater than 0 and at most 0.5."""
 
     max_opening: float
-    """Between the fingers."""
+    """Largest distance between the fingers."""
     finger_depth: float
     """From the finger base to the fingertips. Panda: 0.05."""
     finger_width: float
     """Thickness of a finger along the closing axis. Panda: 0.0264."""
     finger_breadth: float
-    """Breadth of the fingers across it. Panda: 0.021."""
+    """Breadth of a finger across the closing axis. Panda: 0.021."""
     palm: Box | None = None
-    """What lies behind the fingers, in the grasp frame (z along the approach, ±y the closing axis)."""
+    """Bounding box of the palm in the grasp frame (z along the approach, ±y along the closing axis)."""
 
 
 @dataclass(frozen=True)
 class CollisionCheck:
-    """Whether the open hand would meet what was observed, or the table, at the grasp or on its way there from the
-    pre-grasp. Space that nothing observed is taken to be free."""
+    """Checks whether the open hand would collide with the observed surface or the table, at the grasp or between
+    pre-grasp and grasp. Unobserved space counts as free."""
 
     mode: Literal["off", "flag", "filter"]
-    """Nobody looks; each grasp says whether (`Grasp.collides`); those that would are dropped."""
+    """``off``: no check; ``flag``: set `Grasp.collides`; ``filter``: drop grasps that collide."""
     table_height: float | None = None
-    """Of the table above the volume's bottom, metres; 0.05 where it is None. A negative one is no table."""
+    """Height of the table above the bottom of the volume, metres; None: 0.05; negative: no table."""
 
 
 @dataclass(frozen=True)
 class Convention:
-    """Which frame of the hand the poses are of."""
+    """The frame of the hand that grasp poses refer to."""
 
     origin: Literal["finger_base", "tcp", "parent"] = "finger_base"
-    """Between the fingers, where they begin; between the fingertips; the link that carries the hand."""
+    """``finger_base``: midpoint between the finger bases; ``tcp``: midpoint between the fingertips; ``parent``: the
+    link that carries the hand."""
     closing_axis: Literal["y", "x"] = "y"
+    """Axis of the grasp frame along which the fingers close."""
     parent_from_grasp: PoseLike | None = None
-    """``T_parent_grasp``, for ``"parent"``: the finger base, closing along `closing_axis`, in the link."""
+    """``T_parent_grasp``, for ``"parent"``: pose of the finger base, closing along `closing_axis`, in the link."""
 
 
 @dataclass(frozen=True)
 class Retreat:
-    """Where the hand goes with what it holds."""
+    """The motion of the hand after it has closed."""
 
     distance: float = 0.1
     """Metres."""
     direction: Vector | None = None
-    """In the grasps' frame, of any length; back along the approach where it is None."""
+    """Direction in the frame of the grasps, of any length; None: back along the approach."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """What is asked of the grasps. The default leaves everything to the server."""
+    """Options of a detection. The default uses the server's defaults."""
 
     model: str = ""
-    """The planner: a network by its name, ``"gpd"`` or ``"shaf"``; the server's default where it is empty."""
+    """Name of a network, ``"gpd"`` or ``"shaf"``; empty: the server's default model."""
     version: str = ""
-    """Of the model; the newest where it is empty."""
+    """Version of the model; empty: the newest."""
     threshold: float | None = None
-    """Smallest quality of a grasp, above 0 and at most 1; the model's own where it is None."""
+    """Smallest quality of a grasp, greater than 0 and at most 1; None: the model's threshold."""
     force: float | None = None
-    """When nothing reaches `threshold`: return the best grasp alone, if its quality reaches this."""
+    """If no grasp reaches `threshold`, return the best grasp if its quality is at least this."""
     max_grasps: int = 0
-    """At most this many, the best. 0: all."""
+    """Return at most this many grasps, best first. 0: no limit."""
     explain: bool = False
-    """Also say why the other voxels hold no grasp (`Detection.dropped`). An empty answer always does."""
+    """Also report dropped voxels by reason (`Detection.dropped`). Results without grasps always report them."""
     region: Box | None = None
-    """Only grasps whose point between the fingertips lies here, in the grasps' frame."""
+    """Only grasps whose point between the fingertips lies in this box, in the frame of the grasps."""
     approach: Cone | None = None
-    """Only grasps that approach within this."""
+    """Only grasps whose approach direction lies in this cone."""
     min_height: float | None = None
-    """No corner of the open hand may be lower than this at the grasp, metres along z of the grasps' frame."""
+    """Smallest z of any corner of the open hand at the grasp, in the frame of the grasps, metres."""
     gripper: Gripper | None = None
-    """The hand; the Panda's, with which the networks were trained, where it is None."""
+    """Shape of the hand; None: the Panda hand, with which the networks were trained."""
     collision: CollisionCheck | None = None
     convention: Convention | None = None
     pregrasp_distance: float | None = None
-    """How far before the grasp the pre-grasp is, metres back along the approach; 0.05 where it is None."""
+    """Distance of the pre-grasp from the grasp, back along the approach, metres; None: 0.05."""
     retreat: Retreat | None = None

@@ -1,4 +1,4 @@
-"""When to ask again."""
+"""Retries of failed calls."""
 
 from __future__ import annotations
 
@@ -11,24 +11,25 @@ from graspd.errors import Error, ResourceExhausted, Unavailable
 
 @dataclass(frozen=True)
 class Retry:
-    """When to ask again, where that can help: nobody was there, the connection broke, or the server was busy. Asking
-    for grasps twice does no harm."""
+    """When a call is retried. Only failures that can pass are retried: the server is unreachable, the connection
+    breaks, or the server is busy. Detection is idempotent."""
 
     attempts: int
-    """How often to ask, the first time included."""
+    """Maximum number of attempts, including the first."""
     pause: float
-    """The first pause, seconds; each further one is twice as long. Half of it is left to chance, so that many who were
-    refused together do not come back together. Where the server says when to come back, it is not sooner."""
+    """First pause, seconds; it doubles with each further attempt. The actual pause is drawn uniformly from [0.5, 1] of
+    this, so that clients that were refused together do not retry together. It is never shorter than the server's retry
+    hint."""
     longest: float
-    """The longest pause, seconds."""
+    """Upper limit of the pause, before the server's retry hint, seconds."""
 
     NONE: ClassVar[Retry]
     """A single attempt."""
     RECOMMENDED: ClassVar[Retry]
-    """For a robot that wants its grasp: over a lost replica, or a full queue, in half a second or so."""
+    """For robots: bridges a lost replica or a full queue within about half a second."""
 
     def after(self, attempts: int, error: Error) -> float | None:
-        """How many seconds to wait after so many attempts, the latest of which ended with `error`; None: no more."""
+        """The pause after this many attempts, seconds; None: no further attempt. `error` is the last attempt's."""
         if attempts >= self.attempts or not isinstance(error, (ResourceExhausted, Unavailable)):
             return None
         pause = min(self.pause * 2.0 ** min(attempts - 1, 20), self.longest)

@@ -1,4 +1,4 @@
-"""What was seen. Arrays of a wrong shape are a `ValueError` here; what they hold is checked by the server."""
+"""Observations. Arrays of a wrong shape raise `ValueError`; the server validates the values."""
 
 from __future__ import annotations
 
@@ -16,74 +16,76 @@ class Volume:
     """A truncated signed distance field over a cube of N³ voxels."""
 
     values: NDArray[Any]
-    """``[x][y][z]``, or ``[1][x][y][z]`` as VGN's files have it. In [0, 1]: 0.5 on the surface, above it in front of
-    it, below it behind, ``(tsdf + 1) / 2``, and 0 where nothing was observed or no surface is near, as Open3D has it.
-    Where they are of uint8: v / 255."""
+    """``[x][y][z]``, or ``[1][x][y][z]`` as in VGN's files. Values in [0, 1], ``(tsdf + 1) / 2``: 0.5 on the surface,
+    greater in front of it, smaller behind it, and 0 for voxels that are unobserved or not near a surface, as in Open3D.
+    uint8 values mean v / 255."""
     _: KW_ONLY
     voxel_size: float | None = None
-    """Edge of a voxel, metres; that of a cube of 0.3 m where it is None. Must be the model's."""
+    """Edge of a voxel, metres; must be the model's. None: 0.3 m / N."""
     pose: PoseLike | None = None
-    """``T_frame_volume``: the volume's corner in `frame_id`; the identity where it is None."""
+    """``T_frame_volume``: pose of the volume's corner in `frame_id`; None: identity."""
     frame_id: str = ""
-    """The frame in which `pose` is given and the grasps will be."""
+    """Name of the frame of `pose` and of the grasps."""
     stamp: int | None = None
-    """When it was seen, nanoseconds since 1970 (`time.time_ns()`; ROS: ``sec * 10**9 + nanosec``). Comes back."""
+    """Time of the observation, nanoseconds since 1970 (`time.time_ns()`; ROS: ``sec * 10**9 + nanosec``). The server
+    returns it unchanged."""
     dtype: DTypeLike | None = None
-    """How the values travel: float32, float16, or uint8, which keeps 255 steps. As they are, where it is None."""
+    """Encoding of the values on the wire: float32, float16 or uint8 (255 steps). None: that of `values`."""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.values)
         if len(shape[-3:]) != 3 or len(set(shape[-3:])) != 1 or shape[:-3] not in [(), (1,)] or 0 in shape:
-            raise ValueError(f"a volume is a cube [x][y][z], not an array of shape {shape}")
+            raise ValueError(f"a volume must be a cube [x][y][z], got shape {shape}")
 
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """One depth image, rectified. Needs one of `camera_from_task` and `frame_from_camera`."""
+    """A rectified depth image with its camera pose: exactly one of `camera_from_task` and `frame_from_camera`."""
 
     depth: NDArray[Any]
-    """``[row][column]``, along the optical axis: metres where it is of floats, millimetres where it is of uint16. 0,
-    NaN and infinity are no reading."""
+    """``[row][column]``: distance along the optical axis, floats in metres or uint16 in millimetres. 0, NaN and
+    infinity mean no reading."""
     k: NDArray[np.floating[Any]]
-    """The intrinsic matrix, 3 × 3, pixels (ROS: ``CameraInfo.k``). Pixel centres are at whole numbers."""
+    """The 3 × 3 intrinsic matrix, pixels (ROS: ``CameraInfo.k``). Pixel centres have integer coordinates."""
     _: KW_ONLY
     camera_from_task: PoseLike | None = None
-    """``T_camera_task``: maps points of the workspace's cube into the camera (z forward, x right, y down)."""
+    """``T_camera_task``: maps points of the task frame into the camera frame (z forward, x right, y down)."""
     frame_from_camera: PoseLike | None = None
-    """``T_frame_camera``: where the camera stands in the workspace's `frame_id`, as hand-eye calibration gives it."""
+    """``T_frame_camera``: the camera's pose in the workspace's `frame_id`, as hand-eye calibration returns it."""
 
     def __post_init__(self) -> None:
         if np.ndim(self.depth) != 2:
-            raise ValueError(f"a depth image is an array [row][column], not one of shape {np.shape(self.depth)}")
+            raise ValueError(f"a depth image must be an array [row][column], got shape {np.shape(self.depth)}")
         if (self.camera_from_task is None) == (self.frame_from_camera is None):
-            raise ValueError("a depth image needs one of camera_from_task and frame_from_camera")
+            raise ValueError("a depth image needs exactly one of camera_from_task and frame_from_camera")
 
 
 @dataclass(frozen=True, eq=False)
 class CloudView:
-    """Points that one camera saw."""
+    """A point cloud observed by one camera."""
 
     points: NDArray[np.floating[Any]]
-    """``[…][3]``: x, y, z, metres. Points with a NaN are left out."""
+    """``[…][3]``: x, y, z, metres. Points with a NaN are ignored."""
     camera_position: Vector
-    """Where the camera stood, in the frame of the points: (0, 0, 0) where they are in the camera's own."""
+    """Position of the camera in the frame of the points, metres: (0, 0, 0) for points in the camera frame."""
     frame_from_cloud: PoseLike | None = None
-    """``T_frame_cloud``: the points in the workspace's `frame_id`; the identity where it is None."""
+    """``T_frame_cloud``: maps the points into the workspace's `frame_id`; None: identity."""
 
     def __post_init__(self) -> None:
         if np.shape(self.points)[-1:] != (3,):
-            raise ValueError(f"a cloud is an array of x, y, z, not one of shape {np.shape(self.points)}")
+            raise ValueError(f"a point cloud must be an array […][3] of x, y, z, got shape {np.shape(self.points)}")
 
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
-    """The cube in which grasps are looked for. Its frame, the task frame, has its origin at a corner, z up."""
+    """The cube that views are fused into and in which grasps are detected. The task frame has its origin at a corner of
+    the cube, z up."""
 
     pose: PoseLike | None = None
-    """``T_frame_task``: the cube's corner in `frame_id`; the identity where it is None."""
+    """``T_frame_task``: pose of the task frame in `frame_id`; None: identity."""
     size: float | None = None
-    """Edge, metres; what the model was trained for, where it is None."""
+    """Edge length, metres; None: the size that the model was trained with."""
     frame_id: str = ""
-    """The frame in which `pose` is given and the grasps will be."""
+    """Name of the frame of `pose` and of the grasps."""
     stamp: int | None = None
-    """When the views were taken, nanoseconds since 1970. Comes back."""
+    """Time of the observation, nanoseconds since 1970. The server returns it unchanged."""

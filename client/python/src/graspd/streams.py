@@ -1,4 +1,4 @@
-"""What the streams of both clients have in common."""
+"""State of streams, shared by both clients."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from graspd.seen import DepthView, Volume, Workspace
 
 
 class Detecting:
-    """A stream of volumes and its answers."""
+    """The state of a stream of volumes."""
 
     def __init__(self, options: Options | None) -> None:
         self._options = options
         self._unanswered = 0
-        self._is_over = False
-        self._mistake: Exception | None = None
+        self._all_sent = False
+        self._failure: Exception | None = None
 
     @contextmanager
-    def asking(self) -> Iterator[None]:
-        """For as long as volumes come. Should they end with an exception, it waits for the answers to those before it:
-        gRPC would only log it."""
+    def sending(self) -> Iterator[None]:
+        """Surrounds the iteration of the volumes. An exception of the iteration is stored and raised by `end`, after
+        the results of the earlier volumes; gRPC would only log it."""
         try:
             yield
-        except Exception as mistake:
-            self._mistake = mistake
-        self._is_over = True
+        except Exception as failure:
+            self._failure = failure
+        self._all_sent = True
 
     def request(self, volume: Volume | NDArray[Any]) -> pb.DetectGraspsRequest:
         request = wire.detect_request(volume, self._options, "")
@@ -46,22 +46,23 @@ class Detecting:
         return methods.DETECT_STREAM.answer(reply)
 
     def end(self) -> None:
-        """After the last answer."""
-        if self._mistake is not None:
-            raise self._mistake
-        if self._unanswered or not self._is_over:
+        """Called after the last reply. Raises if the stream is incomplete."""
+        if self._failure is not None:
+            raise self._failure
+        if self._unanswered or not self._all_sent:
             raise ended()
 
 
-# These are met only after the views were added: another workspace would start another volume.
+# The server returns these codes only after it has added the views. Sending the workspace again would start another
+# volume.
 WAS_ADDED = (StatusCode.RESOURCE_EXHAUSTED, StatusCode.INTERNAL)
 
 
 class Adding:
-    """The views of a volume that is tracked."""
+    """The state of a tracked volume."""
 
     def __init__(self, workspace: Workspace) -> None:
-        # Until it has been taken.
+        # None once the server has accepted it.
         self._workspace: Workspace | None = workspace
 
     def request(self, views: Iterable[DepthView], options: Options | None, request_id: str) -> pb.TrackGraspsRequest:
@@ -79,4 +80,4 @@ class Adding:
 
 
 def ended() -> Unavailable:
-    return Unavailable(StatusCode.UNAVAILABLE, "the server has ended the stream")
+    return Unavailable(StatusCode.UNAVAILABLE, "the server closed the stream; open it again")

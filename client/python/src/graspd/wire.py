@@ -1,4 +1,4 @@
-"""From what users say to the messages of `grasp.v1`, and back."""
+"""Conversion between the client's types and the messages of `grasp.v1`."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from graspd.geometry import Pose, PoseLike, Vector
 from graspd.options import Box, CollisionCheck, Cone, Convention, Gripper, Options, Retreat
 from graspd.seen import CloudView, DepthView, Volume, Workspace
 
-Said = TypeVar("Said")
+Value = TypeVar("Value")
 Message = TypeVar("Message")
 
 WORKSPACE_SIZE = 0.3
-"""Edge of the cube that the papers' networks see, metres."""
+"""Edge of the workspace of the published networks, metres."""
 
 DTYPES = {
     np.dtype("<f4"): pb.DATA_TYPE_F32,
@@ -30,9 +30,9 @@ DTYPES = {
 }
 
 
-def given(message: Callable[[Said], Message], said: Said | None) -> Message | None:
-    """A field that may be left out."""
-    return None if said is None else message(said)
+def given(message: Callable[[Value], Message], value: Value | None) -> Message | None:
+    """Converts an optional field."""
+    return None if value is None else message(value)
 
 
 def detect_request(volume: Volume | NDArray[Any], options: Options | None, request_id: str) -> pb.DetectGraspsRequest:
@@ -93,21 +93,23 @@ def volume_message(volume: Volume | NDArray[Any]) -> pb.Volume:
 
 
 def encoded(values: NDArray[Any], dtype: DTypeLike | None) -> NDArray[Any]:
-    """As one of `DTYPES`."""
+    """The values as one of `DTYPES`."""
     own = values.dtype if values.dtype in DTYPES else np.dtype("<f4")
-    wanted = own if dtype is None else np.dtype(dtype)
-    if wanted not in DTYPES:
-        raise ValueError(f"volumes travel as float32, float16 or uint8, not as {wanted}")
-    if values.dtype == wanted:
+    target = own if dtype is None else np.dtype(dtype)
+    if target not in DTYPES:
+        raise ValueError(f"Volume.dtype is {target}, must be float32, float16 or uint8")
+    if values.dtype == target:
         return values
     if values.dtype == np.uint8:
-        return (values / 255).astype(wanted)
-    if wanted != np.uint8:
-        return values.astype(wanted)
-    # Rounded, the server could not see what was wrong with them.
+        return (values / 255).astype(target)
+    if target != np.uint8:
+        return values.astype(target)
+    # Checked here: after rounding the server could not detect invalid values.
     if not (values.min() >= 0 and values.max() <= 1):
-        raise ValueError("a volume that is to travel as uint8 must have values in [0, 1]")
-    # What is above 0 stays above 0, which means unobserved.
+        raise ValueError(
+            f"values of a volume with dtype uint8 must lie in [0, 1], got {values.min()} to {values.max()}"
+        )
+    # Values greater than 0 stay greater than 0, because 0 means unobserved.
     steps: NDArray[Any] = np.maximum(np.rint(values * 255), values > 0).astype(np.uint8)
     return steps
 
@@ -119,7 +121,7 @@ def depth_message(view: DepthView) -> pb.DepthView:
     elif np.issubdtype(view.depth.dtype, np.floating):
         unit, depth = pb.DEPTH_UNIT_F32_METRES, view.depth.astype("<f4", copy=False)
     else:
-        raise ValueError(f"a depth image is of floats (metres) or of uint16 (millimetres), not of {view.depth.dtype}")
+        raise ValueError(f"a depth image must be floats (metres) or uint16 (millimetres), got {view.depth.dtype}")
     return pb.DepthView(
         data=depth.tobytes(),
         unit=unit,
@@ -269,7 +271,6 @@ def dropped(message: pb.Dropped) -> Dropped:
         below_threshold=message.below_threshold,
         mask=message.mask,
         width=message.width,
-        border=message.border,
         region=message.region,
         approach=message.approach,
         height=message.height,

@@ -7,104 +7,105 @@ use grasp_client::{DetectOptions, pb};
 use crate::numbers::Numbers;
 use crate::pose;
 
-/// What is asked of the grasps.
+/// Options of the detection.
 #[derive(Args, Clone)]
 pub(crate) struct DetectArgs {
-    /// Which planner answers: a network, `gpd` or `shaf`. By default the server chooses.
+    /// Model: a network's name, `gpd` or `shaf`. Default: the server's default model.
     #[arg(long, default_value = "", hide_default_value = true)]
     model: String,
 
-    /// Which version of it. By default the newest.
+    /// Version of the model. Default: the newest.
     #[arg(long, default_value = "", hide_default_value = true)]
     version: String,
 
-    /// Smallest quality of a grasp, above 0 and at most 1. By default the model's own.
+    /// Smallest quality of a grasp, greater than 0 and at most 1. Default: the model's threshold.
     #[arg(long)]
     threshold: Option<f32>,
 
-    /// When nothing reaches it, the best grasp alone, if it reaches this.
+    /// If no grasp reaches the threshold, return the best grasp if its quality is at least this.
     #[arg(long)]
     force: Option<f32>,
 
-    /// At most this many grasps, the best. 0 for all.
+    /// Return at most this many grasps, best first. 0: no limit.
     #[arg(long, default_value_t = 0)]
     max_grasps: u32,
 
-    /// Also say why the other voxels hold no grasp.
+    /// Also report how many voxels were dropped, by reason.
     #[arg(long)]
     explain: bool,
 
-    /// Only grasps with their fingertips in a box: its smallest and largest coordinates, metres.
+    /// Only grasps whose point between the fingertips lies in this box: its minimum and maximum corner in the frame of
+    /// the grasps, metres.
     #[arg(long, value_name = "X,Y,Z,X,Y,Z", allow_hyphen_values = true)]
     region: Option<Numbers<6>>,
 
-    /// Only grasps that approach along a direction, at most so many degrees off.
+    /// Only grasps whose approach direction is within this angle of a direction in the frame of the grasps.
     #[arg(long, value_name = "X,Y,Z,DEGREES", allow_hyphen_values = true)]
     approach: Option<Numbers<4>>,
 
-    /// How low the lowest corner of the hand may be, metres along the frame's z.
+    /// Smallest z of any corner of the open hand in the frame of the grasps, metres.
     #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
     min_height: Option<f64>,
 
-    /// The hand: its opening, the depth, the thickness and the breadth of its fingers, metres. By default Panda's.
+    /// Gripper: maximum opening; depth, thickness and breadth of the fingers, metres. Default: Panda hand.
     #[arg(long, value_name = "OPENING,DEPTH,WIDTH,BREADTH")]
     gripper: Option<Numbers<4>>,
 
-    /// What lies behind its fingers, a box in the grasp frame: its smallest and largest coordinates, metres. By default
-    /// nothing.
+    /// Bounding box of the palm in the grasp frame: minimum and maximum corner, metres. Default: no palm.
     #[arg(long, value_name = "X,Y,Z,X,Y,Z", allow_hyphen_values = true, requires = "gripper")]
     palm: Option<Numbers<6>>,
 
-    /// What becomes of grasps whose open hand would meet what was observed, or the table.
+    /// Check of the open hand for collisions with the observed surface and the table.
     #[arg(long, value_enum, default_value_t = Collision::Off)]
     collision: Collision,
 
-    /// Height of the table above the volume's bottom, metres.
+    /// Height of the table above the bottom of the workspace, metres.
     #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
     table_height: Option<f64>,
 
-    /// Where on the hand a grasp's frame stands.
+    /// Origin of the grasp frame.
     #[arg(long, value_enum, default_value_t = Origin::FingerBase)]
     origin: Origin,
 
-    /// Along which axis of that frame the fingers close.
+    /// Axis of the grasp frame along which the fingers close.
     #[arg(long, value_enum, default_value_t = Closing::Y)]
     closing: Closing,
 
-    /// T_parent_grasp, for `--origin parent`: the pose of the finger base in the link that carries the hand, one in a file
-    /// as for --workspace.
+    /// T_parent_grasp for `--origin parent`: pose of the finger base in the parent link. A file with one pose, as for
+    /// --workspace.
     #[arg(long, value_name = "FILE", required_if_eq("origin", "parent"))]
     parent_from_grasp: Option<PathBuf>,
 
-    /// How far back along the approach the pre-grasp is, metres. By default 0.05.
+    /// Distance of the pre-grasp from the grasp, back along the approach, metres. Default: 0.05.
     #[arg(long, value_name = "METRES")]
     pregrasp: Option<f64>,
 
-    /// How far the hand goes with what it holds, metres. By default 0.1.
+    /// Distance of the retreat, metres. Default: 0.1.
     #[arg(long, value_name = "METRES")]
     retreat: Option<f64>,
 
-    /// In which direction of the frame it goes. By default back along the approach.
+    /// Direction of the retreat in the frame of the grasps. Default: back along the approach.
     #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true)]
     retreat_direction: Option<Numbers<3>>,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
 enum Collision {
+    /// No check.
     Off,
-    /// Each grasp says whether.
+    /// Mark grasps that collide.
     Flag,
-    /// They are dropped.
+    /// Drop grasps that collide.
     Filter,
 }
 
 #[derive(Clone, Copy, PartialEq, ValueEnum)]
 enum Origin {
-    /// Between the fingers, where they begin.
+    /// Midpoint between the finger bases.
     FingerBase,
-    /// Between the fingertips.
+    /// Midpoint between the fingertips.
     Tcp,
-    /// At the link that carries the hand.
+    /// The robot link that carries the hand.
     Parent,
 }
 
@@ -115,7 +116,7 @@ enum Closing {
 }
 
 impl DetectArgs {
-    /// As the protocol has it.
+    /// The options as a protocol message.
     pub fn read(&self) -> anyhow::Result<DetectOptions> {
         ensure!(
             self.parent_from_grasp.is_none() || self.origin == Origin::Parent,
@@ -160,7 +161,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_flags_are_the_protocols_numbers() {
+    fn the_values_of_the_flags_equal_the_protocols_enums() {
         use pb::collision_check::Mode;
         use pb::convention::{ClosingAxis, Origin as Wire};
         assert_eq!(

@@ -1,4 +1,4 @@
-//! Grasps in the forms that other programs read.
+//! Export of grasps as CSV, MoveIt and Isaac files.
 
 use std::fmt::Write;
 
@@ -6,7 +6,7 @@ use grasp_client::{Detection, Proposal};
 use nalgebra::Isometry3;
 use serde_json::json;
 
-/// A row for each grasp; metres, quaternions x y z w.
+/// One row per grasp; metres, quaternions x y z w.
 pub(crate) fn csv(detection: &Detection) -> String {
     let mut text =
         "quality,width,x,y,z,qx,qy,qz,qw,pregrasp_x,pregrasp_y,pregrasp_z,collides,retreat_x,retreat_y,retreat_z\n"
@@ -16,7 +16,7 @@ pub(crate) fn csv(detection: &Detection) -> String {
         let ([px, py, pz], _) = parts(pregrasp);
         let ([rx, ry, rz], _) = parts(retreat);
         let collides = collides.map(|collides| collides.to_string()).unwrap_or_default();
-        // Writing to a string does not fail.
+        // Writing to a string cannot fail.
         let _ = writeln!(
             text,
             "{quality},{width},{x},{y},{z},{qx},{qy},{qz},{qw},{px},{py},{pz},{collides},{rx},{ry},{rz}"
@@ -25,13 +25,13 @@ pub(crate) fn csv(detection: &Detection) -> String {
     text
 }
 
-/// A list of `moveit_msgs/Grasp`, but for the gripper's joints, which only the robot's description knows.
+/// A list of `moveit_msgs/Grasp` without the gripper's joint postures, which depend on the robot's description.
 pub(crate) fn moveit(detection: &Detection) -> String {
     let header = json!({ "frame_id": detection.frame_id });
     let motion = |from: &Isometry3<f64>, to: &Isometry3<f64>| {
-        let way = to.translation.vector - from.translation.vector;
-        let distance = way.norm();
-        let [x, y, z] = if distance > 0.0 { (way / distance).into() } else { [0.0, 0.0, 1.0] };
+        let displacement = to.translation.vector - from.translation.vector;
+        let distance = displacement.norm();
+        let [x, y, z] = if distance > 0.0 { (displacement / distance).into() } else { [0.0, 0.0, 1.0] };
         json!({
             "direction": { "header": header, "vector": { "x": x, "y": y, "z": z } },
             "desired_distance": distance,
@@ -49,7 +49,7 @@ pub(crate) fn moveit(detection: &Detection) -> String {
             },
         });
         let _ = writeln!(text, "- id: grasp_{index}");
-        // JSON is YAML, too.
+        // JSON is valid YAML.
         let _ = writeln!(text, "  grasp_pose: {pose_stamped}");
         let _ = writeln!(text, "  grasp_quality: {quality}");
         let _ = writeln!(text, "  pre_grasp_approach: {}", motion(pregrasp, pose));
@@ -60,8 +60,8 @@ pub(crate) fn moveit(detection: &Detection) -> String {
     if text.is_empty() { "[]\n".to_owned() } else { text }
 }
 
-/// NVIDIA's `isaac_grasp`, version 1.0: the gripper is told by how far each finger is from the middle. Before a grasp it is
-/// open to `opening`, metres.
+/// NVIDIA's `isaac_grasp` format, version 1.0. A gripper's state is the distance of each finger from the middle. The
+/// pre-grasp state is an opening of `opening` metres.
 pub(crate) fn isaac(detection: &Detection, opening: f64) -> String {
     let mut text = "format: isaac_grasp\nformat_version: \"1.0\"\n".to_owned();
     let frame = json!(detection.frame_id);

@@ -1,4 +1,4 @@
-//! What every reader of files needs.
+//! Reading of arrays from .npy and .npz files.
 
 use std::fs::File;
 use std::io::{self, BufReader, Cursor, Read};
@@ -8,10 +8,10 @@ use anyhow::{Context, bail};
 use npyz::npz::{NpzArchive, file_name_from_array_name};
 use npyz::{Deserialize, NpyFile, Order, TypeChar};
 
-/// An array of a file, its numbers not read yet.
+/// An array of a file; its values have not been read yet.
 pub(crate) type Array = NpyFile<Box<dyn Read>>;
 
-/// Says which file it was, if it is not what it must be.
+/// Adds the path to the error of `read`.
 pub(crate) fn in_file<T>(path: &Path, read: impl FnOnce(&Path) -> anyhow::Result<T>) -> anyhow::Result<T> {
     read(path).with_context(|| path.display().to_string())
 }
@@ -20,7 +20,7 @@ pub(crate) fn has_extension(path: &Path, wanted: &str) -> bool {
     path.extension().is_some_and(|extension| extension == wanted)
 }
 
-/// The array of a .npy file; of a .npz file the only one, or the one of this name.
+/// The array of a .npy file; for a .npz file its only array, or the array of this name.
 pub(crate) fn array(path: &Path, name: &str) -> anyhow::Result<Array> {
     let file = BufReader::new(File::open(path)?);
     if !has_extension(path, "npz") {
@@ -33,41 +33,41 @@ pub(crate) fn array(path: &Path, name: &str) -> anyhow::Result<Array> {
         _ => names
             .iter()
             .find(|other| *other == name)
-            .with_context(|| format!("holds {}; one array, or one called `{name}`, is needed", names.join(", ")))?,
+            .with_context(|| format!("no array `{name}`; arrays in the file: {}", names.join(", ")))?,
     };
     let mut bytes = Vec::new();
     archive.zip_archive().by_name(&file_name_from_array_name(name))?.read_to_end(&mut bytes)?;
     Ok(NpyFile::new(Box::new(Cursor::new(bytes)) as Box<dyn Read>)?)
 }
 
-/// The kind of its numbers and their bytes, where they are of a kind that is `needed`.
-pub(crate) fn kind(array: &Array, needed: &str, taken: &[(TypeChar, u64)]) -> anyhow::Result<(TypeChar, u64)> {
+/// Type and size in bytes of the values. An error names the `needed` types if they are not among `supported`.
+pub(crate) fn kind(array: &Array, needed: &str, supported: &[(TypeChar, u64)]) -> anyhow::Result<(TypeChar, u64)> {
     let dtype = array.dtype();
-    let npyz::DType::Plain(plain) = &dtype else { bail!("its dtype is {dtype:?}, {needed} is needed") };
+    let npyz::DType::Plain(plain) = &dtype else { bail!("dtype {dtype:?} is not supported; use {needed}") };
     let kind = (plain.type_char(), plain.size_field());
-    if taken.contains(&kind) { Ok(kind) } else { bail!("its dtype is {plain}, {needed} is needed") }
+    if supported.contains(&kind) { Ok(kind) } else { bail!("dtype {plain} is not supported; use {needed}") }
 }
 
-/// Its numbers, the last axis fastest, whatever the file's order is.
+/// The values in row-major order, also of files in Fortran order.
 pub(crate) fn values<T: Deserialize + Copy>(array: Array) -> io::Result<Vec<T>> {
     let (shape, order) = (array.shape().to_vec(), array.order());
     let values: Vec<T> = array.into_vec()?;
     if order == Order::C {
         return Ok(values);
     }
-    let place = |mut index: usize| {
-        let (mut place, mut stride) = (0, values.len());
+    let value_at = |mut index: usize| {
+        let (mut source, mut stride) = (0, values.len());
         for edge in shape.iter().rev().map(|&edge| edge as usize) {
             stride /= edge;
-            place += index % edge * stride;
+            source += index % edge * stride;
             index /= edge;
         }
-        values[place]
+        values[source]
     };
-    Ok((0..values.len()).map(place).collect())
+    Ok((0..values.len()).map(value_at).collect())
 }
 
-/// The same of floating numbers of either precision.
+/// The values of an f32 or f64 array in row-major order.
 pub(crate) fn floats(array: Array) -> anyhow::Result<Vec<f64>> {
     Ok(match kind(&array, "f64 or f32", &[(TypeChar::Float, 8), (TypeChar::Float, 4)])? {
         (_, 8) => values(array)?,

@@ -1,4 +1,4 @@
-//! The command line of graspd.
+//! Command line client of graspd.
 
 mod cloud;
 mod detect_args;
@@ -34,11 +34,11 @@ use crate::detect_args::DetectArgs;
 use crate::scene::SceneArgs;
 use crate::view::ViewArgs;
 
-/// Asks a graspd for grasps.
+/// Detects grasps with a graspd server.
 #[derive(Parser)]
 #[command(name = "grasp", version, max_term_width = 100)]
 struct Cli {
-    /// Where the server is.
+    /// Address of the server.
     #[arg(long, global = true, env = "GRASPD_SERVER", value_name = "ADDR", default_value = "127.0.0.1:50051")]
     server: String,
 
@@ -55,36 +55,36 @@ struct Cli {
 
 #[derive(Args)]
 struct AccessArgs {
-    /// CA that signed the server's certificate, PEM. By default those that this machine trusts, with https:// addresses.
+    /// CA that signed the server's certificate, PEM. Default for https:// addresses: the system's CAs.
     #[arg(long, global = true, help_heading = "Connection", env = "GRASPD_TLS_CA", value_name = "FILE")]
     tls_ca: Option<PathBuf>,
 
-    /// Certificate to show to a server that wants one, PEM.
+    /// Client certificate for servers that require one, PEM.
     #[arg(long, global = true, help_heading = "Connection", value_name = "FILE", requires = "tls_key")]
     tls_cert: Option<PathBuf>,
 
-    /// Its private key, PEM.
+    /// Private key of the client certificate, PEM.
     #[arg(long, global = true, help_heading = "Connection", value_name = "FILE", requires = "tls_cert")]
     tls_key: Option<PathBuf>,
 
-    /// File that holds the token that the server wants.
+    /// File with the bearer token, for servers that require one.
     #[arg(long, global = true, help_heading = "Connection", env = "GRASPD_TOKEN_FILE", value_name = "FILE")]
     token_file: Option<PathBuf>,
 }
 
 #[derive(Subcommand)]
 enum Command {
-    /// Finds the grasps in a volume, depth images or point clouds.
+    /// Detect grasps in a volume, depth images or point clouds.
     Detect(Detect),
-    /// Finds them again whenever one of the files changes, until it is stopped.
+    /// Detect grasps again whenever an input file changes.
     Watch(Watch),
-    /// Draws them, or records them for Foxglove and Rerun.
+    /// Draw the grasps, or record them for Foxglove and Rerun.
     View(View),
-    /// Asks for the grasps many times, and says how long that took.
+    /// Measure latency and throughput of the server with repeated requests.
     Bench(Bench),
-    /// Lists what can be asked for by name.
+    /// List the models of the server.
     Models,
-    /// Says whether the server is ready; the exit status is 1 when it is not.
+    /// Print whether the server is ready; exit status 1 if it is not.
     Health,
 }
 
@@ -96,15 +96,15 @@ struct Detect {
     #[command(flatten)]
     detect: DetectArgs,
 
-    /// Also write them as a table with commas.
+    /// Also write the grasps as CSV.
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
 
-    /// Also write them as a list of moveit_msgs/Grasp, YAML.
+    /// Also write the grasps as a list of moveit_msgs/Grasp, YAML.
     #[arg(long, value_name = "FILE")]
     moveit: Option<PathBuf>,
 
-    /// Also write them as isaac_grasp, YAML.
+    /// Also write the grasps as isaac_grasp, YAML.
     #[arg(long, value_name = "FILE")]
     isaac: Option<PathBuf>,
 }
@@ -117,11 +117,11 @@ struct Watch {
     #[command(flatten)]
     detect: DetectArgs,
 
-    /// How often it is looked whether a file has changed, seconds.
+    /// Interval at which the files are checked for changes, seconds.
     #[arg(long, value_name = "SECONDS", default_value_t = 0.1, value_parser = positive)]
     every: f64,
 
-    /// How many answers are enough. By default none are.
+    /// Exit after this many detections. Default: no limit.
     #[arg(long, value_name = "N")]
     count: Option<u64>,
 }
@@ -146,22 +146,22 @@ struct Bench {
     #[command(flatten)]
     detect: DetectArgs,
 
-    /// How many ask at the same time, each again as soon as there is an answer.
+    /// Closed loop: number of callers, each with one request in flight.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..), conflicts_with = "rate")]
     callers: u16,
 
-    /// Requests a second, at moments left to chance, however long the answers take.
+    /// Open loop: Poisson arrivals at this rate, requests per second, independent of the response times.
     #[arg(long, value_name = "PER_SECOND", value_parser = positive)]
     rate: Option<f64>,
 
-    /// For how long, seconds.
+    /// Duration, seconds.
     #[arg(long, default_value_t = 10.0, value_parser = positive)]
     seconds: f64,
 }
 
 fn positive(text: &str) -> Result<f64, String> {
     let number = text.parse().ok().filter(|number: &f64| *number > 0.0 && *number <= 1e6);
-    number.ok_or_else(|| "must be a number above 0 and at most a million".to_owned())
+    number.ok_or_else(|| "must be a number greater than 0 and at most 1000000".to_owned())
 }
 
 impl AccessArgs {
@@ -175,7 +175,10 @@ impl AccessArgs {
         Ok(Access {
             ca: file(&self.tls_ca)?.map(Certificate::from_pem),
             identity: file(&self.tls_cert)?.zip(file(&self.tls_key)?).map(|(cert, key)| Identity::from_pem(cert, key)),
-            token: file(&self.token_file)?.map(token).transpose().map_err(|fault| anyhow!("--token-file: {fault}"))?,
+            token: file(&self.token_file)?
+                .map(token)
+                .transpose()
+                .map_err(|reason| anyhow!("--token-file: {reason}"))?,
             retry: Retry::RECOMMENDED,
         })
     }
@@ -203,7 +206,7 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
     };
     match command {
         Command::Detect(Detect { scene: args, detect, csv, moveit, isaac }) => {
-            // The files first: a mistake in them needs no server to be found.
+            // Files are read first, so that an invalid file is reported without a server.
             let (scene, detect) = (args.read()?, detect.read()?);
             let opening = detect.gripper.as_ref().map_or(grasp::MAX_OPENING, |gripper| gripper.max_opening);
             let detection = scene.detect(&connect().await?, options(&args, detect)).await?;
@@ -222,7 +225,7 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             let stamps = || args.files().map(|path| fs::metadata(path)?.modified()).collect::<io::Result<Vec<_>>>();
             let (mut seen, mut answers) = (None, 0);
             while count.is_none_or(|count| answers < count) {
-                // A file that is not there, or not whole yet, will be.
+                // A missing file is not an error: it may be written later.
                 let now = stamps().ok();
                 if now.is_some() && now != seen {
                     let answer = async {
@@ -236,7 +239,7 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
                             }
                             answers += 1;
                         }
-                        // The next view may be a better one, and the server there again.
+                        // The error may be gone at the next change: an incomplete file, or a server that restarts.
                         Err(error) => eprintln!("grasp: {error:#}; waiting for a file to change"),
                     }
                     seen = now;
@@ -245,7 +248,7 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             }
         }
         Command::View(View { scene: args, detect, view }) => {
-            // Hands are drawn by their finger base, whatever frame of them is asked for.
+            // The drawing needs the finger base frame, so that --origin and --closing do not apply.
             let (scene, detect) = (args.read()?, DetectOptions { convention: None, ..detect.read()? });
             let table = detect.collision.and_then(|collision| collision.table_height);
             let depth = detect.gripper.as_ref().map(|gripper| gripper.finger_depth);
@@ -256,10 +259,10 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
         Command::Bench(Bench { scene: args, detect, callers, rate, seconds }) => {
             let scene = Arc::new(args.read()?);
             let options = options(&args, detect.read()?);
-            // What is refused is to be seen, not to be tried again.
+            // No retries: refusals are part of the result.
             let access = Access { retry: Retry::NONE, ..access.read()? };
             let client = Client::connect_with(server, access).await?;
-            // A mistake in the request is told at once, as the error that it is.
+            // An invalid request ends the benchmark with its error before the load starts.
             scene.detect(&client, options.clone()).await?;
             let arrivals = rate.map_or(Arrivals::Callers(callers.into()), Arrivals::Rate);
             let until = Until::Elapsed(Duration::from_secs_f64(seconds));
@@ -288,9 +291,9 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
     Ok(ExitCode::SUCCESS)
 }
 
-/// Shows on a terminal how much of the time is over.
-async fn with_progress<T>(seconds: f64, shown: bool, work: impl Future<Output = T>) -> T {
-    if !shown || !io::stderr().is_terminal() {
+/// Shows a progress bar during `work`, if `enabled` and stderr is a terminal.
+async fn with_progress<T>(seconds: f64, enabled: bool, work: impl Future<Output = T>) -> T {
+    if !enabled || !io::stderr().is_terminal() {
         return work.await;
     }
     let started = Instant::now();

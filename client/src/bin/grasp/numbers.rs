@@ -1,6 +1,6 @@
 use std::str::FromStr;
 
-/// Numbers with commas between them.
+/// N comma-separated numbers.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Numbers<const N: usize>(pub [f64; N]);
 
@@ -10,7 +10,7 @@ impl<const N: usize> FromStr for Numbers<N> {
     fn from_str(text: &str) -> Result<Self, String> {
         let numbers: Result<Vec<f64>, _> = text.split(',').map(|number| number.trim().parse()).collect();
         let numbers = numbers.ok().and_then(|numbers| numbers.try_into().ok());
-        numbers.map(Self).ok_or_else(|| format!("{N} numbers with commas between them are needed"))
+        numbers.map(Self).ok_or_else(|| format!("must be {N} numbers separated by commas"))
     }
 }
 
@@ -19,7 +19,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn as_many_as_are_needed() {
+    fn the_count_of_numbers_is_checked() {
         assert_eq!("1, -2,3e-3".parse::<Numbers<3>>().unwrap().0, [1.0, -2.0, 0.003]);
         assert!("1,2".parse::<Numbers<3>>().is_err() && "1,2,x".parse::<Numbers<3>>().is_err());
     }

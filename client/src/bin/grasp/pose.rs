@@ -1,4 +1,4 @@
-//! Poses and intrinsic matrices, of .npy and JSON files.
+//! Poses and intrinsic matrices from .npy and JSON files.
 
 use std::fs::File;
 use std::io::BufReader;
@@ -14,18 +14,23 @@ use crate::files::{self, has_extension, in_file};
 pub(crate) fn one(path: &Path) -> anyhow::Result<Isometry3<f64>> {
     match in_file(path, poses)?[..] {
         [pose] => Ok(pose),
-        ref poses => bail!("{}: holds {} poses, one is needed", path.display(), poses.len()),
+        ref poses => bail!("{}: {} poses in the file, exactly one is needed", path.display(), poses.len()),
     }
 }
 
-/// The poses of so many images or point clouds.
-pub(crate) fn each(path: &Path, count: usize, things: &str) -> anyhow::Result<Vec<Isometry3<f64>>> {
+/// One pose for each of `count` inputs; `inputs` names them in the error.
+pub(crate) fn each(path: &Path, count: usize, inputs: &str) -> anyhow::Result<Vec<Isometry3<f64>>> {
     let poses = in_file(path, poses)?;
-    ensure!(poses.len() == count, "{}: holds {} poses for {count} {things}", path.display(), poses.len());
+    ensure!(
+        poses.len() == count,
+        "{}: {} poses in the file for {count} {inputs}; give one pose for each",
+        path.display(),
+        poses.len()
+    );
     Ok(poses)
 }
 
-/// The nine numbers of an intrinsic matrix, row by row.
+/// The nine numbers of an intrinsic matrix in row-major order.
 pub(crate) fn intrinsics(path: &Path) -> anyhow::Result<[f64; 9]> {
     in_file(path, matrix_k)
 }
@@ -39,7 +44,7 @@ fn json(path: &Path) -> anyhow::Result<Value> {
     Ok(serde_json::from_reader(BufReader::new(File::open(path)?))?)
 }
 
-/// Every number in it, in their order.
+/// All numbers of nested arrays, in order.
 fn flat(value: &Value) -> Vec<f64> {
     match value {
         Value::Number(number) => number.as_f64().into_iter().collect(),
@@ -57,10 +62,12 @@ fn matrix_k(path: &Path) -> anyhow::Result<[f64; 9]> {
         flat(k)
     };
     let count = numbers.len();
-    numbers.try_into().ok().with_context(|| format!("holds {count} numbers, nine are needed, row by row"))
+    numbers
+        .try_into()
+        .ok()
+        .with_context(|| format!("{count} numbers in the file; an intrinsic matrix has nine, in row-major order"))
 }
 
-/// One or more poses.
 fn poses(path: &Path) -> anyhow::Result<Vec<Isometry3<f64>>> {
     if has_extension(path, "npy") {
         return matrices(&numbers(path)?);
@@ -76,17 +83,17 @@ fn named(value: &Value) -> anyhow::Result<Isometry3<f64>> {
     let part = |key: &str| value.get(key).map(flat).unwrap_or_default();
     let (position, orientation) = (part("position"), part("orientation"));
     let (&[x, y, z], &[qx, qy, qz, qw]) = (&position[..], &orientation[..]) else {
-        bail!("a pose needs `position` with three numbers and `orientation` with four: x, y, z, w")
+        bail!("a pose must have `position` (x, y, z) and `orientation` (quaternion x, y, z, w)")
     };
     let rotation = UnitQuaternion::try_new(Quaternion::new(qw, qx, qy, qz), 1e-6);
-    let rotation = rotation.context("an orientation is a quaternion of unit length")?;
+    let rotation = rotation.context("the norm of `orientation` is 0; it must be a unit quaternion")?;
     Ok(Isometry3::from_parts(Translation3::new(x, y, z), rotation))
 }
 
 fn matrices(numbers: &[f64]) -> anyhow::Result<Vec<Isometry3<f64>>> {
     ensure!(
         !numbers.is_empty() && numbers.len().is_multiple_of(16),
-        "holds {} numbers, 4×4 for each pose are needed",
+        "{} numbers in the file; each pose is a 4×4 matrix",
         numbers.len()
     );
     let pose = |numbers: &[f64]| {
@@ -95,7 +102,7 @@ fn matrices(numbers: &[f64]) -> anyhow::Result<Vec<Isometry3<f64>>> {
         let orthonormal = (rotation * rotation.transpose() - Matrix3::identity()).norm() < 1e-3;
         ensure!(
             orthonormal && rotation.determinant() > 0.0 && numbers[12..] == [0.0, 0.0, 0.0, 1.0],
-            "a matrix is no pose: its upper left must be a rotation, its last row 0 0 0 1"
+            "invalid pose matrix: the upper left 3×3 block must be a rotation, the last row 0 0 0 1"
         );
         let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&rotation));
         Ok(Isometry3::from_parts(Translation3::new(numbers[3], numbers[7], numbers[11]), rotation))

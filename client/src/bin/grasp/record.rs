@@ -1,4 +1,4 @@
-//! A recording that Foxglove and Rerun open: MCAP, messages of Foxglove's own types in protobuf, which Rerun needs.
+//! MCAP recording for Foxglove and Rerun. The messages are Foxglove's protobuf types, which Rerun requires.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -21,10 +21,11 @@ use mcap::Writer;
 use mcap::records::MessageHeader;
 use nalgebra::Point3 as Point;
 
-/// How many points stand for a stroke of a hand.
+/// Segments of a line of a hand that is drawn as points.
 const DOTS: u32 = 32;
 
-/// Writes what was seen and the grasps in it, in the frame of the grasps. The fingers are `depth` metres long.
+/// Writes the observed surface and the grasps, in the frame of the grasps. `depth` is the length of the fingers,
+/// metres.
 pub(crate) fn write(path: &Path, surface: &[SurfacePoint], depth: f64, detection: &Detection) -> anyhow::Result<()> {
     let file = File::create(path).with_context(|| path.display().to_string())?;
     let mut writer = Writer::new(BufWriter::new(file))?;
@@ -33,7 +34,7 @@ pub(crate) fn write(path: &Path, surface: &[SurfacePoint], depth: f64, detection
     let surface: Vec<_> = surface.iter().map(|point| (point.position, [90, 160, 200])).collect();
     add(&mut writer, "/surface", timestamp, &cloud(&surface, frame, timestamp))?;
     add(&mut writer, "/grasps", timestamp, &scene(&detection.grasps, depth, frame, timestamp))?;
-    // Once more as points: Rerun draws no scenes.
+    // The hands again as points: Rerun does not draw `SceneUpdate` messages.
     let dots: Vec<_> = detection.grasps.iter().flat_map(|grasp| dots(grasp, depth)).collect();
     add(&mut writer, "/hands", timestamp, &cloud(&dots, frame, timestamp))?;
     writer.finish()?;
@@ -105,7 +106,7 @@ fn scene(grasps: &[Proposal], depth: f64, frame: &str, timestamp: Timestamp) -> 
     SceneUpdate { deletions: vec![], entities: grasps.iter().enumerate().map(entity).collect() }
 }
 
-/// The strokes of a hand as points.
+/// The lines of a hand as points.
 fn dots(grasp: &Proposal, depth: f64) -> Vec<(Point<f64>, [u8; 3])> {
     let (hand, color) = (hand(grasp.width, depth), quality_color(f64::from(grasp.quality)));
     let along =
@@ -117,7 +118,7 @@ fn pose([x, y, z]: [f64; 3], [qx, qy, qz, qw]: [f64; 4]) -> Pose {
     Pose { position: Some(Vector3 { x, y, z }), orientation: Some(Quaternion { x: qx, y: qy, z: qz, w: qw }) }
 }
 
-/// Two fingers, the bar between them, and the wrist: pairs of points of the grasp frame.
+/// The lines of a hand in the grasp frame, as pairs of points: two fingers, the bar between them, and the wrist.
 fn hand(width: f64, depth: f64) -> [Point<f64>; 8] {
     let (y, tip) = (width / 2.0, depth);
     [[-y, 0.0, -y, tip], [y, 0.0, y, tip], [-y, 0.0, y, 0.0], [0.0, 0.0, 0.0, -0.04]]

@@ -9,53 +9,53 @@ use nalgebra::{Isometry3, Point3};
 use crate::numbers::Numbers;
 use crate::{cloud, image, pose, volume};
 
-/// What is looked at: a volume, depth images with their cameras, or point clouds with the positions of theirs.
+/// The observation: a volume, depth images with camera poses, or point clouds with camera positions.
 #[derive(Args, Clone)]
 pub(crate) struct SceneArgs {
-    /// A volume: a .npy file, or a .npz file with one array or one called `grid`, N×N×N values in [0, 1] (u8: 0 to 255),
-    /// indexed x, y, z, 0.5 on the surface and 0 where nothing was observed. Or, with --intrinsics, depth images: PNG with
-    /// 16 bits or .npy with u16, both in millimetres, or .npy with f32, in metres; 0 and NaN are no reading. Or, with
-    /// --camera-position, point clouds: .npy, or .npz with one array or one called `points`, N×3 or H×W×3 numbers, metres.
+    /// Volume, depth images or point clouds. A volume is a .npy file, or a .npz file with one array or an array `grid`:
+    /// N×N×N values in [0, 1] (u8: 0 to 255), indexed x, y, z, 0.5 on the surface, 0 if unobserved. With --intrinsics
+    /// the files are depth images: 16-bit PNG or u16 .npy in millimetres, or f32 .npy in metres; 0 and NaN mean no
+    /// reading. With --camera-position they are point clouds: .npy, or .npz with one array or an array `points`, N×3 or
+    /// H×W×3, metres.
     #[arg(required = true)]
     files: Vec<PathBuf>,
 
-    /// Edge of a voxel of the volume, metres. By default that of a cube of 0.3 m.
+    /// Edge of a voxel of the volume, metres. Default: 0.3 m / N.
     #[arg(long, value_name = "METRES", conflicts_with_all = ["intrinsics", "camera_position"])]
     voxel_size: Option<f64>,
 
-    /// The cameras' intrinsic matrix: .npy with 3×3 numbers, or JSON with the nine numbers of `k`, as ROS's CameraInfo has
-    /// them.
+    /// Intrinsic matrix of the cameras: 3×3 .npy, or JSON with the nine numbers `k` of ROS's CameraInfo.
     #[arg(long, value_name = "FILE", conflicts_with = "camera_position")]
     intrinsics: Option<PathBuf>,
 
-    /// T_camera_task of each image: .npy with 4×4 or N×4×4 numbers, or JSON with such matrices, or with poses as
+    /// T_camera_task of each image: 4×4 or N×4×4 .npy, JSON with such matrices, or JSON with poses
     /// {"position": [x, y, z], "orientation": [x, y, z, w]}.
     #[arg(long, value_name = "FILE", requires = "intrinsics", conflicts_with = "frame_from_camera")]
     camera_from_task: Option<PathBuf>,
 
-    /// T_frame_camera of each image instead, as hand-eye calibration gives it.
+    /// T_frame_camera of each image, as hand-eye calibration returns it, instead of T_camera_task. Same formats.
     #[arg(long, value_name = "FILE", requires = "intrinsics")]
     frame_from_camera: Option<PathBuf>,
 
-    /// Where the camera of a point cloud stood, in the frame of the points, metres: 0,0,0 where that is the camera's own.
-    /// Once for all of them, or once for each.
+    /// Camera position of a point cloud in the frame of its points, metres: 0,0,0 for points in the camera frame. Give
+    /// it once for all point clouds, or once for each.
     #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true)]
     camera_position: Vec<Numbers<3>>,
 
-    /// T_frame_cloud of each point cloud, in such a file. By default its points are in the frame.
+    /// T_frame_cloud of each point cloud, formats as for --camera-from-task. Default: identity.
     #[arg(long, value_name = "FILE", requires = "camera_position")]
     frame_from_cloud: Option<PathBuf>,
 
-    /// T_frame_task: where the workspace's corner is, one pose in such a file. By default the frame's origin.
+    /// T_frame_task: pose of the workspace's corner, formats as for --camera-from-task. Default: identity.
     #[arg(long, value_name = "FILE")]
     workspace: Option<PathBuf>,
 
-    /// The frame in which the grasps will be; only a name.
+    /// Name of the frame of the grasps.
     #[arg(long, default_value = "", hide_default_value = true)]
     frame_id: String,
 }
 
-/// What was read.
+/// The observation as read from its files.
 #[derive(Clone)]
 pub(crate) enum Scene {
     Volume(Box<Volume>),
@@ -64,7 +64,7 @@ pub(crate) enum Scene {
 }
 
 impl SceneArgs {
-    /// All that is read.
+    /// All input files.
     pub fn files(&self) -> impl Iterator<Item = &PathBuf> {
         let Self { files, intrinsics, camera_from_task, frame_from_camera, frame_from_cloud, workspace, .. } = self;
         files
@@ -91,8 +91,9 @@ impl SceneArgs {
         }
         let [file] = &self.files[..] else {
             bail!(
-                "several files need --intrinsics or --camera-position: they are depth images or point clouds, a volume \
-                 is one file"
+                "{} files given, but a volume is one file; add --intrinsics for depth images or --camera-position for \
+                 point clouds",
+                self.files.len()
             )
         };
         Ok(Scene::Volume(Box::new(volume::read(file, self.voxel_size, pose)?)))
@@ -120,7 +121,7 @@ impl SceneArgs {
             [of_all] => vec![*of_all; count],
             of_each if of_each.len() == count => of_each.to_vec(),
             other => bail!(
-                "--camera-position is given {} times for {count} point clouds: give it once for all, or once for each",
+                "--camera-position is given {} times for {count} point clouds; give it once for all or once for each",
                 other.len()
             ),
         };
@@ -136,7 +137,7 @@ impl SceneArgs {
 }
 
 impl Scene {
-    /// Asks for the grasps in it.
+    /// Detects grasps in the observation.
     pub async fn detect(&self, client: &Client, options: Options) -> Result<Detection, Error> {
         match self {
             Self::Volume(volume) => client.detect(volume, options).await,
@@ -145,13 +146,15 @@ impl Scene {
         }
     }
 
-    /// The volume that it is, or that its images or points make, to look at.
+    /// The volume to draw: the given one, or the fused images or points.
     pub fn volume(&self) -> anyhow::Result<Volume> {
         let (views, workspace) = match self {
             Self::Volume(volume) => return Ok((**volume).clone()),
-            Self::Depth(views, workspace) => (views.iter().map(|view| seen(view, workspace)).collect(), workspace),
+            Self::Depth(views, workspace) => {
+                (views.iter().map(|view| depth_view(view, workspace)).collect(), workspace)
+            }
             Self::Clouds(views, workspace) => {
-                let views = views.iter().map(|view| rendered(view, workspace));
+                let views = views.iter().map(|view| rendered_view(view, workspace));
                 (views.collect::<anyhow::Result<Vec<_>>>()?, workspace)
             }
         };
@@ -163,7 +166,7 @@ impl Scene {
     }
 }
 
-fn seen(view: &DepthView, workspace: &Workspace) -> View {
+fn depth_view(view: &DepthView, workspace: &Workspace) -> View {
     let depth = match &view.depth {
         Depth::Metres(depth) => depth.clone(),
         Depth::Millimetres(depth) => depth.iter().map(|&depth| f32::from(depth) * 1e-3).collect(),
@@ -177,11 +180,11 @@ fn seen(view: &DepthView, workspace: &Workspace) -> View {
     View { intrinsics: Intrinsics { width, height, fx, fy, cx, cy }, depth, camera_from_task }
 }
 
-/// As the server does it.
-fn rendered(view: &CloudView, workspace: &Workspace) -> anyhow::Result<View> {
+/// Renders a cloud to a depth image, as the server does.
+fn rendered_view(view: &CloudView, workspace: &Workspace) -> anyhow::Result<View> {
     let task_from_cloud = workspace.pose.inverse() * view.frame_from_cloud;
     let points: Vec<_> = view.points.iter().map(|&point| task_from_cloud * Point3::from(point).cast::<f64>()).collect();
     let eye = task_from_cloud * Point3::from(view.camera_position);
     seen_from(&points, &eye, WORKSPACE_SIZE)
-        .context("no point of a cloud is in sight of its camera; check --camera-position and the poses")
+        .context("a camera sees no point of its cloud; check --camera-position and the poses")
 }

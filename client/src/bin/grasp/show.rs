@@ -8,7 +8,7 @@ use nalgebra::Isometry3;
 use serde_json::{Value, json};
 use tonic::Code;
 
-/// Prints a text and ends its line. False where nobody reads it any more, as after `| head`: that is no mistake.
+/// Prints a line. Returns false if stdout is a closed pipe, as after `| head`, which is not an error.
 pub(crate) fn print(text: &str) -> anyhow::Result<bool> {
     match writeln!(io::stdout().lock(), "{text}") {
         Ok(()) => Ok(true),
@@ -73,7 +73,7 @@ fn pose(pose: &Isometry3<f64>) -> Value {
 
 const QUANTILES: [(&str, f64); 4] = [("p50", 0.5), ("p90", 0.9), ("p99", 0.99), ("max", 1.0)];
 
-/// What became of calls, how many, and how long they took.
+/// Name and sorted latencies of each outcome of the calls.
 fn outcomes(report: &Report) -> impl Iterator<Item = (String, &Vec<Duration>)> {
     let refused = report.refused.iter().map(|(&code, times)| (format!("{:?}", Code::from_i32(code)), times));
     std::iter::once(("answered".to_owned(), &report.answered)).chain(refused)
@@ -86,7 +86,7 @@ pub(crate) fn report(report: &Report) -> String {
             QUANTILES.map(|(_, share)| format!("{:.2}", Report::quantile(times, share).as_secs_f64() * 1e3));
         table.add_row(right([outcome, times.len().to_string()].into_iter().chain(quantiles)));
     }
-    format!("{table}\n{:.1} answers a second, for {:.1} s", report.throughput(), report.elapsed.as_secs_f64())
+    format!("{table}\n{:.1} answers/s over {:.1} s", report.throughput(), report.elapsed.as_secs_f64())
 }
 
 pub(crate) fn report_json(report: &Report) -> String {
@@ -177,12 +177,11 @@ fn stages(latency: &Latency) -> [(&'static str, f64); 6] {
     ]
 }
 
-fn reasons(dropped: &Dropped) -> [(&'static str, u32); 10] {
+fn reasons(dropped: &Dropped) -> [(&'static str, u32); 9] {
     [
         ("below_threshold", dropped.below_threshold),
         ("mask", dropped.mask),
         ("width", dropped.width),
-        ("border", dropped.border),
         ("region", dropped.region),
         ("approach", dropped.approach),
         ("height", dropped.height),
@@ -207,7 +206,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_models_fit_a_terminal_and_say_where_the_camera_stood() {
+    fn the_table_of_models_fits_a_terminal_and_shows_the_camera_azimuth() {
         let model = Model {
             name: "vgn-packed".to_owned(),
             version: "2.0.1".to_owned(),

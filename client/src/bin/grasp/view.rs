@@ -10,32 +10,32 @@ use nalgebra::{Isometry3, Point3, Translation3};
 
 use crate::record;
 
-/// Pixels of a picture.
+/// Width and height of the picture, pixels.
 const SIZE: [usize; 2] = [1200, 900];
 
-/// Grasps in a picture, the best: more hide each other.
+/// Number of grasps that are drawn, best first. More would hide each other.
 const SHOWN: usize = 40;
 
-/// Edges of the cube.
+/// Edges of the workspace.
 const EDGE: Color = [170, 170, 170];
 
-/// The height at which the table is taken to be.
+/// Outline of the table's height.
 const TABLE: Color = [205, 150, 70];
 
-/// x, y and z.
+/// The x, y and z axes.
 const AXES: [Color; 3] = [[214, 48, 49], [38, 166, 91], [41, 98, 255]];
 
-/// Where what was seen goes.
+/// Output of `grasp view`.
 #[derive(Args)]
 pub(crate) struct ViewArgs {
-    /// A picture (.png), or a recording that Foxglove and Rerun open (.mcap).
+    /// Output file: a picture (.png), or a recording for Foxglove and Rerun (.mcap).
     #[arg(long, value_name = "FILE", default_value = "grasps.png")]
     out: PathBuf,
 }
 
 impl ViewArgs {
-    /// Draws or records the observed surface and the grasps, as far as they are not the usual ones: `table` is its height
-    /// above the volume's bottom, `depth` the length of the hand's fingers, metres.
+    /// Draws or records the observed surface and the grasps. `table` is the height of the table above the volume's
+    /// bottom and `depth` the length of the fingers, metres; `None` means the default.
     pub fn write(
         &self,
         volume: &Volume,
@@ -48,19 +48,19 @@ impl ViewArgs {
         match self.out.extension().and_then(|extension| extension.to_str()) {
             Some("png") => draw(volume, field.mesh(), table, depth, detection).save(&self.out)?,
             Some("mcap") => record::write(&self.out, &placed(&field.surface(), volume.pose()), depth, detection)?,
-            _ => bail!("{}: .png or .mcap is needed", self.out.display()),
+            _ => bail!("--out {}: the extension must be .png or .mcap", self.out.display()),
         }
         Ok(&self.out)
     }
 }
 
-/// In the frame of the volume's pose.
+/// The surface points in the frame of `pose`.
 fn placed(surface: &[SurfacePoint], pose: &Isometry3<f64>) -> Vec<SurfacePoint> {
     let point = |point: &SurfacePoint| SurfacePoint { position: pose * point.position, normal: pose * point.normal };
     surface.iter().map(point).collect()
 }
 
-/// In the volume's own frame, from a corner above it, from which all of the cube is seen.
+/// Draws in the task frame. The camera is above a corner and sees the whole workspace.
 fn draw(volume: &Volume, mesh: SurfaceMesh, table: f64, depth: f64, detection: &Detection) -> Picture {
     let size = volume.voxel_size() * volume.resolution() as f64;
     let [width, height] = SIZE;
@@ -76,11 +76,11 @@ fn draw(volume: &Volume, mesh: SurfaceMesh, table: f64, depth: f64, detection: &
     picture
 }
 
-/// The cube, the table's height on its sides, and the axes at its corner.
+/// The edges of the workspace, the height of the table on its sides, and the axes of the task frame.
 fn frame(picture: &mut Picture, size: f64, table: f64) {
     let thickness = size / 300.0;
     let corner = |index: usize| Point3::from([0, 1, 2].map(|axis| if index >> axis & 1 == 1 { size } else { 0.0 }));
-    // From each corner along the axes on whose lower side it lies.
+    // From each corner along the axes for which it is on the lower side.
     let edges = (0..8).flat_map(|from| [1, 2, 4].map(|axis| (from, from | axis))).filter(|(from, to)| from != to);
     let edges: Vec<Mesh> = edges.map(|(from, to)| bar(corner(from), corner(to), thickness)).collect();
     picture.mesh(&Mesh::union(&edges), &Isometry3::identity(), 1.0, EDGE);
@@ -96,7 +96,7 @@ fn frame(picture: &mut Picture, size: f64, table: f64) {
     }
 }
 
-/// From one point to another, along an axis.
+/// An axis-aligned bar between two points.
 fn bar(from: Point3<f64>, to: Point3<f64>, thickness: f64) -> Mesh {
     let middle = Translation3::from(nalgebra::center(&from, &to));
     Mesh::cuboid((to - from).abs().add_scalar(thickness)).transformed(&middle.into())

@@ -7,7 +7,8 @@ use nalgebra::{Point3, UnitQuaternion, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// A box somewhere in a volume of n³ voxels, grasped from above at its middle and, in vain, at its corner.
+/// A random box in a volume of n³ voxels, with a successful grasp from above at its middle and a failed one at its
+/// corner.
 pub fn scene(seed: u64, n: usize) -> Scene {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let low: [usize; 3] = std::array::from_fn(|_| rng.random_range(2..n / 2));
@@ -31,13 +32,13 @@ pub fn scene(seed: u64, n: usize) -> Scene {
 }
 
 /// A data set of such scenes.
-// Every test file compiles this module for itself; not all of them call this.
+// Each test file compiles this module, and not all of them use this.
 #[allow(dead_code)]
 pub fn dataset(scenes: u64, n: usize) -> Dataset {
     Dataset::of((0..scenes).map(|seed| scene(seed, n)).collect()).unwrap()
 }
 
-/// Where they come from.
+/// Their provenance.
 // As above.
 #[allow(dead_code)]
 pub fn provenance() -> Provenance {
@@ -54,7 +55,7 @@ pub fn provenance() -> Provenance {
     }
 }
 
-/// Writes scenes as VGN and GIGA do.
+/// Writes scenes in the format of VGN and GIGA.
 // As above.
 #[allow(dead_code)]
 pub fn write(folder: &Path, scenes: &[Scene]) {

@@ -79,12 +79,12 @@ pub(super) fn hash(path: &Path) -> anyhow::Result<String> {
     Ok(Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect())
 }
 
-/// Of a folder's files, by their names.
-pub(super) fn hash_folder(folder: &Path) -> anyhow::Result<String> {
+/// Of a folder's files with one of these extensions, by their names.
+pub(super) fn hash_folder(folder: &Path, extensions: &[&str]) -> anyhow::Result<String> {
     let files: io::Result<Vec<PathBuf>> =
         fs::read_dir(folder).and_then(|files| files.map(|file| Ok(file?.path())).collect());
     let mut files = files.with_context(|| folder.display().to_string())?;
-    files.retain(|path| path.is_file());
+    files.retain(|path| extensions.iter().any(|extension| path.extension().is_some_and(|own| own == *extension)));
     files.sort();
     let hashes = files.iter().map(|path| Ok(format!("{:?} {}", path.file_name(), hash(path)?)));
     Ok(digest(&hashes.collect::<anyhow::Result<Vec<_>>>()?.join("\n")))

@@ -1,4 +1,4 @@
-//! Random choices, the same for the same seed.
+//! Seeded random choices.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;

@@ -1,4 +1,4 @@
-//! What a shop's shelf holds: boxes, cans, bottles.
+//! Packaging: boxes, cans, bottles.
 
 use super::dice::Dice;
 use super::shape::{Section, Shape, arc, ball, block, frustum, lathe, pipe, prism, uniform, wall};
@@ -29,7 +29,7 @@ pub(super) fn milk_carton(dice: &mut Dice) -> Shape {
     }
 }
 
-/// A tin can, low like tuna's or high like a drink's.
+/// A can, low (tuna) or high (drink).
 pub(super) fn can(dice: &mut Dice) -> Shape {
     let (r, h) = (dice.between(0.024, 0.042), dice.between(0.035, 0.15));
     let rim = dice.between(0.82, 1.0) * r;

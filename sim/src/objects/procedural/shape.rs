@@ -9,7 +9,7 @@ use nalgebra::{Isometry3, Point3, Rotation3, Vector3};
 use crate::hull::convex_hull;
 use grasp_picture::Mesh;
 
-/// The most vertices of a part: the physics looks through all of them at every contact.
+/// Maximum number of vertices of a part. The physics engine iterates over all of them at every contact.
 const MOST_VERTICES: usize = 64;
 
 /// A solid of convex parts, metres.
@@ -19,7 +19,7 @@ pub(super) struct Shape {
 }
 
 impl Shape {
-    /// The convex hull of points; nothing where they span no volume.
+    /// The convex hull of points; empty if they enclose no volume.
     pub(super) fn hull(points: impl IntoIterator<Item = Point3<f64>>) -> Shape {
         let points: Vec<_> = points.into_iter().collect();
         Shape { parts: convex_hull(&points).into_iter().collect() }
@@ -40,22 +40,22 @@ impl Shape {
         self.moved(&Isometry3::translation(x, y, z))
     }
 
-    /// Turned about the x axis by `angle` radians.
+    /// Rotated about the x axis by `angle` radians.
     pub(super) fn turned_x(self, angle: f64) -> Shape {
         self.moved(&Isometry3::rotation(Vector3::x() * angle))
     }
 
-    /// Turned about the y axis by `angle` radians.
+    /// Rotated about the y axis by `angle` radians.
     pub(super) fn turned_y(self, angle: f64) -> Shape {
         self.moved(&Isometry3::rotation(Vector3::y() * angle))
     }
 
-    /// Turned about the z axis by `angle` radians.
+    /// Rotated about the z axis by `angle` radians.
     pub(super) fn turned_z(self, angle: f64) -> Shape {
         self.moved(&Isometry3::rotation(Vector3::z() * angle))
     }
 
-    /// Laid down so that its axis, z, points along x.
+    /// Rotated so that its axis, z, points along x.
     pub(super) fn laid_down(self) -> Shape {
         self.turned_y(TAU / 4.0)
     }
@@ -97,7 +97,7 @@ pub(super) fn prism(outline: &[(f64, f64)], height: f64) -> Shape {
     Shape::hull([0.0, height].into_iter().flat_map(|z| outline.iter().map(move |&(x, y)| Point3::new(x, y, z))))
 }
 
-/// A cylinder, cone or anything between, by its radii at the bottom and the top.
+/// A cylinder or (truncated) cone with these radii at the bottom and the top.
 pub(super) fn frustum(bottom: f64, top: f64, height: f64) -> Shape {
     lathe(&[(bottom, 0.0), (top, height)])
 }
@@ -113,9 +113,9 @@ pub(super) fn ball(x: f64, y: f64, z: f64) -> Shape {
     Shape::hull(points).stretched(x, y, z)
 }
 
-/// A solid of revolution about z by its outline, pairs of (radius, z) with z rising.
+/// A solid of revolution about z. The outline is pairs of (radius, z) with increasing z.
 ///
-/// The outline is cut where it turns inward, so that every piece is convex.
+/// The outline is split where it is concave, so that every part is convex.
 pub(super) fn lathe(outline: &[(f64, f64)]) -> Shape {
     let bulges = |i: usize| {
         let ((r0, z0), (r1, z1), (r2, z2)) = (outline[i - 1], outline[i], outline[i + 1]);
@@ -136,7 +136,7 @@ pub(super) fn lathe(outline: &[(f64, f64)]) -> Shape {
     shape
 }
 
-/// A hollow wall about z of `segments` flat pieces, by rings of (outer radius, inner radius, z).
+/// A hollow wall about z of `segments` flat pieces, defined by rings of (outer radius, inner radius, z).
 pub(super) fn wall(rings: &[(f64, f64, f64)], segments: usize) -> Shape {
     let quad = |ring: (f64, f64, f64), i: usize| {
         [i, i + 1].into_iter().flat_map(move |i| {
@@ -155,14 +155,14 @@ pub(super) enum Section {
     Square(f64, f64),
 }
 
-/// A pipe along a path in the x–z plane, by its points and the section at each.
+/// A pipe along a path in the x–z plane, defined by points with a section at each.
 pub(super) fn pipe(path: &[(f64, f64, Section)]) -> Shape {
     let last = path.len() - 1;
     let rings: Vec<_> = (0..=last).map(|i| ring(path[i], path[i.saturating_sub(1)], path[(i + 1).min(last)])).collect();
     Shape::all(rings.windows(2).map(|pair| Shape::hull(pair.iter().flatten().copied())))
 }
 
-/// A [`pipe`] that ends where it began.
+/// A closed [`pipe`].
 pub(super) fn closed_pipe(path: &[(f64, f64, Section)]) -> Shape {
     let n = path.len();
     let rings: Vec<_> = (0..n).map(|i| ring(path[i], path[(i + n - 1) % n], path[(i + 1) % n])).collect();
@@ -176,16 +176,16 @@ pub(super) fn arc(x: f64, z: f64, radius: f64, from: f64, to: f64, count: usize)
     (0..count).map(|i| (x + radius * angle(i).cos(), z + radius * angle(i).sin())).collect()
 }
 
-/// A path with one section throughout.
+/// A path with a constant section.
 pub(super) fn uniform(path: Vec<(f64, f64)>, section: Section) -> Vec<(f64, f64, Section)> {
     path.into_iter().map(|(x, z)| (x, z, section)).collect()
 }
 
-/// The section of a pipe at a point of its path, square to the line between the neighbours.
+/// The section of a pipe at a point of its path, perpendicular to the line between the neighbours.
 fn ring(at: (f64, f64, Section), before: (f64, f64, Section), after: (f64, f64, Section)) -> Vec<Point3<f64>> {
     let along = Vector3::new(after.0 - before.0, 0.0, after.1 - before.1);
     let turn = Rotation3::rotation_between(&Vector3::z(), &along).unwrap_or_else(|| {
-        // Straight down: a half turn about the one axis that keeps the section's sides.
+        // Straight down: a rotation by 180° about the axis that preserves the sides of the section.
         Rotation3::from_axis_angle(&Vector3::y_axis(), TAU / 2.0)
     });
     let flat = match at.2 {
@@ -196,7 +196,7 @@ fn ring(at: (f64, f64, Section), before: (f64, f64, Section), after: (f64, f64, 
     flat.into_iter().map(|p| turn * p + Vector3::new(at.0, 0.0, at.1)).collect()
 }
 
-/// Points of a circle about the z axis; the tip of a cone where the radius is none.
+/// Points of a circle about the z axis; a single point if the radius is 0.
 fn circle(radius: f64, z: f64, sides: usize) -> impl Iterator<Item = Point3<f64>> {
     let radius = if radius < 1e-6 { 0.0 } else { radius };
     (0..sides).map(move |i| {

@@ -1,4 +1,4 @@
-//! Crockery and kitchen things: hollow where the real ones are.
+//! Crockery and kitchen utensils, hollow where real ones are.
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
@@ -73,7 +73,7 @@ pub(super) fn spoon(dice: &mut Dice) -> Shape {
     stem.and(scoop.stretched(1.25, 0.9, 1.0))
 }
 
-/// A salt cellar, pepper mill, vase or chess piece: anything turned on a lathe.
+/// A salt cellar, pepper mill, vase or chess piece: a solid of revolution.
 pub(super) fn turned(dice: &mut Dice) -> Shape {
     let r = dice.between(0.02, 0.036);
     let mut outline = vec![(r, 0.0)];
@@ -104,7 +104,7 @@ fn vessel(bottom: f64, top: f64, height: f64, thickness: f64, segments: usize) -
     wall(&rings, segments).and(frustum(bottom - thickness * 0.5, bottom - thickness * 0.5, thickness))
 }
 
-/// An ear of a cup at x = `from`, about the height `z`.
+/// The handle of a cup at x = `from`, around the height `z`.
 fn handle(from: f64, z: f64, reach: f64, height: f64) -> Shape {
     let mut path = arc(0.0, 0.0, 1.0, FRAC_PI_2, -FRAC_PI_2, 7);
     path.iter_mut().for_each(|p| *p = (from - 0.002 + p.0 * reach, z + p.1 * height));

@@ -1,4 +1,4 @@
-//! What lies in a workshop or on a desk.
+//! Tools and desk items.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
@@ -43,7 +43,7 @@ pub(super) fn wrench(dice: &mut Dice) -> Shape {
     let claw = Section::Square(jaw * 0.4, t / 2.0);
     let fork = |tilt: f64| {
         let bow = pipe(&uniform(arc(0.0, 0.0, jaw, 0.28 * PI, 1.72 * PI, 8), claw));
-        // Turned from the x–z plane into the x–y plane.
+        // Rotated from the x–z plane into the x–y plane.
         bow.turned_x(FRAC_PI_2).turned_z(tilt).shifted(jaw * 1.2, 0.0, t / 2.0)
     };
     let eye = wall(&[(jaw, jaw * 0.6, 0.0), (jaw, jaw * 0.6, t)], 10).shifted(jaw * 0.85, 0.0, 0.0);

@@ -1,4 +1,4 @@
-//! Toys, building blocks and shapes that are like nothing else.
+//! Toys, building blocks and abstract shapes.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
@@ -136,7 +136,7 @@ pub(super) fn plane(dice: &mut Dice) -> Shape {
     hull.and(wing(sweep, span, chord).shifted(length * 0.5, 0.0, -0.002)).and(rudder).and(fin.shifted(0.0, 0.002, 0.0))
 }
 
-/// A spinning top, dumbbell, spool or skittle: a lathe's toy.
+/// A spinning top, dumbbell, spool or skittle: a solid of revolution.
 pub(super) fn spool(dice: &mut Dice) -> Shape {
     let (r, h) = (dice.between(0.02, 0.035), dice.between(0.04, 0.1));
     let (core, flange) = (r * dice.between(0.35, 0.7), dice.between(0.12, 0.3) * h);
@@ -175,7 +175,7 @@ pub(super) fn stone(dice: &mut Dice) -> Shape {
     Shape::hull(stone.collect::<Vec<_>>())
 }
 
-/// A few simple solids fused at random.
+/// A random union of a few simple solids.
 pub(super) fn composite(dice: &mut Dice) -> Shape {
     let mut shape = Shape::default();
     for i in 0..dice.count(2, 5) {

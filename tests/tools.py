@@ -1,0 +1,159 @@
+#!/usr/bin/env python3
+"""Downloads what the tests and benchmarks run, and prints the paths.
+
+    tools.py python      the interpreter of the Python tests, for GRASPD_PYTHON
+    tools.py peers       the interpreter of the servers that graspd is compared with, for GRASPD_PEERS
+    tools.py haproxy     the load balancer of `make test-faults`, for GRASPD_HAPROXY
+    tools.py prometheus  for the tests of deploy/prometheus and deploy/grafana, for GRASPD_PROMETHEUS
+    tools.py promtool    checks the rules of Prometheus, for GRASPD_PROMTOOL
+    tools.py cpp         a prefix with CMake, protoc and gRPC for C++, for GRASPD_CPP
+    tools.py chromium    the browser of the page's tests, for GRASPD_CHROMIUM
+
+Variables and downloads are handled as in deploy/native.py.
+"""
+
+import os
+import sys
+from pathlib import Path
+from typing import List
+
+TESTS = Path(__file__).resolve().parent
+sys.path.insert(0, str(TESTS.parent / "deploy"))
+
+import native  # noqa: E402
+from native import CACHE, PLATFORM, Unavailable, built_once, given, pip, say  # noqa: E402
+
+
+def python() -> Path:
+    if os.environ.get("GRASPD_PYTHON"):
+        return given("GRASPD_PYTHON")
+    if sys.version_info < (3, 11):
+        version = "{}.{}".format(*sys.version_info)
+        raise Unavailable(f"The Python client's tests need Python 3.11 or newer; {sys.executable} is {version}.")
+    return interpreter("python", sys.executable, "The Python packages of the tests", 234, "GRASPD_PYTHON")
+
+
+def peers() -> Path:
+    if os.environ.get("GRASPD_PEERS"):
+        return given("GRASPD_PEERS")
+    # The system's, which has a shared library beside it for Triton to load, wherever others are first on PATH.
+    system = "/usr/bin/python3"
+    if PLATFORM != "Linux-x86_64" or not os.path.exists(system):
+        raise Unavailable(f"The peers are for Linux on x86-64 with a {system}; this is {PLATFORM}.")
+    return interpreter("peers", system, "The Python packages of graspd's peers", 283, "GRASPD_PEERS")
+
+
+def haproxy() -> Path:
+    if os.environ.get("GRASPD_HAPROXY"):
+        return given("GRASPD_HAPROXY")
+    return from_debian("haproxy", "haproxy", "GRASPD_HAPROXY")
+
+
+def prometheus() -> Path:
+    if os.environ.get("GRASPD_PROMETHEUS"):
+        return given("GRASPD_PROMETHEUS")
+    return from_debian("prometheus", "prometheus", "GRASPD_PROMETHEUS")
+
+
+def promtool() -> Path:
+    if os.environ.get("GRASPD_PROMTOOL"):
+        return given("GRASPD_PROMTOOL")
+    return from_debian("prometheus", "promtool", "GRASPD_PROMTOOL")
+
+
+def chromium() -> Path:
+    if os.environ.get("GRASPD_CHROMIUM"):
+        return given("GRASPD_CHROMIUM")
+    # The shell without a window: the same engine, and none of GTK.
+    return from_debian("chromium-headless-shell", "chromium-headless-shell", "GRASPD_CHROMIUM")
+
+
+def cpp() -> Path:
+    import shutil
+
+    if os.environ.get("GRASPD_CPP"):
+        return given("GRASPD_CPP", "include/grpcpp", "include/google/protobuf")
+    programs = [shutil.which(name) for name in ["grpc_cpp_plugin", "protoc", "cmake"]]
+    if all(programs):
+        prefix = Path(programs[0]).resolve().parent.parent
+        if (prefix / "include/grpcpp").exists():
+            return prefix
+    packages = ["cmake", "libgrpc++-dev", "libprotobuf-dev", "protobuf-compiler-grpc"]
+    return unpacked("cpp", packages, "prefix with CMake, protoc and gRPC for C++", "GRASPD_CPP") / "usr"
+
+
+def from_debian(package: str, name: str, variable: str) -> Path:
+    """A program of a Debian package."""
+    import shutil
+
+    there = shutil.which(name, path=os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin"]))
+    return Path(there) if there else unpacked(package, [package], name, variable) / name
+
+
+def unpacked(name: str, packages: List[str], title: str, variable: str) -> Path:
+    """A folder with Debian packages and the libraries that this machine lacks, unpacked instead of installed: this needs no
+    root, and no service starts."""
+    import shutil
+    import subprocess
+
+    if not shutil.which("apt-get"):
+        raise Unavailable(f"{title} not found, and no apt-get to download it; set {variable} to its path.")
+    folder = CACHE / f"debian-{name}-{PLATFORM}"
+
+    def build(part: Path) -> None:
+        wanted = " ".join(packages)
+        say(f"Debian's {wanted} -> {folder}")
+        simulate = ["apt-get", "install", "--simulate", "--no-install-recommends", *packages]
+        plan = subprocess.run(simulate, capture_output=True, text=True)
+        names = [line.split()[1] for line in plan.stdout.splitlines() if line.startswith("Inst ")]
+        if not names or subprocess.run(["apt-get", "download", *names], cwd=part, stdout=sys.stderr).returncode:
+            said = plan.stderr.strip() or "apt-get says above why"
+            raise Unavailable(f"{wanted} could not be downloaded ({said}); run `apt-get update` as root or set {variable}.")
+        for archive in part.glob("*.deb"):
+            subprocess.run(["dpkg-deb", "--extract", archive, part], check=True)
+            archive.unlink()
+        for link in part.glob("usr/lib/*-linux-gnu/*.so"):
+            if not link.exists():  # what is linked with is here, but its library is the system's
+                library = Path("/", link.relative_to(part)).with_name(os.readlink(link))
+                for name in {library.name, library.resolve().name}:
+                    link.with_name(name).symlink_to(library)
+        # PulseAudio's library has half of itself in a folder of its own.
+        holding = [*part.glob("usr/lib/*-linux-gnu"), *part.glob("usr/lib/*-linux-gnu/pulseaudio")]
+        libraries = os.pathsep.join(str(folder / path.relative_to(part)) for path in holding)
+        # A script for each program: the package may have several. Chromium's in usr/bin is one that looks in /usr.
+        for program in [*part.glob("usr/bin/*"), *part.glob("usr/sbin/*"), *part.glob("usr/lib/chromium/chromium-*")]:
+            script = part / program.name
+            script.write_text(f'#!/bin/sh\nLD_LIBRARY_PATH="{libraries}" exec "{folder / program.relative_to(part)}" "$@"\n')
+            script.chmod(0o755)
+
+    return built_once(folder, build)
+
+
+def interpreter(name: str, base: str, title: str, megabytes: int, variable: str) -> Path:
+    """A virtual environment of `base` with the packages of `tests/{name}/requirements.txt`."""
+    import hashlib
+    import subprocess
+
+    requirements = TESTS / name / "requirements.txt"
+    ask = [base, "-c", "import sysconfig; print(sysconfig.get_python_version())"]
+    version = subprocess.check_output(ask, text=True).strip()
+    folder = CACHE / f"{name}-{version}-{hashlib.sha256(requirements.read_bytes()).hexdigest()[:12]}"
+
+    def build(part: Path) -> None:
+        say(f"{title}, {megabytes} MB of wheels -> {folder}")
+        # Without a pip of its own, since Debian's Python has none to give. Nothing in bin/ but
+        # `python` is used, which is what survives the renaming of the folder.
+        subprocess.run([base, "-m", "venv", "--without-pip", str(part)], stdout=sys.stderr, check=True)
+        names = [word for word in requirements.read_text().split() if "==" in word]
+        pip(["--python", f"{part}/bin/python", "install", "--requirement", str(requirements)], names, f"""\
+{title} could not be installed; pip says above why.
+To bring them from a machine with a network and Python {version}, run this there,
+    python3 -m pip download --dest wheels --requirement {requirements}
+and copy the wheels into {native.WHEELS}/
+or set {variable} to an interpreter that has these packages.""")
+
+    return built_once(folder, build) / "bin/python"
+
+
+if __name__ == "__main__":
+    native.main("tools.py", __doc__, [python, peers, haproxy, prometheus, promtool, cpp, chromium])
