@@ -182,6 +182,15 @@ fn an_export_can_be_replayed() {
     assert_eq!(count("successes") + count("failures"), all);
     assert!(count("successes") > 0 && count("successes_kept") * 10 >= count("successes") * 8, "{report}");
     assert_eq!(export::read(&desk.path("replayed.jsonl")).unwrap().len(), lines.len());
+
+    // As if another simulator had found the opposite.
+    let inverted = lines.into_iter().map(|mut line| {
+        line.trials.iter_mut().for_each(|trial| trial.label = 1 - trial.label);
+        serde_json::to_string(&line).unwrap() + "\n"
+    });
+    fs::write(desk.path("inverted.jsonl"), inverted.collect::<String>()).unwrap();
+    desk.run("replay inverted.jsonl --objects objects --contact forbid --differences differences.png");
+    assert!(fs::metadata(desk.path("differences.png")).unwrap().len() > 10_000);
 }
 
 #[test]

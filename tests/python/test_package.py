@@ -244,20 +244,20 @@ class MistakesTest(ServerTest):
         volume, depth, pose = scene.volume(*CAMERAS), scene.depth(CAMERAS[0]), np.eye(4)
         never = graspd.CollisionCheck("never")
         for ask, said in [
-            (lambda: graspd.Volume(volume[:-1]), r"not an array of shape \(39, 40, 40\)"),
-            (lambda: graspd.Volume(np.zeros((0, 0, 0))), "not an array of shape"),
+            (lambda: graspd.Volume(volume[:-1]), r"must be a cube .* got shape \(39, 40, 40\)"),
+            (lambda: graspd.Volume(np.zeros((0, 0, 0))), "must be a cube"),
             (lambda: graspd.DepthView(depth[None], scene.K, camera_from_task=pose), "row"),
             (lambda: graspd.DepthView(depth, scene.K), "one of camera_from_task and frame_from_camera"),
             (lambda: graspd.CloudView(depth, (0, 0, 0)), "x, y, z"),
-            (lambda: graspd.Pose.from_matrix(2 * pose), "a rotation and a shift"),
+            (lambda: graspd.Pose.from_matrix(2 * pose), "a rotation and a translation"),
             (lambda: graspd.Pose.from_matrix(pose[:3]), "4 × 4"),
-            (lambda: self.client.detect(graspd.Volume(volume, dtype=int)), "not as int64"),
+            (lambda: self.client.detect(graspd.Volume(volume, dtype=int)), "is int64, must be float32"),
             (lambda: self.client.detect(graspd.Volume(2 * volume, dtype=np.uint8)), r"in \[0, 1\]"),
-            (lambda: self.client.detect_from_depth([replace(views()[0], depth=depth.astype(int))]), "not of int64"),
+            (lambda: self.client.detect_from_depth([replace(views()[0], depth=depth.astype(int))]), "got int64"),
             (lambda: self.client.detect(volume, graspd.Options(collision=never)), "MODE_NEVER"),
-            (lambda: graspd.Client("127.0.0.1:1", tls_cert="a.pem"), "belong together"),
-            (lambda: graspd.Client("127.0.0.1:1", token=" "), "the token is empty"),
-            (lambda: graspd.Client("127.0.0.1:1", token="two\nlines"), "the token"),
+            (lambda: graspd.Client("127.0.0.1:1", tls_cert="a.pem"), "must be given together"),
+            (lambda: graspd.Client("127.0.0.1:1", token=" "), "token is empty"),
+            (lambda: graspd.Client("127.0.0.1:1", token="two\nlines"), "token"),
         ]:
             with self.subTest(said), self.assertRaisesRegex(ValueError, said):
                 ask()
@@ -611,7 +611,7 @@ class PoseTest(unittest.TestCase):
         ]:
             matrix = np.eye(4)
             matrix[:3, :3] = pose.as_matrix()
-            with self.assertRaisesRegex(ValueError, "a rotation and a shift"):
+            with self.assertRaisesRegex(ValueError, "a rotation and a translation"):
                 graspd.Pose.from_matrix(spoil(matrix))
 
 

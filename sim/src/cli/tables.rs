@@ -342,15 +342,15 @@ impl Tables {
         format!(
             "# The paper's tables, here and there\n\n\
              *6-DoF Robotic Grasping with Transformer*, Tables 1–4, beside what `make tables` measured: {} scenes of five unseen\n\
-             procedural objects for each of {} seeds from {} (only the first in PyBullet, and for cameras, ε and objects that the\n\
+             procedural objects for each seed from {} to {} (only the first in PyBullet, and for cameras, ε and objects that the\n\
              paper does not have), noisy depth from one side view, ε = 0.9, `force` down to 0.5, the best grasp first, out_th 0.1.\n\
              GSR is the share of the grasps that lifted an object, DR that of the objects cleared away; mean ± standard deviation\n\
              over the seeds. VGN-R are VGN's released weights; the paper states its times for an RTX 3090, here it is\n\
              {} with {} cores, ONNX Runtime's CPU provider, one observation after another.\n\
              Simulator and decoding {}.{pybullet}\n\n",
             self.rounds,
-            self.seeds,
             self.seed,
+            self.seed + self.seeds - 1,
             processor(),
             std::thread::available_parallelism().map_or(1, |n| n.get()),
             &fingerprint[..12],

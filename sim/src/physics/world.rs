@@ -262,7 +262,7 @@ impl World {
     }
 
     /// Whether any of the parts, in the frame `pose`, is closer than `gap` metres to an object's mesh, or closer than
-    /// `gap` minus [`MARGIN`] to the table, which has no margin.
+    /// `gap` minus `MARGIN` to the table, which has no margin.
     #[must_use]
     pub fn is_near(&self, parts: &[HandPart], pose: &Isometry3<f64>, gap: f64) -> bool {
         parts.iter().any(|part| part.lowest_point(pose) < TABLE_HEIGHT + gap - MARGIN) || {
