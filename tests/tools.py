@@ -44,26 +44,18 @@ def peers() -> Path:
 
 
 def haproxy() -> Path:
-    if os.environ.get("GRASPD_HAPROXY"):
-        return given("GRASPD_HAPROXY")
     return from_debian("haproxy", "haproxy", "GRASPD_HAPROXY")
 
 
 def prometheus() -> Path:
-    if os.environ.get("GRASPD_PROMETHEUS"):
-        return given("GRASPD_PROMETHEUS")
     return from_debian("prometheus", "prometheus", "GRASPD_PROMETHEUS")
 
 
 def promtool() -> Path:
-    if os.environ.get("GRASPD_PROMTOOL"):
-        return given("GRASPD_PROMTOOL")
     return from_debian("prometheus", "promtool", "GRASPD_PROMTOOL")
 
 
 def chromium() -> Path:
-    if os.environ.get("GRASPD_CHROMIUM"):
-        return given("GRASPD_CHROMIUM")
     # The shell without a window: the same engine, and none of GTK.
     return from_debian("chromium-headless-shell", "chromium-headless-shell", "GRASPD_CHROMIUM")
 
@@ -83,9 +75,11 @@ def cpp() -> Path:
 
 
 def from_debian(package: str, name: str, variable: str) -> Path:
-    """A program of a Debian package."""
+    """A program of a Debian package, unless the variable names another."""
     import shutil
 
+    if os.environ.get(variable):
+        return given(variable)
     there = shutil.which(name, path=os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin"]))
     return Path(there) if there else unpacked(package, [package], name, variable) / name
 

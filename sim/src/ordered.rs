@@ -4,8 +4,8 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-/// Numbers per thread that are worked on at a time: many enough that few threads idle at the end of each, few enough that
-/// an interrupted run loses seconds.
+/// Numbers per thread in a chunk: enough that threads idle little at its end, and few enough that an interrupted run
+/// loses only seconds.
 const CHUNK: u64 = 16;
 
 /// Calls `work` for every number on rayon's threads, and `take` with the results in the order of the numbers.

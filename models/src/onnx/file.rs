@@ -48,7 +48,7 @@ impl ModelProto {
         }
     }
 
-    /// Writes a file; whoever reads it meanwhile sees the old one or the new one, never a part.
+    /// Writes a file in one step: a concurrent reader gets the old file or the new one, never a part.
     ///
     /// # Errors
     /// [`FileError`] when the file system refuses.
