@@ -345,7 +345,7 @@ fn conditions_of_the_tables_run_once() {
     let desk = Desk::new();
     fs::create_dir(desk.path("zoo")).unwrap();
     fs::copy(NETWORK, desk.path("zoo/vgn-packed.onnx")).unwrap();
-    let tables = "tables --models zoo --out out/tables.md --rounds 1 --seeds 1 --timed 1";
+    let tables = "tables --models zoo --out out/tables.md --results out/tables.jsonl --rounds 1 --seeds 1 --timed 1";
     let missing = |desk: &Desk| {
         let output = desk.command(tables).output().unwrap();
         assert!(output.status.success(), "{}", stderr(&output));

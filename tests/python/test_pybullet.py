@@ -245,7 +245,8 @@ class CommandTest(unittest.TestCase):
         (self.folder / "zoo/vgn-packed.onnx").symlink_to(Path(os.environ["GRASPD_MODELS"], "vgn-packed.onnx").resolve())
         python, graspd = self.folder / "bin/python3", os.path.abspath(os.environ["GRASPD"])
         self.run_sh(
-            f"grasp-sim tables --models zoo --rounds 1 --seeds 1 --timed 1 --out tables.md --objects objects "
+            f"grasp-sim tables --models zoo --rounds 1 --seeds 1 --timed 1 --out tables.md --results tables.jsonl "
+            f"--objects objects "
             f"--pybullet {python} --graspd {shlex.quote(graspd)}"
         )
         played = [json.loads(line) for line in (self.folder / "tables.jsonl").read_text().splitlines()]

@@ -50,9 +50,13 @@ pub struct Tables {
     #[arg(long, value_name = "PROGRAM")]
     graspd: Option<PathBuf>,
 
-    /// The tables.
+    /// Output file, Markdown.
     #[arg(long, default_value = "docs/tables.md")]
     out: PathBuf,
+
+    /// Results of all benchmark runs, JSON lines. Runs found in it are not repeated.
+    #[arg(long, default_value = "models/tables.jsonl")]
+    results: PathBuf,
 
     /// Scenes to clear for each seed.
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
@@ -99,7 +103,7 @@ impl Tables {
         let entries = self.entries()?;
         let fingerprint = digest(&format!("{} {}", simulator(), decoding()));
         let tasks = self.tasks(&entries, &fingerprint)?;
-        let mut log = Log::open(&self.out.with_extension("jsonl"))?;
+        let mut log = Log::open(&self.results)?;
         let missing: Vec<&Task> = tasks.iter().filter(|task| !log.played.contains_key(&task.key)).collect();
         eprintln!("{} of {} games are to be played", missing.len(), tasks.len());
         let progress = ProgressBar::new(missing.iter().map(|task| self.effort(task)).sum())
