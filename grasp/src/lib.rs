@@ -8,6 +8,8 @@
 //! or transform `T_a_b` maps points of frame b into frame a; voxel arrays are indexed `[x][y][z]` with z varying
 //! fastest.
 
+#![warn(missing_docs)]
+
 mod camera;
 mod cloud;
 mod constraints;

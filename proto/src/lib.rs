@@ -3,6 +3,8 @@
 //!
 //! The conversions from messages validate every field. A [`FieldError`] names the invalid field and its value.
 
+#![warn(missing_docs)]
+
 mod error;
 mod grasps;
 mod options;

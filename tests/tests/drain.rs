@@ -102,7 +102,7 @@ fn every_mistake_in_the_configuration_is_reported_in_one_run() {
         "--listen (GRASPD_LISTEN) is `nowhere`",
         "--workers (GRASPD_WORKERS) is `0`",
         "--drain-timeout (GRASPD_DRAIN_TIMEOUT) is `-1`",
-        "--models (GRASPD_MODELS) /no/such/folder: No such file",
+        "--models (GRASPD_MODELS) is `/no/such/folder`: /no/such/folder: No such file",
         "--queue (GRASPD_QUEUE) is `many`",
         "--log (GRASPD_LOG) is `a=b=c`",
     ] {

@@ -3,6 +3,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use grasp_models::Backend;
+use prometheus::core::Collector;
 #[cfg(target_os = "linux")]
 use prometheus::process_collector::ProcessCollector;
 use prometheus::{
@@ -25,6 +26,8 @@ const BUCKETS: [f64; 33] = [
 
 /// Volumes per batch.
 const BATCHES: [f64; 9] = [1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 16.0, 32.0, 64.0];
+
+const VALID: &str = "the metric names below are valid and distinct";
 
 /// The Prometheus metrics. The label `model` is `name version`, and empty for requests that were refused before a model
 /// was selected.
@@ -54,84 +57,58 @@ impl Metrics {
 
     /// `dropped` counts the lines that the log has lost.
     pub fn new(dropped: ErrorCounter) -> Self {
-        const VALID: &str = "the metric names below are valid and distinct";
-        let stages = HistogramOpts::new("graspd_stage_duration_seconds", "Duration of each stage of a request.");
+        let registry = Registry::new();
+        let counter = |name, help| register(&registry, IntCounter::new(name, help));
+        let gauge = |name, help| register(&registry, IntGauge::new(name, help));
+        let counters = |name, help, labels| register(&registry, IntCounterVec::new(Opts::new(name, help), labels));
+        let gauges = |name, help, labels| register(&registry, IntGaugeVec::new(Opts::new(name, help), labels));
+        let histograms = |name, help, labels, buckets: &[f64]| {
+            register(&registry, HistogramVec::new(HistogramOpts::new(name, help).buckets(buckets.to_vec()), labels))
+        };
+        // CPU time, memory and open files of the process.
+        #[cfg(target_os = "linux")]
+        registry.register(Box::new(ProcessCollector::for_self())).expect(VALID);
         let metrics = Self {
-            registry: Registry::new(),
-            stages: HistogramVec::new(stages.buckets(BUCKETS.to_vec()), &["model", "stage"]).expect(VALID),
-            requests: IntCounterVec::new(
-                Opts::new("graspd_requests_total", "Requests by gRPC status code."),
-                &["model", "code"],
-            )
-            .expect(VALID),
-            grasps: IntCounterVec::new(Opts::new("graspd_grasps_total", "Grasps returned to clients."), &["model"])
-                .expect(VALID),
-            waiting: IntGaugeVec::new(Opts::new("graspd_queue_requests", "Queued requests."), &["model"]).expect(VALID),
-            batches: HistogramVec::new(
-                HistogramOpts::new("graspd_batch_size", "Volumes per batch.").buckets(BATCHES.to_vec()),
-                &["model"],
-            )
-            .expect(VALID),
-            models: IntGaugeVec::new(
-                Opts::new("graspd_model_info", "1 for each served model, with its provider, precision and file hash."),
+            stages: histograms(
+                "graspd_stage_duration_seconds",
+                "Duration of each stage of a request.",
+                &["model", "stage"],
+                &BUCKETS,
+            ),
+            requests: counters("graspd_requests_total", "Requests by gRPC status code.", &["model", "code"]),
+            grasps: counters("graspd_grasps_total", "Grasps returned to clients.", &["model"]),
+            waiting: gauges("graspd_queue_requests", "Queued requests.", &["model"]),
+            batches: histograms("graspd_batch_size", "Volumes per batch.", &["model"], &BATCHES),
+            models: gauges(
+                "graspd_model_info",
+                "1 for each served model, with its provider, precision and file hash.",
                 &["model", "provider", "precision", "sha256"],
-            )
-            .expect(VALID),
-            reloads: IntCounterVec::new(
-                Opts::new(
-                    "graspd_reloads_total",
-                    "Reloads of the model folder: ok, or failed if any file could not be loaded.",
-                ),
+            ),
+            reloads: counters(
+                "graspd_reloads_total",
+                "Reloads of the model folder: ok, or failed if any file could not be loaded.",
                 &["outcome"],
-            )
-            .expect(VALID),
-            rejected: IntGauge::new(
-                "graspd_rejected_files",
-                "Model files that could not be loaded at the last reload.",
-            )
-            .expect(VALID),
-            connections: IntGauge::new("graspd_connections", "Open connections to the gRPC listener.").expect(VALID),
-            connections_limit: IntGauge::new("graspd_connections_limit", "Maximum number of open connections.")
-                .expect(VALID),
-            connections_refused: IntCounter::new(
+            ),
+            rejected: gauge("graspd_rejected_files", "Model files that could not be loaded at the last reload."),
+            connections: gauge("graspd_connections", "Open connections to the gRPC listener."),
+            connections_limit: gauge("graspd_connections_limit", "Maximum number of open connections."),
+            connections_refused: counter(
                 "graspd_connections_refused_total",
                 "Connections refused because the limit was reached.",
-            )
-            .expect(VALID),
-            ready: IntGauge::new("graspd_ready", "1 while the server accepts requests, 0 during startup and shutdown.")
-                .expect(VALID),
-            tracked: IntGauge::new("graspd_tracked_volumes", "Open TrackGrasps streams, each with one volume.")
-                .expect(VALID),
-            dropped_lines: IntCounter::new(
+            ),
+            ready: gauge("graspd_ready", "1 while the server accepts requests, 0 during startup and shutdown."),
+            tracked: gauge("graspd_tracked_volumes", "Open TrackGrasps streams, each with one volume."),
+            dropped_lines: counter(
                 "graspd_log_lines_dropped_total",
                 "Log lines dropped because stderr was not read fast enough.",
-            )
-            .expect(VALID),
+            ),
             dropped: (dropped, AtomicU64::new(0)),
+            registry,
         };
-        let Self { registry, stages, requests, grasps, waiting, batches, models, reloads, rejected, .. } = &metrics;
-        let Self { connections, connections_limit, connections_refused, ready, tracked, dropped_lines, .. } = &metrics;
-        registry.register(Box::new(stages.clone())).expect(VALID);
-        registry.register(Box::new(requests.clone())).expect(VALID);
-        registry.register(Box::new(grasps.clone())).expect(VALID);
-        registry.register(Box::new(waiting.clone())).expect(VALID);
-        registry.register(Box::new(batches.clone())).expect(VALID);
-        registry.register(Box::new(models.clone())).expect(VALID);
-        registry.register(Box::new(reloads.clone())).expect(VALID);
-        registry.register(Box::new(rejected.clone())).expect(VALID);
-        registry.register(Box::new(connections.clone())).expect(VALID);
-        registry.register(Box::new(connections_limit.clone())).expect(VALID);
-        registry.register(Box::new(connections_refused.clone())).expect(VALID);
-        registry.register(Box::new(ready.clone())).expect(VALID);
-        registry.register(Box::new(tracked.clone())).expect(VALID);
-        registry.register(Box::new(dropped_lines.clone())).expect(VALID);
         // Series start at 0, so that `increase()` includes the first event.
         for outcome in ["ok", "failed"] {
             metrics.reloads.with_label_values(&[outcome]);
         }
-        // CPU time, memory and open files of the process.
-        #[cfg(target_os = "linux")]
-        registry.register(Box::new(ProcessCollector::for_self())).expect(VALID);
         metrics
     }
 
@@ -206,6 +183,13 @@ impl Metrics {
         self.dropped_lines.inc_by(lines.saturating_sub(counted.fetch_max(lines, Ordering::Relaxed)));
         TextEncoder::new().encode_to_string(&self.registry.gather()).expect("the encoder writes to memory")
     }
+}
+
+/// Adds a metric to the registry.
+fn register<M: Collector + Clone + 'static>(registry: &Registry, metric: prometheus::Result<M>) -> M {
+    let metric = metric.expect(VALID);
+    registry.register(Box::new(metric.clone())).expect(VALID);
+    metric
 }
 
 /// The name of a status code in the gRPC specification, for the codes that this server returns.

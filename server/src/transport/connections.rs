@@ -135,8 +135,25 @@ mod tests {
     use std::pin::pin;
 
     use tokio::io::AsyncReadExt;
+    use tokio::time::Instant;
 
     use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn a_connection_without_a_preface_ends_after_the_timeout() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let open = IntGauge::new("open", "Open connections.").unwrap();
+        let refused = IntCounter::new("refused", "Refused connections.").unwrap();
+        let timeout = Duration::from_secs(10);
+        let mut incoming = pin!(accept(listener, ConnectionLimit { limit: 1, timeout, open, refused }));
+
+        let _silent = TcpStream::connect(address).await.unwrap();
+        let mut connection = incoming.next().await.unwrap().unwrap();
+        let accepted = Instant::now();
+        let error = connection.read(&mut [0]).await.unwrap_err();
+        assert_eq!((error.kind(), accepted.elapsed().as_secs()), (io::ErrorKind::TimedOut, 10));
+    }
 
     #[tokio::test]
     async fn connections_are_counted_and_limited_and_have_tcp_nodelay() {

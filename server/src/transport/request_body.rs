@@ -277,7 +277,107 @@ impl http_body::Body for RequestBody {
 
 #[cfg(test)]
 mod tests {
+    use std::future::poll_fn;
+    use std::io;
+
+    use http_body::Body as _;
+    use tokio::sync::mpsc;
+    use tokio::time::timeout;
+
     use super::*;
+
+    /// The data that a client sends.
+    struct Sent(mpsc::Receiver<Vec<u8>>);
+
+    impl http_body::Body for Sent {
+        type Data = Bytes;
+        type Error = Status;
+
+        fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+            self.0.poll_recv(context).map(|data| data.map(|data| Ok(Frame::data(data.into()))))
+        }
+    }
+
+    const STALL: Duration = Duration::from_secs(10);
+
+    /// The body of a request for `path`, and the channel that fills it.
+    fn body(path: &str) -> (RequestBody, mpsc::Sender<Vec<u8>>) {
+        let (sender, data) = mpsc::channel(1);
+        let (log, _guard) = tracing_appender::non_blocking(io::sink());
+        let metrics = Arc::new(Metrics::new(log.error_counter()));
+        let limits = Limits { message_bytes: 1 << 20, stall: STALL };
+        (RequestBody::new(path, Body::new(Sent(data)), None, limits, metrics), sender)
+    }
+
+    /// Reads to the end. Returns the refusal, if there is one, and the seconds until then.
+    async fn read(mut body: RequestBody) -> (Option<Status>, u64) {
+        let started = Instant::now();
+        let refusal = loop {
+            match poll_fn(|context| Pin::new(&mut body).poll_frame(context)).await {
+                Some(Ok(_)) => {}
+                Some(Err(status)) => break Some(status),
+                None => break None,
+            }
+        };
+        (refusal, started.elapsed().as_secs())
+    }
+
+    /// The prefix of a message.
+    fn prefix(length: u32) -> Vec<u8> {
+        [&[0][..], &length.to_be_bytes()].concat()
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_message_that_stalls_is_refused_after_the_stall_timeout() {
+        let (body, sender) = body("/grasp.v1.GraspService/DetectGrasps");
+        sender.send([prefix(100), vec![7; 10]].concat()).await.unwrap();
+        let (refusal, seconds) = read(body).await;
+        let refusal = refusal.unwrap();
+        assert_eq!((refusal.code(), seconds), (Code::DeadlineExceeded, STALL.as_secs()));
+        assert!(refusal.message().contains("stalled for 10s (--stall-timeout), 90 bytes missing"), "{refusal}");
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_message_that_is_too_slow_is_refused_although_it_never_stalls() {
+        let (body, sender) = body("/grasp.v1.GraspService/DetectGrasps");
+        tokio::spawn(async move {
+            let _ = sender.send(prefix(MIN_RATE as u32)).await;
+            while sender.send(vec![7]).await.is_ok() {
+                tokio::time::sleep(STALL * 9 / 10).await;
+            }
+        });
+        let (refusal, seconds) = read(body).await;
+        let refusal = refusal.unwrap();
+        // Two stalls, and one second for 65,536 bytes at the minimum rate.
+        assert_eq!((refusal.code(), seconds), (Code::DeadlineExceeded, 21));
+        assert!(refusal.message().contains("slower than 65536 bytes per second"), "{refusal}");
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn time_in_which_the_server_does_not_read_does_not_count() {
+        let (mut body, sender) = body("/grasp.v1.GraspService/DetectGrasps");
+        sender.send([prefix(2), vec![7]].concat()).await.unwrap();
+        assert!(poll_fn(|context| Pin::new(&mut body).poll_frame(context)).await.unwrap().is_ok());
+        sender.send(vec![7]).await.unwrap();
+        drop(sender);
+        tokio::time::sleep(100 * STALL).await;
+        let (refusal, seconds) = read(body).await;
+        assert_eq!((refusal.map(|refusal| refusal.to_string()), seconds), (None, 0));
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn only_streams_may_pause_between_messages() {
+        let message = [prefix(1), vec![7]].concat();
+        let (stream, sender) = body("/grasp.v1.GraspService/DetectGraspsStream");
+        sender.send(message.clone()).await.unwrap();
+        assert!(timeout(100 * STALL, read(stream)).await.is_err(), "the stream is still open");
+
+        let (unary, sender) = body("/grasp.v1.GraspService/DetectGrasps");
+        sender.send(message).await.unwrap();
+        let (refusal, seconds) = read(unary).await;
+        assert!(refusal.unwrap().message().contains("the end of the request missing"));
+        assert_eq!(seconds, STALL.as_secs());
+    }
 
     #[test]
     fn message_boundaries_are_found_in_pieces_of_any_size() {

@@ -1,0 +1,264 @@
+use std::fs;
+use std::net::SocketAddr;
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use clap::builder::{PathBufValueParser, RangedI64ValueParser, TypedValueParser};
+use clap::{Parser, ValueEnum, value_parser};
+use grasp_models::{Choice, Precision, Provider, Store};
+use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::ParseError;
+
+use crate::serving::reload::{Stamps, stamps};
+use crate::transport::tokens::Tokens;
+
+/// Detects 6-DoF grasps in depth images, point clouds and TSDF volumes, over gRPC.
+///
+/// Each flag can also be set by an environment variable. ORT_DYLIB_PATH is the path of ONNX Runtime's shared library.
+#[derive(Parser)]
+#[command(name = "graspd", version, max_term_width = 100)]
+pub(super) struct Flags {
+    /// Model folder. All .onnx files in it are served.
+    #[arg(
+        long,
+        env = "GRASPD_MODELS",
+        value_name = "DIR",
+        value_parser = PathBufValueParser::new().try_map(Models::read),
+    )]
+    pub models: Models,
+
+    /// Model for requests that name no model, if it accepts their resolution. If not set, the file `default` in the
+    /// model folder names it; without that file it is the first network by name.
+    #[arg(long, env = "GRASPD_DEFAULT_MODEL", value_name = "NAME")]
+    pub default_model: Option<String>,
+
+    /// Address of the gRPC listener. Port 0 selects a free port, which is printed to stdout.
+    #[arg(long, env = "GRASPD_LISTEN", value_name = "ADDR", default_value = "127.0.0.1:50051")]
+    pub listen: SocketAddr,
+
+    /// Address of the HTTP listener: /metrics (Prometheus), /healthz, /readyz and the web page at /.
+    #[arg(long, env = "GRASPD_HTTP", value_name = "ADDR", default_value = "127.0.0.1:9090")]
+    pub http: SocketAddr,
+
+    /// Sessions per model. Each session processes one batch at a time.
+    #[arg(long, env = "GRASPD_WORKERS", value_name = "N", default_value = "1", value_parser = count())]
+    pub workers: u16,
+
+    /// Threads per session. Default: the CPUs available to the process divided by --workers.
+    #[arg(long, env = "GRASPD_THREADS", value_name = "N", value_parser = count())]
+    pub threads: Option<u16>,
+
+    /// Execution provider of ONNX Runtime: cpu, openvino, cuda, tensorrt or auto. auto selects the fastest provider
+    /// that is available and whose outputs match those of cpu in fp32. A named provider that is not available is an
+    /// error.
+    #[arg(long, env = "GRASPD_PROVIDER", value_name = "NAME", default_value = "auto")]
+    pub provider: Choice<Provider>,
+
+    /// Numeric precision: fp32, bf16, fp16, int8 or auto. auto selects the fastest. A named precision that is not
+    /// available is an error.
+    #[arg(long, env = "GRASPD_PRECISION", value_name = "NAME", default_value = "auto")]
+    pub precision: Choice<Precision>,
+
+    /// Queue length per model, requests. If the queue is full, requests are refused immediately.
+    #[arg(long, env = "GRASPD_QUEUE", value_name = "N", default_value = "32", value_parser = count())]
+    pub queue: u16,
+
+    /// Maximum batch size, volumes. Values above 1 raise the throughput on a GPU. On a CPU they only raise the latency.
+    #[arg(long, env = "GRASPD_MAX_BATCH", value_name = "N", default_value = "1", value_parser = count())]
+    pub max_batch: u16,
+
+    /// Maximum time that a session waits for a batch to fill, from the arrival of its first volume, milliseconds. 0
+    /// disables waiting.
+    #[arg(
+        long,
+        env = "GRASPD_BATCH_DELAY",
+        value_name = "MS",
+        default_value = "0",
+        allow_negative_numbers = true,
+        value_parser = milliseconds,
+    )]
+    pub batch_delay: Duration,
+
+    /// Interval at which the model folder is polled for changes, seconds. Changed models are loaded and warmed up in
+    /// the background, then replace the old ones. 0 disables polling. SIGHUP always reloads the folder.
+    #[arg(
+        long,
+        env = "GRASPD_WATCH",
+        value_name = "SECONDS",
+        default_value = "2",
+        allow_negative_numbers = true,
+        value_parser = seconds,
+    )]
+    pub watch: Duration,
+
+    /// Certificate chain of the gRPC listener, PEM. Enables TLS; plaintext connections are then refused.
+    #[arg(
+        long,
+        requires = "tls_key",
+        env = "GRASPD_TLS_CERT",
+        value_name = "FILE",
+        value_parser = PathBufValueParser::new().try_map(Pem::read),
+    )]
+    pub tls_cert: Option<Pem>,
+
+    /// Private key of the certificate, PEM.
+    #[arg(
+        long,
+        requires = "tls_cert",
+        env = "GRASPD_TLS_KEY",
+        value_name = "FILE",
+        value_parser = PathBufValueParser::new().try_map(Pem::read),
+    )]
+    pub tls_key: Option<Pem>,
+
+    /// CA certificates, PEM. Clients must present a certificate that one of them has signed (mutual TLS).
+    #[arg(
+        long,
+        requires = "tls_cert",
+        env = "GRASPD_TLS_CLIENT_CA",
+        value_name = "FILE",
+        value_parser = PathBufValueParser::new().try_map(Pem::read),
+    )]
+    pub tls_client_ca: Option<Pem>,
+
+    /// File of access tokens, one per line. Requests must have the header `authorization: Bearer TOKEN` with one of
+    /// them. SIGHUP reloads the file. Health checks need no token.
+    #[arg(
+        long,
+        env = "GRASPD_TOKEN_FILE",
+        value_name = "FILE",
+        value_parser = PathBufValueParser::new().try_map(tokens),
+    )]
+    pub token_file: Option<Arc<Tokens>>,
+
+    /// Maximum number of open connections. Further connections are closed immediately.
+    #[arg(long, env = "GRASPD_MAX_CONNECTIONS", value_name = "N", default_value = "16384")]
+    pub max_connections: NonZeroUsize,
+
+    /// Maximum number of concurrent TrackGrasps streams, each with one volume. Further streams are refused.
+    #[arg(long, env = "GRASPD_MAX_TRACKED", value_name = "N", default_value = "64", value_parser = count())]
+    pub max_tracked: u16,
+
+    /// Time without a request after which a TrackGrasps stream ends and its volume is dropped, seconds.
+    #[arg(
+        long,
+        env = "GRASPD_TRACK_TIMEOUT",
+        value_name = "SECONDS",
+        default_value = "60",
+        allow_negative_numbers = true,
+        value_parser = seconds,
+    )]
+    pub track_timeout: Duration,
+
+    /// Number of latest requests shown on the web page of the HTTP listener, with their scenes. 0 disables the page.
+    /// Default: 20, or 0 with --token-file, because the page needs no token.
+    #[arg(long, env = "GRASPD_RECENT", value_name = "N")]
+    pub recent: Option<usize>,
+
+    /// Maximum pause within a message, seconds. After it the request is refused.
+    #[arg(
+        long,
+        env = "GRASPD_STALL_TIMEOUT",
+        value_name = "SECONDS",
+        default_value = "10",
+        allow_negative_numbers = true,
+        value_parser = positive_seconds,
+    )]
+    pub stall_timeout: Duration,
+
+    /// Maximum message size, bytes.
+    #[arg(long, env = "GRASPD_MAX_MESSAGE_BYTES", value_name = "N", default_value = "16777216")]
+    pub max_message_bytes: NonZeroUsize,
+
+    /// Time that accepted requests have to finish after SIGTERM, seconds.
+    #[arg(
+        long,
+        env = "GRASPD_DRAIN_TIMEOUT",
+        value_name = "SECONDS",
+        default_value = "20",
+        allow_negative_numbers = true,
+        value_parser = seconds,
+    )]
+    pub drain_timeout: Duration,
+
+    /// OpenTelemetry collector that receives a trace of each request, over OTLP/gRPC without TLS, such as
+    /// http://127.0.0.1:4317. Requests with a W3C `traceparent` header join that trace. If not set, tracing is
+    /// disabled.
+    #[arg(long, env = "GRASPD_OTLP", value_name = "URL")]
+    pub otlp: Option<String>,
+
+    /// Log filter: a level, or directives of Rust's `tracing` such as `warn,graspd=debug`. The log goes to stderr.
+    #[arg(long, env = "GRASPD_LOG", value_name = "FILTER", default_value = "info", value_parser = log_filter)]
+    pub log: String,
+
+    /// Log format: text or json.
+    #[arg(long, value_enum, env = "GRASPD_LOG_FORMAT", value_name = "FORMAT", default_value = "text")]
+    pub log_format: LogFormat,
+}
+
+/// Format of the log.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum LogFormat {
+    Text,
+    Json,
+}
+
+/// A model folder and its files' metadata.
+#[derive(Clone)]
+pub(super) struct Models {
+    pub store: Store,
+    /// Taken before the store's files were read.
+    pub stamps: Stamps,
+}
+
+impl Models {
+    fn read(folder: PathBuf) -> Result<Self, grasp_models::StoreError> {
+        let stamps = stamps(&folder);
+        Ok(Self { store: Store::open(&folder)?, stamps })
+    }
+}
+
+/// The content of a PEM file.
+#[derive(Clone)]
+pub(super) struct Pem(pub Vec<u8>);
+
+impl Pem {
+    fn read(file: PathBuf) -> std::io::Result<Self> {
+        fs::read(file).map(Self)
+    }
+}
+
+/// A number of threads, sessions, volumes or queued requests.
+fn count() -> RangedI64ValueParser<u16> {
+    value_parser!(u16).range(1..=1024)
+}
+
+fn tokens(file: PathBuf) -> Result<Arc<Tokens>, String> {
+    // clap prints the outermost error only.
+    Tokens::read(file).map(Arc::new).map_err(|error| format!("{error:#}"))
+}
+
+fn log_filter(text: &str) -> Result<String, ParseError> {
+    EnvFilter::try_new(text).map(|_| text.to_owned())
+}
+
+fn seconds(text: &str) -> Result<Duration, &'static str> {
+    let seconds = text.parse().ok().filter(|seconds: &f64| *seconds <= LONGEST);
+    seconds.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok()).ok_or("must be from 0 to 1,000,000")
+}
+
+/// Adding a much longer duration to an `Instant` would overflow.
+const LONGEST: f64 = 1e6;
+
+fn positive_seconds(text: &str) -> Result<Duration, &'static str> {
+    match seconds(text) {
+        Ok(Duration::ZERO) => Err("must be greater than 0"),
+        seconds => seconds,
+    }
+}
+
+fn milliseconds(text: &str) -> Result<Duration, &'static str> {
+    seconds(text).map(|milliseconds| milliseconds / 1000)
+}
