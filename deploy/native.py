@@ -2,11 +2,11 @@
 """Downloads the native libraries that cargo cannot download, and prints their paths.
 
     native.py onnxruntime      the shared library, for ORT_DYLIB_PATH
-    native.py onnxruntime-gpu  the one for NVIDIA cards, likewise; it needs CUDA 13
+    native.py onnxruntime-gpu  the same for NVIDIA GPUs; it needs CUDA 13
     native.py libtorch         a folder with lib/ and include/, for LIBTORCH (training only)
 
-Only the path goes to stdout. If the variable is set, its path is checked and printed. Downloads stay in
-${GRASPD_CACHE:-~/.cache/graspd}: a second run does not use the network.
+Only the path is printed to stdout. If the variable is set, its path is checked and printed. Downloads are kept in
+${GRASPD_CACHE:-~/.cache/graspd}, so that a second run does not use the network.
 """
 
 import os
@@ -15,8 +15,8 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Callable, Dict, List, NamedTuple
 
-# Wheels are the one form in which these libraries are published, with a hash, for every platform.
-# Only C libraries are unpacked, so the wheels of one CPython serve every Python that runs this file.
+# Wheels are the only form in which these libraries are published for every platform with a hash.
+# Only C libraries are unpacked, so that the wheels of one CPython version work with every Python.
 WHEEL_PYTHON = ["--implementation", "cp", "--python-version", "3.11", "--abi", "cp311"]
 PLATFORM_TAGS = {
     "Linux-x86_64": ["manylinux_2_28_x86_64", "manylinux_2_25_x86_64", "manylinux2014_x86_64"],
@@ -33,13 +33,13 @@ class Wheel(NamedTuple):
 
 class Artefact(NamedTuple):
     title: str
-    folder: str  # in the cache; names the version, so that another version is another folder
-    result: str  # what is printed, inside that folder
+    folder: str  # folder in the cache; contains the version
+    result: str  # path in that folder that is printed
     wheels: List[Wheel]
 
 
 ONNXRUNTIME = {
-    # The OpenVINO build, because it brings that provider as well; it trails the plain one by some versions.
+    # The OpenVINO build, because it includes that provider. It is some versions behind the plain build.
     "Linux-x86_64": Artefact("ONNX Runtime 1.24.1 with OpenVINO", "onnxruntime-openvino-1.24.1", "libonnxruntime.so.1.24.1", [
         Wheel("onnxruntime-openvino==1.24.1", 84, "3007c803634cc69c6d52af1dea7ce729d9bb62b9a11070fd2f959119199007a8"),
     ]),
@@ -56,7 +56,7 @@ ONNXRUNTIME_GPU = {
     ]),
 }
 LIBTORCH = {
-    # libtorch_cpu.so is linked against two CUDA libraries even where there is no GPU.
+    # libtorch_cpu.so is linked against two CUDA libraries even without a GPU.
     "Linux-x86_64": Artefact("libtorch 2.11.0 for the CPU", "libtorch-2.11.0", "", [
         Wheel("torch==2.11.0", 531, "7aa2f9bbc6d4595ba72138026b2074be1233186150e9292865e04b7a63b8c67a"),
         Wheel("nvidia-cuda-runtime==13.0.96", 2, "7f82250d7782aa23b6cfe765ecc7db554bd3c2870c43f3d1821f1d18aebf0548"),
@@ -69,7 +69,7 @@ LIBTORCH = {
     ]),
 }
 
-# What is unpacked: the folder in the wheel, the folder it goes to, and the files' patterns.
+# Unpacked files: folder in the wheel, destination folder, file name patterns.
 UNPACKED = [
     ("onnxruntime/capi/", "", ["lib*"]),
     ("torch/include/", "include/", ["*"]),
@@ -79,12 +79,12 @@ UNPACKED = [
 
 CACHE_HOME = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
 CACHE = Path(os.environ.get("GRASPD_CACHE") or f"{CACHE_HOME}/graspd").expanduser().absolute()
-WHEELS = CACHE / "wheels"  # for wheels brought from another machine; looked at first
+WHEELS = CACHE / "wheels"  # for wheels copied from another machine; searched first
 PLATFORM = "{0.sysname}-{0.machine}".format(os.uname()) if hasattr(os, "uname") else sys.platform
 
 
 class Unavailable(Exception):
-    """Says what is missing and how to get it."""
+    """A library is not available. The message says how to provide it."""
 
 
 def onnxruntime() -> Path:
@@ -100,7 +100,7 @@ def runtime(title: str, artefacts: Dict[str, Artefact]) -> Path:
         return given("ORT_DYLIB_PATH")
     otherwise = "set ORT_DYLIB_PATH to the shared library of an ONNX Runtime, 1.24 or newer"
     if PLATFORM not in artefacts:
-        raise Unavailable(f"There is no wheel of {title} for {PLATFORM}: {otherwise}.")
+        raise Unavailable(f"{title} has no wheel for {PLATFORM}: {otherwise}.")
     return from_wheels(artefacts[PLATFORM], otherwise)
 
 
@@ -119,19 +119,19 @@ def given(variable: str, *inside: str) -> Path:
     path = Path(os.environ[variable]).absolute()
     for wanted in [path, *map(path.joinpath, inside)]:
         if not wanted.exists():
-            raise Unavailable(f"{variable} is {path}, but there is no {wanted}: correct it or unset it.")
+            raise Unavailable(f"{variable} is {path}, but {wanted} does not exist: correct or unset {variable}.")
     return path
 
 
 def from_wheels(artefact: Artefact, otherwise: str) -> Path:
-    # The platform is in the name because several machines may share a home directory.
+    # The name contains the platform, because several machines may share a home directory.
     folder = CACHE / f"{artefact.folder}-{PLATFORM}"
 
     def build(part: Path) -> None:
         fetch(artefact, part / "wheels", folder, otherwise)
         unpack(part / "wheels", part)
         if (part / "lib/libtorch_cpu.so").exists():
-            # torch-sys links with `torch`: a stub that wants CUDA in the wheel, here a linker script.
+            # torch-sys links against `torch`. In the wheel that is a stub which needs CUDA; here it is a linker script.
             (part / "lib/libtorch.so").write_text("INPUT(-ltorch_cpu -lc10)\n")
 
     return built_once(folder, build) / artefact.result
@@ -149,8 +149,8 @@ def fetch(artefact: Artefact, into: Path, folder: Path, otherwise: str) -> None:
     pins = into / "pins.txt"
     pins.write_text("".join(f"{wheel.requirement} --hash=sha256:{wheel.sha256}\n" for wheel in artefact.wheels))
     pip(["download", *selection, "--require-hashes", "--dest", str(into), "--requirement", str(pins)], names, f"""\
-{artefact.title} could not be fetched; pip says above why.
-To bring it from a machine with a network, run this there,
+{artefact.title} could not be downloaded; pip's error is above.
+On a machine with network access, run
     python3 -m pip download {' '.join(selection)} --dest wheels {' '.join(names)}
 and copy the wheels into {WHEELS}/
 or {otherwise}.""")
@@ -163,12 +163,12 @@ def pip(arguments: List[str], names: List[str], failure: str) -> None:
     if importlib.util.find_spec("pip") is None:
         raise Unavailable(f"{sys.executable} has no pip (Debian, Ubuntu: apt install python3-pip).\n{failure}")
     WHEELS.mkdir(exist_ok=True)
-    # No copy in pip's own cache: the result is kept here.
+    # Not in pip's own cache, because the result is kept here.
     manner = ["--no-cache-dir", "--retries", "2", "--disable-pip-version-check", "--find-links", str(WHEELS)]
     if all(any(WHEELS.glob(name.replace("-", "_").replace("==", "-") + "-*.whl")) for name in names):
         manner.append("--no-index")
     if not sys.stderr.isatty():
-        manner.append("--quiet")  # without a terminal the progress bar is noise
+        manner.append("--quiet")  # no progress bar without a terminal
     if subprocess.run([sys.executable, "-m", "pip", *arguments, *manner], stdout=sys.stderr).returncode:
         raise Unavailable(failure)
 
@@ -192,7 +192,7 @@ def unpack(wheels: Path, part: Path) -> None:
 
 
 def built_once(folder: Path, build: Callable[[Path], None]) -> Path:
-    """Builds `folder` unless it exists. It appears whole or not at all, also if several runs build it or one is killed."""
+    """Builds `folder` unless it exists. It is created atomically, also with concurrent or killed runs."""
     if folder.is_dir():
         return folder
     import fcntl
@@ -204,10 +204,10 @@ def built_once(folder: Path, build: Callable[[Path], None]) -> Path:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            say(f"Waiting for the run that is fetching {folder}")
+            say(f"Waiting for another run that downloads {folder}")
             fcntl.flock(lock, fcntl.LOCK_EX)
         if not folder.is_dir():
-            shutil.rmtree(part, ignore_errors=True)  # left by a run that was cut off
+            shutil.rmtree(part, ignore_errors=True)  # left by an interrupted run
             part.mkdir()
             try:
                 build(part)
@@ -222,7 +222,7 @@ def say(line: str) -> None:
 
 
 def main(name: str, doc: str, commands: List[Callable[[], Path]]) -> None:
-    """Runs the command that the command line names."""
+    """Runs the command of the command line."""
     subcommands = {command.__name__.replace("_", "-"): command for command in commands}
     if sys.argv[1:] not in [[subcommand] for subcommand in subcommands]:
         sys.exit(doc)

@@ -1,11 +1,13 @@
 #!/bin/sh
-# One machine's share of a data set. Part INDEX of PARTS labels its range of the SCENES into DATA/part-INDEX; what the
-# machine is told besides goes to `grasp-sim label`. A machine that was lost takes its part up where it stopped.
+# Labels one part of a data set: part INDEX of PARTS writes its range of the SCENES to DATA/part-INDEX. Arguments are
+# passed to `grasp-sim label`. When a part is started again it continues where it stopped.
 set -eu
 
-: "${DATA:?is the folder that all machines see}" "${SCENES:?is the number of scenes}" "${PARTS:?is the number of machines}"
-# Kubernetes numbers the pods of an Indexed Job so, Slurm the tasks of an array.
-INDEX=${JOB_COMPLETION_INDEX:-${SLURM_ARRAY_TASK_ID:?is the number of this machine, from 0}}
+: "${DATA:?set it to the shared folder}"
+: "${SCENES:?set it to the number of scenes}"
+: "${PARTS:?set it to the number of parts}"
+# The index of a pod in a Kubernetes Indexed Job, or of a task in a Slurm array.
+INDEX=${JOB_COMPLETION_INDEX:-${SLURM_ARRAY_TASK_ID:?set it to the index of this part, from 0}}
 
 first=$((SCENES * INDEX / PARTS))
 end=$((SCENES * (INDEX + 1) / PARTS))

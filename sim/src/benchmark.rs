@@ -115,9 +115,9 @@ impl Benchmark {
             .into_par_iter()
             .map(|number| {
                 let waiting = idle().pop();
-                let mut player = waiting.map_or_else(|| planner.build(params, options), Ok)?;
-                let round = self.play(number, &mut player, &watch);
-                idle().push(player);
+                let mut planner = waiting.map_or_else(|| planner.build(params, options), Ok)?;
+                let round = self.round(number, &mut planner, &watch);
+                idle().push(planner);
                 watch(Event::Round);
                 round
             })
@@ -139,7 +139,7 @@ impl Benchmark {
         Observation::new(observe(world, &self.views, self.noise, rng))
     }
 
-    fn play(&self, number: u64, planner: &mut BenchPlanner, watch: impl Fn(Event<'_>)) -> anyhow::Result<Round> {
+    fn round(&self, number: u64, planner: &mut BenchPlanner, watch: impl Fn(Event<'_>)) -> anyhow::Result<Round> {
         let (mut world, mut rng) = self.scene(number);
         let mut round = Round {
             objects: world.objects().len(),

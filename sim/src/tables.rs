@@ -1,4 +1,4 @@
-//! The tables of *6-DoF Robotic Grasping with Transformer*, as they come out here beside what is published.
+//! The tables of *6-DoF Robotic Grasping with Transformer*: our results beside the published ones.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -7,42 +7,42 @@ use serde::{Deserialize, Serialize};
 
 use crate::score::{Spread, Summary};
 
-/// A scenario of the benchmark, as it is written in results.
+/// Name of a scenario of the benchmark in the results.
 pub type Scenario = &'static str;
 
 /// Both scenarios.
 pub const SCENARIOS: [Scenario; 2] = ["packed", "pile"];
 
-/// The cameras that networks are looked at from: the paper's view first.
+/// Camera views for which networks are evaluated, with their names in the tables; the paper's view first.
 pub const VIEWS: [(&str, &str); 5] = [
-    ("side", "the paper's side view"),
-    ("side:90", "turned by 90°"),
-    ("side:180", "turned by 180°"),
-    ("random:1-6", "one to six from anywhere"),
-    ("circle", "six from above"),
+    ("side", "side view (paper)"),
+    ("side:90", "side view + 90°"),
+    ("side:180", "side view + 180°"),
+    ("random:1-6", "1–6 random views"),
+    ("circle", "6 views from above"),
 ];
 
-/// ε in hundredths, as it is swept.
+/// Values of ε in the threshold table, in hundredths.
 pub const EPSILONS: [u8; 3] = [80, EPSILON, 95];
 
-/// ε of all other tables, in hundredths.
+/// ε in all other tables, in hundredths.
 pub const EPSILON: u8 = 90;
 
-/// The objects of a game that are ours; others have the name of their folder.
+/// Name of the procedural test objects. Other object sets have the name of their folder.
 pub const TEST_OBJECTS: &str = "test";
 
-/// A physics engine in which tables are cleared.
+/// A simulator in which the benchmark runs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Simulator {
-    /// The one of this crate.
+    /// This crate.
     Rapier,
     /// `sim/pybullet`.
     PyBullet,
 }
 
 impl Simulator {
-    /// As it is written in the tables.
+    /// Name in the tables.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -52,54 +52,55 @@ impl Simulator {
     }
 }
 
-/// What a cell of a table is about.
+/// The configuration of a benchmark run.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Condition {
-    /// The planner's name in the tables.
+    /// Name of the planner in the tables.
     pub method: String,
-    /// The scenario that its network learnt from, if it learnt from one only.
-    pub learnt: Option<String>,
-    /// The scenario that it is tried on.
+    /// The scenario that its network was trained on; `None` for several, or without a network.
+    #[serde(alias = "learnt")]
+    pub trained_on: Option<String>,
+    /// The scenario of the scenes.
     pub scenario: String,
-    /// What the scenes are made of: [`TEST_OBJECTS`], or the name of a folder.
+    /// Object set: [`TEST_OBJECTS`], or the name of a folder.
     pub objects: String,
-    /// Where tables are cleared.
+    /// The simulator.
     pub simulator: Simulator,
-    /// Where the cameras stand.
+    /// Camera views.
     pub views: String,
-    /// ε in hundredths.
+    /// ε, the smallest quality of a grasp, in hundredths.
     pub epsilon: u8,
-    /// Whether the best grasp alone is taken, down to 0.5, when none reaches ε.
+    /// If no grasp reaches ε: whether the best one down to 0.5 is taken.
     pub forced: bool,
 }
 
 impl Condition {
-    /// Whether the planner's network learnt from the scenario that it is tried on, if it learnt from one only.
-    fn learnt_here(&self) -> bool {
-        self.learnt.as_ref().is_none_or(|learnt| *learnt == self.scenario)
+    /// Whether the planner was not trained on the other scenario only.
+    fn is_same_scenario(&self) -> bool {
+        self.trained_on.as_ref().is_none_or(|trained_on| *trained_on == self.scenario)
     }
 
-    /// Whether the paper has it: its view, its ε, and `force`, with objects that are made from seeds.
+    /// Whether it is the paper's: its view, its ε, `force`, and the test objects.
     fn is_as_published(&self) -> bool {
         self.objects == TEST_OBJECTS && self.views == VIEWS[0].0 && self.epsilon == EPSILON && self.forced
     }
 
-    /// The same, in the simulator of this crate.
-    fn is_as_published_here(&self) -> bool {
+    /// The same, in rapier.
+    fn is_as_published_in_rapier(&self) -> bool {
         self.is_as_published() && self.simulator == Simulator::Rapier
     }
 }
 
-/// What was measured.
+/// The measurements.
 #[derive(Clone, Debug, Default)]
 pub struct Results {
-    /// A summary for each seed.
+    /// One summary per seed.
     pub conditions: BTreeMap<Condition, Vec<Summary>>,
-    /// Milliseconds to plan, by method and scenario, one observation at a time.
+    /// Planning time in milliseconds by method and scenario, one observation at a time.
     pub times: BTreeMap<(String, String), Spread>,
-    /// What the networks learnt from, by the names of their files: scenes and grasps.
+    /// Training data by file name of the network: numbers of scenes and grasps.
     pub data: BTreeMap<String, (String, String)>,
-    /// Objects of the test sets, by scenario.
+    /// Number of test objects by scenario.
     pub test_objects: BTreeMap<String, usize>,
 }
 
@@ -115,7 +116,7 @@ const PUBLISHED: [(&str, [&str; 4]); 6] = [
 
 const OF_PAPER: [&str; 4] = ["79.7 ± 2.0", "85.9 ± 1.7", "66.9 ± 3.0", "50.9 ± 3.5"];
 
-/// The same for networks that learnt from the other scenario.
+/// The same for networks trained on the other scenario.
 const PUBLISHED_CROSSED: [(&str, [&str; 4]); 3] = [
     (RELEASED, ["60.1 ± 1.8", "63.2 ± 1.8", "44.9 ± 1.2", "33.5 ± 1.3"]),
     ("transformer", CROSSED_OF_PAPER),
@@ -131,50 +132,51 @@ const PUBLISHED_TIMES: [(&str, [&str; 2]); 3] = [
     ("transformer-small", ["24.3 ± 0.7", "24.6 ± 1.1"]),
 ];
 
-/// What VGN's released weights are called, as in the paper.
+/// Name of VGN's released weights, as in the paper.
 pub const RELEASED: &str = "VGN-R";
 
-/// What a method's name ends with if its network learnt from both scenarios.
-pub const LEARNT_BOTH: &str = " (both)";
+/// Suffix of a method whose network was trained on both scenarios.
+pub const TRAINED_ON_BOTH: &str = " (both)";
 
 impl Results {
-    /// The tables in Markdown, under a head of one's own.
+    /// The tables in Markdown, without a title.
     #[must_use]
     pub fn markdown(&self) -> String {
         let mut text = String::new();
         self.data(&mut text);
-        text.push_str("\n## Table 2: clearing tables\n\n");
-        self.success(&mut text, &PUBLISHED, &self.simulators(), Condition::learnt_here);
-        self.elsewhere(&mut text);
-        text.push_str("\n## Table 3: milliseconds to plan\n\n");
+        text.push_str("\n## Table 2: clutter removal\n\n");
+        self.success(&mut text, &PUBLISHED, &self.simulators(), Condition::is_same_scenario);
+        self.other_objects(&mut text);
+        text.push_str("\n## Table 3: planning time, ms\n\n");
         self.times(&mut text);
-        text.push_str("\n## Table 4: learnt from the other scenario\n\n");
+        text.push_str("\n## Table 4: generalisation to the other scenario\n\n");
         text.push_str(
-            "A network that began with the weights of one for the other scenario has seen it: its card says so.\n\n",
+            "Networks trained on one scenario, evaluated on the other. The card of a network says whether its training started\n\
+             with the weights of the other scenario.\n\n",
         );
-        self.success(&mut text, &PUBLISHED_CROSSED, &[Simulator::Rapier], |condition| !condition.learnt_here());
-        text.push_str("\n## How sure a grasp must be\n\n");
+        self.success(&mut text, &PUBLISHED_CROSSED, &[Simulator::Rapier], |condition| !condition.is_same_scenario());
+        text.push_str("\n## Threshold ε\n\n");
         self.epsilons(&mut text);
-        text.push_str("\n## Where the camera stands\n\n");
+        text.push_str("\n## Camera views\n\n");
         self.views(&mut text);
-        text.push_str("\n## How it ended\n\n");
+        text.push_str("\n## Outcomes\n\n");
         self.endings(&mut text);
         text
     }
 
     fn data(&self, text: &mut String) {
-        text.push_str("## Table 1: what was learnt from\n\n| | scenes | grasps | test objects |\n|---|---|---|---|\n");
+        text.push_str("## Table 1: training data\n\n| | scenes | grasps | test objects |\n|---|---|---|---|\n");
         text.push_str("| pile, published | 83,305 | 1,564,546 | 40 |\n| packed, published | 16,640 | 638,012 | 16 |\n");
         for scenario in SCENARIOS {
             let objects = self.test_objects.get(scenario).map_or_else(String::new, usize::to_string);
-            let _ = writeln!(text, "| {scenario}, here | | | {objects} |");
+            let _ = writeln!(text, "| {scenario}, ours | | | {objects} |");
         }
         for (file, (scenes, grasps)) in &self.data {
             let _ = writeln!(text, "| `{file}` | {scenes} | {grasps} | |");
         }
     }
 
-    /// Those in which tables were cleared.
+    /// The simulators with results.
     fn simulators(&self) -> Vec<Simulator> {
         self.conditions.keys().map(|condition| condition.simulator).collect::<BTreeSet<_>>().into_iter().collect()
     }
@@ -184,7 +186,7 @@ impl Results {
         text: &mut String,
         published: &[(&str, [&str; 4])],
         simulators: &[Simulator],
-        wanted: impl Fn(&Condition) -> bool,
+        is_wanted: impl Fn(&Condition) -> bool,
     ) {
         let columns = SCENARIOS.into_iter().flat_map(|scenario| [(scenario, "GSR"), (scenario, "DR")]);
         text.push('|');
@@ -196,24 +198,25 @@ impl Results {
         }
         let _ = writeln!(text, " |\n|{}", "---|".repeat(1 + 4 * (simulators.len() + 1)));
         let conditions =
-            || self.conditions.iter().filter(|(condition, _)| condition.is_as_published() && wanted(condition));
+            || self.conditions.iter().filter(|(condition, _)| condition.is_as_published() && is_wanted(condition));
         for method in in_order(conditions().map(|(condition, _)| condition.method.as_str())) {
-            let name = method.strip_suffix(LEARNT_BOTH).unwrap_or(method);
+            let name = method.strip_suffix(TRAINED_ON_BOTH).unwrap_or(method);
             let of_method = published.iter().find(|(other, _)| *other == name).map(|(_, figures)| figures);
             let _ = write!(text, "| {method} ");
             for (column, scenario) in SCENARIOS.into_iter().enumerate() {
-                let played = |simulator| {
+                let summaries = |simulator| {
                     let is_it = |condition: &Condition| {
                         (condition.method.as_str(), condition.scenario.as_str(), condition.simulator)
                             == (method, scenario, simulator)
                     };
-                    conditions().find(|(condition, _)| is_it(condition)).map(|(_, played)| played)
+                    conditions().find(|(condition, _)| is_it(condition)).map(|(_, summaries)| summaries)
                 };
                 let figures: [fn(&Summary) -> f64; 2] = [|summary| summary.gsr, |summary| summary.dr];
                 for (index, figure) in figures.into_iter().enumerate() {
                     for &simulator in simulators {
-                        let here = played(simulator).map_or_else(|| "–".to_owned(), |played| spread(played, figure));
-                        let _ = write!(text, "| {here} ");
+                        let ours =
+                            summaries(simulator).map_or_else(|| "–".to_owned(), |summaries| spread(summaries, figure));
+                        let _ = write!(text, "| {ours} ");
                     }
                     let _ = write!(text, "| {} ", of_method.map_or("–", |figures| figures[2 * column + index]));
                 }
@@ -222,11 +225,11 @@ impl Results {
         }
     }
 
-    /// A table for each other set of objects.
-    fn elsewhere(&self, text: &mut String) {
+    /// One table per other object set.
+    fn other_objects(&self, text: &mut String) {
         let others = || self.conditions.iter().filter(|(condition, _)| condition.objects != TEST_OBJECTS);
         for objects in others().map(|(condition, _)| condition.objects.as_str()).collect::<BTreeSet<_>>() {
-            let _ = write!(text, "\n### The same with the objects of `{objects}`\n\nGSR / DR in %, pooled.\n\n|");
+            let _ = write!(text, "\n### Objects of `{objects}`\n\nGSR / DR in %, pooled.\n\n|");
             let columns: Vec<_> = SCENARIOS
                 .into_iter()
                 .flat_map(|scenario| self.simulators().into_iter().map(move |simulator| (scenario, simulator)))
@@ -243,8 +246,12 @@ impl Results {
                         (condition.method.as_str(), condition.scenario.as_str(), condition.simulator)
                             == (method, scenario, simulator)
                     };
-                    let played = conditions().find(|(condition, _)| is_it(condition));
-                    let _ = write!(text, " {} |", played.map_or_else(|| "–".to_owned(), |(_, played)| pooled(played)));
+                    let summaries = conditions().find(|(condition, _)| is_it(condition));
+                    let _ = write!(
+                        text,
+                        " {} |",
+                        summaries.map_or_else(|| "–".to_owned(), |(_, summaries)| pooled(summaries))
+                    );
                 }
                 text.push('\n');
             }
@@ -254,17 +261,18 @@ impl Results {
     fn times(&self, text: &mut String) {
         text.push_str("| | packed | published | pile | published |\n|---|---|---|---|---|\n");
         for method in in_order(self.times.keys().map(|(method, _)| method.as_str())) {
-            let published =
-                PUBLISHED_TIMES.iter().find(|(name, _)| *name == method.strip_suffix(LEARNT_BOTH).unwrap_or(method));
+            let published = PUBLISHED_TIMES
+                .iter()
+                .find(|(name, _)| *name == method.strip_suffix(TRAINED_ON_BOTH).unwrap_or(method));
             let published = published.map(|(_, times)| times);
             let mut row = format!("| {method} ");
             for (column, scenario) in SCENARIOS.into_iter().enumerate() {
-                let here = self.times.get(&(method.to_owned(), scenario.to_owned()));
-                let here = here.map_or_else(
+                let ours = self.times.get(&(method.to_owned(), scenario.to_owned()));
+                let ours = ours.map_or_else(
                     || "–".to_owned(),
                     |time| format!("{:.1} ± {:.1} (n {})", time.mean, time.std.unwrap_or(0.0), time.n),
                 );
-                let _ = write!(row, "| {here} | {} ", published.map_or("–", |times| times[column]));
+                let _ = write!(row, "| {ours} | {} ", published.map_or("–", |times| times[column]));
             }
             text.push_str(&row);
             text.push_str("|\n");
@@ -280,9 +288,9 @@ impl Results {
 
     fn epsilons(&self, text: &mut String) {
         text.push_str(
-            "GSR / DR in rapier in %, pooled, from the paper's view, by ε, where nothing below it is taken: with `force`, the\n",
+            "GSR / DR in rapier in %, pooled, with the paper's view and without `force`. With `force` the result does not depend\n",
         );
-        text.push_str("best grasp is the same whatever ε is.\n\n| |");
+        text.push_str("on ε, because the best grasp is executed.\n\n| |");
         EPSILONS.iter().for_each(|epsilon| text.push_str(&format!(" 0.{epsilon} |")));
         text.push_str(&format!("\n|---|{}\n", "---|".repeat(EPSILONS.len())));
         let strict = self.conditions.keys().filter(|condition| !condition.forced);
@@ -304,7 +312,7 @@ impl Results {
         );
     }
 
-    /// A row for each network and scenario among the games, of the cells that are made of it.
+    /// A row for each network and scenario of `conditions`. `cells` derive the condition of each cell.
     fn rows<'a>(
         &self,
         text: &mut String,
@@ -320,8 +328,10 @@ impl Results {
         for condition in conditions.map(as_published).collect::<BTreeSet<_>>() {
             let _ = write!(text, "| {} on {} |", condition.method, condition.scenario);
             for cell in cells.clone() {
-                let figures =
-                    self.conditions.get(&cell(&condition)).map_or_else(|| "–".to_owned(), |played| pooled(played));
+                let figures = self
+                    .conditions
+                    .get(&cell(&condition))
+                    .map_or_else(|| "–".to_owned(), |summaries| pooled(summaries));
                 let _ = write!(text, " {figures} |");
             }
             text.push('\n');
@@ -329,16 +339,16 @@ impl Results {
     }
 
     fn endings(&self, text: &mut String) {
-        text.push_str("Of the attempts from the paper's view in rapier, in %; and of the rounds.\n\n");
-        text.push_str("| | attempts | lifted | blocked at the pre-grasp | closed on nothing | lost in the lift | ");
-        text.push_str("rounds | cleared | nothing seen | no proposal | two failures |\n");
+        text.push_str("Shares of the attempts and of the rounds, in %, with the paper's view in rapier.\n\n");
+        text.push_str("| | attempts | success | blocked at the pre-grasp | empty grasp | object lost in the lift | ");
+        text.push_str("rounds | cleared | no object visible | no grasp | two failures |\n");
         text.push_str("|---|---|---|---|---|---|---|---|---|---|---|\n");
-        let conditions = || self.conditions.iter().filter(|(condition, _)| condition.is_as_published_here());
+        let conditions = || self.conditions.iter().filter(|(condition, _)| condition.is_as_published_in_rapier());
         let methods = in_order(conditions().map(|(condition, _)| condition.method.as_str()));
-        for (condition, played) in
+        for (condition, summaries) in
             methods.iter().flat_map(|method| conditions().filter(|(condition, _)| condition.method == *method))
         {
-            let sum = |figure: fn(&Summary) -> usize| played.iter().map(figure).sum::<usize>();
+            let sum = |figure: fn(&Summary) -> usize| summaries.iter().map(figure).sum::<usize>();
             let share = |part: usize, whole: usize| match whole {
                 0 => "–".to_owned(),
                 whole => format!("{:.1}", part as f64 / whole as f64 * 100.0),
@@ -366,7 +376,7 @@ impl Results {
     }
 }
 
-/// Each once: first the baselines as the paper has them, then the networks by their names.
+/// Sorted without duplicates: the baselines in the paper's order, then the networks by name.
 fn in_order<'a>(methods: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
     const BASELINES: [&str; 6] = ["random", "shaf", "shaf (proposals)", "gpd", RELEASED, "vgn"];
     let mut methods: Vec<&str> = methods.collect();
@@ -377,19 +387,19 @@ fn in_order<'a>(methods: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
 }
 
 fn name(condition: &Condition) -> String {
-    match &condition.learnt {
-        Some(learnt) if *learnt != condition.scenario => format!("{}, learnt from {learnt},", condition.method),
+    match &condition.trained_on {
+        Some(other) if *other != condition.scenario => format!("{}, trained on {other},", condition.method),
         _ => condition.method.clone(),
     }
 }
 
-fn spread(played: &[Summary], figure: fn(&Summary) -> f64) -> String {
-    let values: Vec<f64> = played.iter().map(figure).collect();
+fn spread(summaries: &[Summary], figure: fn(&Summary) -> f64) -> String {
+    let values: Vec<f64> = summaries.iter().map(figure).collect();
     Spread::of(&values).map_or_else(|| "–".to_owned(), |spread| spread.percent())
 }
 
-fn pooled(played: &[Summary]) -> String {
-    let sum = |figure: fn(&Summary) -> usize| played.iter().map(figure).sum::<usize>() as f64;
+fn pooled(summaries: &[Summary]) -> String {
+    let sum = |figure: fn(&Summary) -> usize| summaries.iter().map(figure).sum::<usize>() as f64;
     let successes = sum(|s| s.successes) * 100.0;
     format!("{:.1} / {:.1}", successes / sum(|s| s.attempts).max(1.0), successes / sum(|s| s.objects).max(1.0))
 }

@@ -371,8 +371,8 @@ fn conditions_of_the_tables_run_once() {
     // An unknown ONNX field: another file, the same network.
     network.extend([0xF8, 0x3F, 0x01]);
     fs::write(desk.path("zoo/vgn-packed.onnx"), network).unwrap();
-    let (played, _) = missing(&desk);
-    assert!(played > 5 && played < all, "{played} of {all}: conditions without the network are kept");
+    let (repeated, _) = missing(&desk);
+    assert!(repeated > 5 && repeated < all, "{repeated} of {all}: conditions without the network are kept");
 }
 
 #[test]

@@ -1,4 +1,4 @@
-"""How long OpenVINO's own runtime takes, with nothing around it: what `benchmark_app -hint latency -niter N` measures.
+"""Latency of OpenVINO's own runtime, as measured by `benchmark_app -hint latency -niter N`.
 
     python tests/peers/openvino_latency.py --model models/zoo/vgn-packed.onnx --threads 2 --precision bf16 --calls 500
 
@@ -22,7 +22,7 @@ def main() -> None:
 
     core = openvino.Core()
     model = core.read_model(chosen.model)
-    # One volume, known beforehand: the best case, and the only one that benchmark_app runs synchronously.
+    # A fixed batch size of 1: the fastest case, and the only one that benchmark_app runs synchronously.
     model.reshape([1, *list(model.input().partial_shape)[1:]])
     compiled = core.compile_model(
         model,
@@ -34,14 +34,14 @@ def main() -> None:
         },
     )
     request = compiled.create_infer_request()
-    # Written once, where the network reads it.
+    # The input is written once, into the tensor that the network reads.
     tsdf = request.get_input_tensor().data
     tsdf[:] = np.random.default_rng(0).random(tsdf.shape, np.float32)
     request.infer()
     times = np.empty(chosen.calls)
     for call in range(chosen.calls):
         request.infer()
-        # Milliseconds, of the inference alone.
+        # Milliseconds, of the inference only.
         times[call] = request.latency
 
     p50, p99 = np.percentile(times, [50, 99])

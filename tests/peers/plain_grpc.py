@@ -1,8 +1,8 @@
-"""What a good Python programmer would write in an afternoon: graspd's service with grpcio, onnxruntime and scipy.
+"""A plain Python implementation of graspd's service, with grpcio, onnxruntime and scipy, for comparison.
 
     GRASPD_PROTO=proto/proto python tests/peers/plain_grpc.py --model models/zoo/vgn-packed.onnx --threads 2
 
-Says on stdout where it listens, then `ready`. SIGTERM ends it.
+Prints its address to stdout, then `ready`. SIGTERM terminates it.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 INPUT, OUTPUTS = "tsdf", ["quality", "rotation", "width"]
 
-# Of the decoding, as in grasp/src/decode.rs; lengths in voxels.
+# Constants of the decoding, as in grasp/src/decode.rs; lengths in voxels.
 SIGMA = 1.0
 OUTSIDE_ABOVE, INSIDE_ABOVE = 0.5, 1e-3
 DILATIONS = 2
@@ -39,7 +39,7 @@ NMS_SIZE = 4
 
 
 def arguments(description: str) -> argparse.Namespace:
-    """The command line of every peer that serves."""
+    """Parses the command line, which all servers here share."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", required=True, type=Path)
     parser.add_argument("--threads", default=1, type=int)
@@ -47,12 +47,12 @@ def arguments(description: str) -> argparse.Namespace:
     parser.add_argument("--precision", default="fp32", choices=["fp32", "bf16"])
     chosen = parser.parse_args()
     if (chosen.provider, chosen.precision) == ("cpu", "bf16"):
-        parser.error("the provider cpu computes in fp32 alone")
+        parser.error("provider cpu supports fp32 only")
     return chosen
 
 
 def open_session(chosen: argparse.Namespace, batch: int | None = None) -> ort.InferenceSession:
-    """With the options that graspd gives its own sessions (models/src/runtime)."""
+    """Opens a session with the options of graspd's own sessions (models/src/runtime)."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = chosen.threads
     options.inter_op_num_threads = 1
@@ -60,7 +60,7 @@ def open_session(chosen: argparse.Namespace, batch: int | None = None) -> ort.In
         options.add_free_dimension_override_by_name("batch", batch)
     if chosen.provider == "cpu":
         return ort.InferenceSession(chosen.model, options, ["CPUExecutionProvider"])
-    # What OpenVINO does not take would be computed elsewhere, and nobody would know.
+    # Without this, operators that OpenVINO does not support would run on the CPU provider unnoticed.
     options.add_session_config_entry("session.disable_cpu_ep_fallback", "1")
     cpu = {
         "INFERENCE_PRECISION_HINT": {"fp32": "f32", "bf16": "bf16"}[chosen.precision],
@@ -72,7 +72,7 @@ def open_session(chosen: argparse.Namespace, batch: int | None = None) -> ort.In
 
 
 def end_at_sigterm() -> None:
-    """By an exception in the main thread, so that everything is closed on the way out."""
+    """Raises an exception in the main thread at SIGTERM, so that everything is closed on exit."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
 
 
@@ -81,13 +81,13 @@ def say(line: str) -> None:
 
 
 def messages() -> ModuleType:
-    """What protoc makes of the .proto file."""
+    """The module that protoc generates from the .proto file."""
     proto = os.environ["GRASPD_PROTO"]
-    # grpcio-tools brings the well-known types along.
+    # grpcio-tools contains the well-known types.
     well_known = os.path.join(os.path.dirname(protoc.__file__), "_proto")
     with tempfile.TemporaryDirectory() as folder:
         if protoc.main(["protoc", f"-I{proto}", f"-I{well_known}", f"--python_out={folder}", "grasp/v1/grasp.proto"]):
-            sys.exit(f"protoc refuses the .proto file in {proto}")
+            sys.exit(f"protoc rejects the .proto file in {proto}")
         sys.path.insert(0, folder)
         return import_module("grasp.v1.grasp_pb2")
 
@@ -96,14 +96,14 @@ class GraspService:
     def __init__(self, pb: ModuleType, session: ort.InferenceSession, path: Path) -> None:
         self.pb = pb
         self.session = session
-        # One inference at a time has all the threads to itself.
+        # One inference at a time, which uses all threads.
         self.free = Lock()
         properties = session.get_modelmeta().custom_metadata_map
         self.name = properties.get("graspd.name", path.stem)
         self.version = properties.get("graspd.version", "1")
         self.resolution = int(properties.get("graspd.resolution", 40))
         self.voxel_size = float(properties.get("graspd.voxel_size", 0.3 / self.resolution))
-        # Where in its voxel a grasp stands.
+        # Position of a grasp in its voxel.
         self.origin = {"corner": 0.0, "center": 0.5}[properties.get("graspd.voxel_origin", "corner")]
         self.dtypes = {pb.DATA_TYPE_F32: "<f4", pb.DATA_TYPE_F16: "<f2", pb.DATA_TYPE_U8: "u1"}
 
@@ -118,7 +118,7 @@ class GraspService:
         started = perf_counter()
         options = request.options
         if options.model not in ["", self.name] or options.version not in ["", self.version]:
-            context.abort(grpc.StatusCode.NOT_FOUND, f"there is no such model, there is {self.name} {self.version}")
+            context.abort(grpc.StatusCode.NOT_FOUND, f"model not found; available: {self.name} {self.version}")
         try:
             volume = self.read(request.volume)
         except ValueError as wrong:
@@ -154,34 +154,34 @@ class GraspService:
         return response
 
     def read(self, volume: Any) -> np.ndarray:
-        """The volume's values as an array, or a ValueError that says what is wrong with it."""
+        """The volume's values as an array. Raises ValueError if the volume is invalid."""
         n = self.resolution
         if volume.dtype not in self.dtypes:
-            raise ValueError(f"volume.dtype is {volume.dtype}, it must be one of {sorted(self.dtypes)}")
+            raise ValueError(f"volume.dtype is {volume.dtype}, must be one of {sorted(self.dtypes)}")
         if volume.resolution != n:
-            raise ValueError(f"volume.resolution is {volume.resolution}, the model reads {n}")
+            raise ValueError(f"volume.resolution is {volume.resolution}, must be {n}")
         if abs(volume.voxel_size - self.voxel_size) > 1e-3 * self.voxel_size:
-            raise ValueError(f"volume.voxel_size is {volume.voxel_size}, the model's is {self.voxel_size}")
+            raise ValueError(f"volume.voxel_size is {volume.voxel_size}, must be {self.voxel_size}")
         values = np.frombuffer(volume.data, self.dtypes[volume.dtype])
         if values.size != n**3:
-            raise ValueError(f"volume.data holds {values.size} values, {n**3} needed")
+            raise ValueError(f"volume.data has {values.size} values, must have {n**3}")
         values = values.astype(np.float32, copy=False).reshape(n, n, n)
         if volume.dtype == self.pb.DATA_TYPE_U8:
             values = values / np.float32(255)
-        # Written so that NaN fails.
+        # NaN fails both comparisons.
         if not (values.min() >= 0 and 0 < values.max() <= 1):
-            raise ValueError("volume.data must be from 0 to 1, and not all 0")
+            raise ValueError("volume.data must be in [0, 1], and not all 0")
         return values
 
     def grasps(
         self, cells: np.ndarray, smooth: np.ndarray, rotation: np.ndarray, width: np.ndarray, frame: Any
     ) -> list[Any]:
-        """The grasps in these voxels, in the frame of the volume's own pose."""
+        """The grasps at these voxels, in the frame of the volume's pose."""
         pb = self.pb
         if not len(cells):
             return []
         at, turn = frame.position, frame.orientation
-        # A pose that is absent is the identity.
+        # An absent pose is the identity.
         orientation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w if frame.HasField("orientation") else 1.0])
         indices = np.stack(np.unravel_index(cells, smooth.shape), axis=-1)
         positions = orientation.apply((indices + self.origin) * self.voxel_size) + [at.x, at.y, at.z]
@@ -204,27 +204,27 @@ class GraspService:
 def decode(
     volume: np.ndarray, smooth: np.ndarray, width: np.ndarray, threshold: float, force: Optional[float]
 ) -> tuple[np.ndarray, dict[str, int]]:
-    """The flat indices of the voxels that hold a grasp, best first, and how many others each reason dropped."""
+    """The flat indices of the voxels with a grasp, best first, and the number of dropped voxels by reason."""
     inside = (volume > INSIDE_ABOVE) & (volume < OUTSIDE_ABOVE)
     near_surface = binary_dilation(volume > OUTSIDE_ABOVE, iterations=DILATIONS, mask=~inside)
-    believed = (width >= MIN_WIDTH) & (width <= MAX_WIDTH)
+    valid_width = (width >= MIN_WIDTH) & (width <= MAX_WIDTH)
 
-    cells, dropped = candidates(smooth, near_surface, believed, threshold)
+    cells, dropped = candidates(smooth, near_surface, valid_width, threshold)
     if not len(cells) and force is not None:
-        cells, dropped = candidates(smooth, near_surface, believed, min(force, threshold))
+        cells, dropped = candidates(smooth, near_surface, valid_width, min(force, threshold))
         dropped["suppressed"] += max(0, len(cells) - 1)
         cells = cells[:1]
     return cells, dropped
 
 
 def candidates(
-    smooth: np.ndarray, near_surface: np.ndarray, believed: np.ndarray, threshold: float
+    smooth: np.ndarray, near_surface: np.ndarray, valid_width: np.ndarray, threshold: float
 ) -> tuple[np.ndarray, dict[str, int]]:
     left, dropped = np.ones_like(near_surface), {}
     for reason, passed in [
         ("below_threshold", smooth >= np.float32(threshold)),
         ("mask", near_surface),
-        ("width", believed),
+        ("width", valid_width),
     ]:
         dropped[reason] = np.count_nonzero(left & ~passed)
         left &= passed
@@ -240,7 +240,7 @@ def main() -> None:
     pb = messages()
     service = GraspService(pb, open_session(chosen, batch=1), chosen.model)
     service.warm_up()
-    # While one thread has the session, the others read, check, decode and write.
+    # While one thread uses the session, the others read, check, decode and write.
     server = grpc.server(ThreadPoolExecutor(max_workers=10))
     detect = grpc.unary_unary_rpc_method_handler(
         service.detect, pb.DetectGraspsRequest.FromString, pb.DetectGraspsResponse.SerializeToString

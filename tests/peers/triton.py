@@ -1,9 +1,9 @@
-"""NVIDIA Triton serving the same ONNX file: the model `grasp`, `tsdf` in, `quality`, `rotation` and `width` out.
+"""Serves the same ONNX file with NVIDIA Triton: model `grasp`, input `tsdf`, outputs `quality`, `rotation` and `width`.
 
     python tests/peers/triton.py --model models/zoo/vgn-packed.onnx --threads 2
 
-Triton's package on PyPI brings its Python backend alone, so onnxruntime runs the network. Says on stdout where the
-`inference.GRPCInferenceService` listens, then `ready`. SIGTERM ends it and Triton's processes.
+Triton's package on PyPI contains its Python backend only, so that onnxruntime computes the network. Prints the address
+of `inference.GRPCInferenceService` to stdout, then `ready`. SIGTERM terminates it and Triton's processes.
 """
 
 import os
@@ -25,7 +25,7 @@ MAX_BATCH = 8
 
 
 def free_port() -> int:
-    """Triton takes no port 0."""
+    """A free port, because Triton does not support port 0."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
@@ -49,11 +49,11 @@ def main() -> None:
         return [Tensor(name=value.name, dtype=np.float32, shape=tuple(value.shape[1:])) for value in values]
 
     port = free_port()
-    # At the end no answer is waited for any more.
+    # No requests are pending at the end, so that Triton need not drain.
     config = TritonConfig(
         grpc_address="127.0.0.1", grpc_port=port, allow_http=False, allow_metrics=False, exit_timeout_secs=0
     )
-    # Triton's log comes by print().
+    # Triton logs with print(); stdout is reserved for the address and `ready`.
     sys.stdout = sys.stderr
     with Triton(config=config) as triton:
         inputs, outputs = tensors(session.get_inputs()), tensors(session.get_outputs())
@@ -65,10 +65,10 @@ def main() -> None:
         try:
             signal.pause()
         finally:
-            # All is done in two seconds, but then Triton's gRPC sometimes takes eight more to shut down.
-            impatience = Timer(2.5, kill_triton)
-            impatience.daemon = True
-            impatience.start()
+            # Triton shuts down within two seconds, but its gRPC server sometimes takes eight more.
+            killer = Timer(2.5, kill_triton)
+            killer.daemon = True
+            killer.start()
 
 
 if __name__ == "__main__":

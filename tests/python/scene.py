@@ -1,4 +1,4 @@
-"""A block on a table and what sees it: the numbers of tests/src/scene.rs. Metres, in the task frame."""
+"""A synthetic scene, a block on a table, with the values of tests/src/scene.rs. Metres, in the task frame."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ K = np.array([[135.0, 0.0, 79.5], [0.0, 135.0, 59.5], [0.0, 0.0, 1.0]])
 
 
 def camera(polar, azimuth):
-    """T_camera_task of one that looks at the middle from 0.6 m, at angles off the vertical and about it, degrees."""
+    """T_camera_task of a camera at 0.6 m from the middle of the scene; angles from and about the vertical, degrees."""
     polar, azimuth = np.radians([polar, azimuth])
     direction = np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
     up = np.array([-np.cos(polar) * np.cos(azimuth), -np.cos(polar) * np.sin(azimuth), np.sin(polar)])
@@ -24,13 +24,13 @@ def camera(polar, azimuth):
 
 
 def rays():
-    """Of each pixel, with a length of 1 along the optical axis."""
+    """The ray of each pixel, with a length of 1 along the optical axis."""
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     return np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(K).T
 
 
 def depth(camera_from_task):
-    """What a camera sees, [row][column] along its optical axis; 0 where that is nothing."""
+    """The depth image of a camera, [row][column], along its optical axis; 0 without a reading."""
     task_from_camera = np.linalg.inv(camera_from_task)
     eye, directions = task_from_camera[:3, 3], rays() @ task_from_camera[:3, :3].T
     with np.errstate(divide="ignore"):
@@ -43,15 +43,15 @@ def depth(camera_from_task):
 
 
 def cloud(camera_from_task):
-    """The same as points in the camera's frame, with one that is none."""
+    """The depth image as points in the camera's frame, plus one NaN point."""
     image = depth(camera_from_task)
     points = rays() * image[..., None]
     return np.vstack([points[image > 0], [[np.nan] * 3]]).astype(np.float32)
 
 
 def volume(*cameras):
-    """What the depth images make together, [x][y][z], as Open3D and hence VGN has it: (tsdf + 1) / 2 near a surface,
-    else 0. Each voxel takes the distance along the ray of its pixel."""
+    """The volume fused from the depth images, [x][y][z], as in Open3D and VGN: (tsdf + 1) / 2 near a surface, else 0.
+    The distance of a voxel is measured along the ray of its pixel."""
     centres = (np.stack(np.mgrid[:RESOLUTION, :RESOLUTION, :RESOLUTION], axis=-1) + 0.5) * SIZE / RESOLUTION
     truncation = 4 * SIZE / RESOLUTION
     total, seen = np.zeros(centres.shape[:3]), np.zeros(centres.shape[:3])
@@ -71,6 +71,6 @@ def volume(*cameras):
 
 
 def is_at_the_block(grasp):
-    """Whether the point between the fingertips is, or nearly."""
+    """Whether the point between the fingertips is within 0.03 m of the block."""
     tips = (grasp.pose.matrix() @ [0, 0, 0.05, 1])[:3]
     return bool(np.all(tips > BLOCK[0] - 0.03) and np.all(tips < BLOCK[1] + 0.03))

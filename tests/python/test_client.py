@@ -1,6 +1,6 @@
-"""A client made from the .proto file, against the server that GRASPD_SERVER names, which serves the model "mirror".
+"""Tests a client generated from the .proto file against the server at GRASPD_SERVER, which serves the model "mirror".
 
-The tests of the crate grasp-tests (tests/python.rs) start that server and run this; by itself it is
+The crate grasp-tests (tests/python.rs) starts that server and runs this file. To run it separately:
     GRASPD_SERVER=127.0.0.1:50051 GRASPD_PROTO=proto/proto python -m unittest discover tests/python
 """
 
@@ -31,19 +31,19 @@ CENTRES = [(4, 5, 6), (11, 10, 9)]
 
 
 def generate(folder):
-    """The modules that protoc makes of the .proto file."""
+    """Returns the modules that protoc generates from the .proto file."""
     proto = os.environ["GRASPD_PROTO"]
-    # grpcio-tools brings the well-known types along.
+    # grpcio-tools contains the well-known types.
     well_known = os.path.join(os.path.dirname(protoc.__file__), "_proto")
     arguments = ["protoc", f"-I{proto}", f"-I{well_known}", f"--python_out={folder}", f"--grpc_python_out={folder}"]
     if protoc.main([*arguments, "grasp/v1/grasp.proto"]):
-        raise RuntimeError("protoc refuses the .proto file")
+        raise RuntimeError("protoc rejects the .proto file")
     sys.path.insert(0, folder)
     return import_module("grasp.v1.grasp_pb2"), import_module("grasp.v1.grasp_pb2_grpc")
 
 
 def blobs():
-    """Free space with a block of 5³ voxels of 1 around each centre, where the mirror sees a grasp."""
+    """Free space with a block of 5³ voxels of value 1 around each centre. The model "mirror" has a grasp at each."""
     volume = np.full((RESOLUTION,) * 3, 0.6, np.float32)
     for x, y, z in CENTRES:
         volume[x - 2 : x + 3, y - 2 : y + 3, z - 2 : z + 3] = 1.0
@@ -84,7 +84,7 @@ class ClientTest(unittest.TestCase):
             self.assertEqual((response.request_id, response.model, response.version), ("from python", "mirror", "1"))
             self.assertGreater(response.latency.total, 0)
 
-    def test_the_pose_moves_the_grasps(self):
+    def test_grasps_are_in_the_frame_of_the_volumes_pose(self):
         volume = self.volume()
         volume.frame_id = "base"
         volume.pose.position.x = 0.5
@@ -99,28 +99,28 @@ class ClientTest(unittest.TestCase):
         dropped = sum(value for _, value in response.dropped.ListFields())
         self.assertEqual(dropped + len(response.grasps), RESOLUTION**3)
 
-    def test_a_stream_answers_in_order(self):
-        requests = [self.request(request_id=str(i), options=self.pb.Options(model="nobody" if i == 3 else "")) for i in range(8)]
+    def test_replies_of_a_stream_are_in_order(self):
+        requests = [self.request(request_id=str(i), options=self.pb.Options(model="missing" if i == 3 else "")) for i in range(8)]
         replies = list(self.grasps.DetectGraspsStream(iter(requests)))
         self.assertEqual([reply.request_id for reply in replies], [str(i) for i in range(8)])
         for index, reply in enumerate(replies):
             self.assertEqual(reply.WhichOneof("outcome"), "error" if index == 3 else "response")
         self.assertEqual(replies[3].error.code, grpc.StatusCode.NOT_FOUND.value[0])
 
-    def test_mistakes_have_their_status(self):
+    def test_errors_have_their_status_code(self):
         values = blobs()
         values[1, 2, 3] = np.nan
         index = np.ravel_multi_index((1, 2, 3), values.shape)
         for request, code, message in [
             (self.request(self.volume(values)), grpc.StatusCode.INVALID_ARGUMENT, f"volume.data[{index}] is NaN"),
-            (self.request(options=self.pb.Options(model="nobody")), grpc.StatusCode.NOT_FOUND, "available: mirror 1"),
+            (self.request(options=self.pb.Options(model="missing")), grpc.StatusCode.NOT_FOUND, "available: mirror 1"),
         ]:
             with self.assertRaises(grpc.RpcError) as caught:
                 self.grasps.DetectGrasps(request)
             self.assertEqual(caught.exception.code(), code)
             self.assertIn(message, caught.exception.details())
 
-    def test_the_models_are_listed(self):
+    def test_models_are_listed(self):
         model, shaf = self.grasps.ListModels(self.pb.ListModelsRequest()).models
         self.assertEqual((shaf.name, shaf.resolution), ("shaf", 0))
         self.assertEqual((model.name, model.version, model.resolution), ("mirror", "1", RESOLUTION))
@@ -138,7 +138,7 @@ class ClientTest(unittest.TestCase):
         self.assertLessEqual({"DetectGrasps", "DetectGraspsFromDepth", "TrackGrasps"}, set(service.methods_by_name))
 
     def test_reflection_v1(self):
-        # grpcio-reflection speaks v1alpha; the messages of v1 are the same.
+        # grpcio-reflection implements v1alpha; the messages of v1 are the same.
         call = self.channel.stream_stream(
             "/grpc.reflection.v1.ServerReflection/ServerReflectionInfo",
             reflection_pb2.ServerReflectionRequest.SerializeToString,

@@ -1,4 +1,4 @@
-"""client/cpp, built and run as its README says, against a real graspd.
+"""Builds and runs client/cpp as in its README, against a real graspd.
 
     GRASPD=target/release/graspd GRASPD_MODELS=models/zoo ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
     GRASPD_CPP=$(python3 tests/tools.py cpp) \\
@@ -29,13 +29,13 @@ sys.path.insert(0, str(ROOT / "deploy"))
 import native  # noqa: E402
 
 CPP = ROOT / "client/cpp"
-INSTALL, BUILD, ASK, ASK_ABOUT_AN_IMAGE = re.findall(r"```sh\n(.*?)```", (CPP / "README.md").read_text(), re.DOTALL)
-# The made-up scene: the corners of the block, which stands on the table.
+INSTALL, BUILD, DETECT, DETECT_IMAGE = re.findall(r"```sh\n(.*?)```", (CPP / "README.md").read_text(), re.DOTALL)
+# The synthetic scene: the corners of the block, which stands on the table.
 LOW, HIGH = np.array([0.13, 0.11, 0.05]), np.array([0.17, 0.19, 0.15])
 
 
 def environment():
-    """In which what is below GRASPD_CPP is found as if it were installed."""
+    """The environment in which the packages below GRASPD_CPP are found as if they were installed."""
     prefix = Path(os.environ["GRASPD_CPP"])
     libraries = ":".join(map(str, prefix.glob("lib/*-linux-gnu")))
     return {
@@ -48,7 +48,7 @@ def environment():
 
 
 def built():
-    """The folder with `detect`, which is built once for what it is made of."""
+    """The folder with `detect`, which is built once per state of its sources."""
     sources = sorted([*CPP.iterdir(), *ROOT.glob("proto/proto/grasp/**/*.proto")])
     contents = [os.environ["GRASPD_CPP"].encode(), *(path.read_bytes() for path in sources)]
     name = hashlib.sha256(b"\0".join(contents)).hexdigest()[:12]
@@ -63,8 +63,8 @@ def built():
     return native.built_once(native.CACHE / f"cpp-{name}", build)
 
 
-def picture():
-    """What the made-up scene's camera sees: metres along its optical axis."""
+def depth_image():
+    """The depth image of the synthetic scene: metres along the optical axis."""
     v, u = np.mgrid[:120, :160]
     eye, turned = np.array([0.15, -0.15, 0.6]), Rotation.from_euler("x", 210, degrees=True).as_matrix()
     rays = np.stack([(u - 79.5) / 135, (v - 59.5) / 135, np.ones(u.shape)], axis=-1) @ turned.T
@@ -88,21 +88,21 @@ class CppTest(unittest.TestCase):
         )
         cls.addClassCleanup(graspd.communicate)
         cls.addClassCleanup(graspd.terminate)
-        said = ""
-        while not said.endswith("ready\n"):
+        output = ""
+        while not output.endswith("ready\n"):
             line = graspd.stdout.readline()
             if not line:
                 raise AssertionError(Path(log.name).read_text())
-            said += line
-        cls.server = re.search(r"grpc listening on (\S+)", said)[1]
+            output += line
+        cls.server = re.search(r"grpc listening on (\S+)", output)[1]
 
-    def detect(self, *flags, command=ASK, server=None):
+    def detect(self, *flags, command=DETECT, server=None):
         command = command.replace("build/detect", f'build/detect --server {server or self.server} "$@"')
         run = ["sh", "-ec", command, "detect", *map(str, flags)]
         return subprocess.run(run, cwd=self.folder, env=environment(), capture_output=True, text=True, timeout=60)
 
     def grasps(self, *flags, **settings):
-        """What was printed of each: quality, width, position, quaternion, position of the pre-grasp."""
+        """The printed grasps: quality, width, position, quaternion, position of the pre-grasp."""
         result = self.detect(*flags, **settings)
         self.assertEqual(result.returncode, 0, result.stderr)
         numbers = r" (-?\d+\.\d+)"
@@ -134,32 +134,32 @@ class CppTest(unittest.TestCase):
         *parts, total, round_trip = map(float, stages.values())
         self.assertTrue(0 < sum(parts) <= total + 0.1 <= round_trip + 0.1, self.latency)
 
-    def test_an_image_is_read_as_the_camera_gives_it(self):
+    def test_images_in_metres_and_millimetres_are_read(self):
         wanted = self.grasps()[0, 2:5]
-        for image in [picture().astype("<f4"), np.rint(picture() * 1e3).astype("<u2")]:
+        for image in [depth_image().astype("<f4"), np.rint(depth_image() * 1e3).astype("<u2")]:
             np.save(self.folder / "depth.npy", image)
-            distances = np.linalg.norm(self.grasps(command=ASK_ABOUT_AN_IMAGE)[:, 2:5] - wanted, axis=1)
+            distances = np.linalg.norm(self.grasps(command=DETECT_IMAGE)[:, 2:5] - wanted, axis=1)
             self.assertLess(distances.min(), 0.02, "millimetres are rounded")
 
-    def test_the_base_may_stand_elsewhere(self):
+    def test_grasps_are_in_the_frame_of_the_base(self):
         moved = self.grasps("--camera", "0.55 -0.35 0.7 0.9659258 0 0 -0.258819", "--corner", "0.4 -0.2 0.1")
         np.testing.assert_allclose(moved[:, 2:5] - [0.4, -0.2, 0.1], self.grasps()[:, 2:5], atol=2e-3)
 
-    def test_mistakes_are_told(self):
+    def test_errors_are_reported(self):
         transposed = self.detect("--k", "135 0 0 0 135 0 79.5 59.5 1")
         self.assert_refused(transposed, "INVALID_ARGUMENT: views[0].camera.k is [135.0")
         self.assert_refused(self.detect("--k", "135 135"), '--k is "135 135", must be 9 numbers')
         self.assert_refused(self.detect("--depth", "none.npy"), "cannot read none.npy")
         np.save(self.folder / "half.npy", np.ones((2, 2), np.float16))
         self.assert_refused(self.detect("--depth", "half.npy"), "half.npy is not a .npy file")
-        np.save(self.folder / "bare.npy", picture().astype("<f4"))
+        np.save(self.folder / "bare.npy", depth_image().astype("<f4"))
         self.assert_refused(self.detect("--depth", "bare.npy"), '--corner is "", must be 3 numbers')
         usage = self.detect("--help")
         self.assertEqual(usage.returncode, 2)
         self.assertIn("--camera", usage.stderr)
 
     def serve(self, answer):
-        """A server of our own, for what a real one does not do on demand."""
+        """Starts a test server, for behaviour that cannot be triggered in a real one."""
         method = grpc.unary_unary_rpc_method_handler(lambda message, context: answer(len(message), context))
         handler = grpc.method_handlers_generic_handler("grasp.v1.GraspService", {"DetectGraspsFromDepth": method})
         server = grpc.server(ThreadPoolExecutor(), [handler])
@@ -168,7 +168,7 @@ class CppTest(unittest.TestCase):
         server.start()
         return f"127.0.0.1:{port}"
 
-    def test_a_refused_image_is_sent_again(self):
+    def test_refused_requests_are_retried(self):
         lengths = []
 
         def answer(length, context):
@@ -178,27 +178,27 @@ class CppTest(unittest.TestCase):
             return b""
 
         np.save(self.folder / "depth.npy", np.ones((480, 640), np.float32))
-        result = self.detect(command=ASK_ABOUT_AN_IMAGE, server=self.serve(answer))
+        result = self.detect(command=DETECT_IMAGE, server=self.serve(answer))
         self.assertEqual(result.returncode, 0, result.stderr)
         self.assertEqual(len(lengths), 3)
         self.assertGreater(min(lengths), 480 * 640 * 4)
 
-    def test_nobody_waits_for_ever(self):
-        asleep = threading.Event()
-        self.addCleanup(asleep.set)
-        server = self.serve(lambda length, context: b"" if asleep.wait(60) else b"")
+    def test_calls_have_a_deadline(self):
+        blocked = threading.Event()
+        self.addCleanup(blocked.set)
+        server = self.serve(lambda length, context: b"" if blocked.wait(60) else b"")
         start = time.monotonic()
         self.assert_refused(self.detect(server=server), "DEADLINE_EXCEEDED")
         self.assertTrue(1.9 < time.monotonic() - start < 30)
 
-    def test_the_retry_policy_is_the_one_that_is_recommended(self):
+    def test_the_retry_policy_is_that_of_the_documentation(self):
         recommended = re.search(r"```json\n(.*?)```", (ROOT / "docs/operations.md").read_text(), re.DOTALL)[1]
         used = re.search(r'SERVICE_CONFIG\[\] = R"\((.*?)\)"', (CPP / "detect.cpp").read_text(), re.DOTALL)[1]
         recommended, used = map(json.loads, [recommended, used])
         recommended["methodConfig"][0].pop("timeout", None)  # the call has a deadline instead
         self.assertEqual(used, recommended)
 
-    def test_what_is_installed_is_what_is_fetched(self):
+    def test_the_readme_installs_the_packages_of_the_test_tools(self):
         source = (ROOT / "tests/tools.py").read_text()
         for package in set(INSTALL.split()[3:]) - {"g++"}:
             self.assertIn(f'"{package}"', source)

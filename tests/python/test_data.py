@@ -1,4 +1,4 @@
-"""Data sets of `grasp-sim`, which GRASP_SIM names, read and written with pandas and NumPy as the code of VGN and GIGA does."""
+"""Tests the data sets of `grasp-sim` (GRASP_SIM), read and written with pandas and NumPy as in VGN's code."""
 
 import json
 import os
@@ -13,8 +13,8 @@ import pandas as pd
 
 INTRINSIC = {"width": 640, "height": 480, "K": [540.0, 0.0, 320.0, 0.0, 540.0, 240.0, 0.0, 0.0, 1.0]}
 
-# The share of a grasp's tries that held, and its clearance: columns that VGN and GIGA do not have.
-ROOM = ["share", "clearance"]
+# The share of successful repetitions, and the clearance: columns that VGN and GIGA do not have.
+MARGINS = ["share", "clearance"]
 
 
 def sim(*arguments):
@@ -39,7 +39,7 @@ class DataTest(unittest.TestCase):
     def test_processed_data_load_with_pandas(self):
         root = self.label("processed")
         grasps = pd.read_csv(root / "grasps.csv", dtype={"scene_id": str})
-        self.assertEqual(list(grasps), ["scene_id", "qx", "qy", "qz", "qw", "i", "j", "k", "width", "label", *ROOM])
+        self.assertEqual(list(grasps), ["scene_id", "qx", "qy", "qz", "qw", "i", "j", "k", "width", "label", *MARGINS])
         self.assertEqual(len(grasps), 4 * 30)
         self.assertLess(0, grasps["label"].sum())
         self.assertTrue(grasps["label"].isin([0, 1]).all())
@@ -61,7 +61,7 @@ class DataTest(unittest.TestCase):
         self.assertEqual(setup["size"], 0.3)
         self.assertEqual({key: setup["intrinsic"][key] for key in INTRINSIC}, INTRINSIC)
         grasps = pd.read_csv(root / "grasps.csv", dtype={"scene_id": str})
-        self.assertEqual(list(grasps), ["scene_id", "qx", "qy", "qz", "qw", "x", "y", "z", "width", "label", *ROOM])
+        self.assertEqual(list(grasps), ["scene_id", "qx", "qy", "qz", "qw", "x", "y", "z", "width", "label", *MARGINS])
         self.assertTrue((grasps["width"] <= 0.08).all())
         for scene in grasps["scene_id"].unique():
             with np.load(root / "scenes" / f"{scene}.npz") as archive:
@@ -70,8 +70,8 @@ class DataTest(unittest.TestCase):
             self.assertEqual(extrinsics.shape[1], 7)
             np.testing.assert_allclose(np.linalg.norm(extrinsics[:, :4], axis=1), 1.0, atol=1e-6)
 
-    def test_a_labelled_grasp_stands_where_something_is(self):
-        """Index, quaternion and volume belong together: before the hand of a success is an observed voxel."""
+    def test_successful_grasps_are_at_observed_surfaces(self):
+        """Index, quaternion and volume are consistent: there is an observed voxel in front of the hand of a success."""
         root = self.label("processed", scenes=8)
         grasps = pd.read_csv(root / "grasps.csv", dtype={"scene_id": str})
         seen = []
@@ -86,23 +86,23 @@ class DataTest(unittest.TestCase):
         self.assertGreater(len(seen), 10)
         self.assertGreater(np.mean(seen), 0.95)
 
-    def test_raw_becomes_processed(self):
+    def test_raw_data_are_converted_to_processed(self):
         raw, fused = self.label("raw"), self.folder / "fused"
         sim("convert", "--from", raw, "--format", "processed", "--out", fused)
         ours = self.label("processed")
         grasps = pd.read_csv(fused / "grasps.csv", dtype={"scene_id": str})
         before = pd.read_csv(raw / "grasps.csv", dtype={"scene_id": str})
         inside = before[["x", "y", "z"]].apply(lambda column: column.between(0.02, 0.28)).all(axis=1)
-        np.testing.assert_allclose(grasps[ROOM], before.loc[inside, ROOM], atol=1e-6)
+        np.testing.assert_allclose(grasps[MARGINS], before.loc[inside, MARGINS], atol=1e-6)
         np.testing.assert_allclose(grasps[["i", "j", "k"]], before.loc[inside, ["x", "y", "z"]] / 0.0075, atol=1e-4)
         for scene in grasps["scene_id"].unique():
             with np.load(fused / "scenes" / f"{scene}.npz") as a, np.load(ours / "scenes" / f"{scene}.npz") as b:
-                # Poses are f32 in the files, so here and there a voxel falls on the next pixel.
+                # Poses are f32 in the files, so that a few voxels project to the next pixel.
                 self.assertGreater(np.isclose(a["grid"], b["grid"], atol=1e-5).mean(), 0.999)
 
-    def test_data_of_others_are_converted(self):
-        """Written as VGN writes: compressed archives, names of letters, columns by pandas."""
-        root, out = self.folder / "theirs", self.folder / "ours"
+    def test_data_in_vgns_format_are_converted(self):
+        """As written by VGN: compressed archives, scene names that are not numbers, columns by pandas."""
+        root, out = self.folder / "vgn", self.folder / "ours"
         (root / "scenes").mkdir(parents=True)
         setup = {"size": 0.3, "intrinsic": INTRINSIC, "max_opening_width": 0.08, "finger_depth": 0.05}
         (root / "setup.json").write_text(json.dumps(setup))
@@ -122,7 +122,7 @@ class DataTest(unittest.TestCase):
         np.testing.assert_allclose(
             grasps[columns[1:]].sort_values("i"), pd.DataFrame(rows, columns=columns)[columns[1:]].sort_values("i"), atol=1e-4
         )
-        self.assertTrue((grasps["share"] == grasps["label"]).all() and (grasps["clearance"] == 0).all(), "as nothing is known")
+        self.assertTrue((grasps["share"] == grasps["label"]).all() and (grasps["clearance"] == 0).all(), "VGN's data have neither")
         found = sorted(np.load(back / "scenes" / f"{scene}.npz")["grid"].sum() for scene in grasps["scene_id"].unique())
         np.testing.assert_allclose(found, sorted(grid.sum() for grid in grids.values()), rtol=1e-3)
 

@@ -1,4 +1,4 @@
-"""What deploy/ says of graspd, against graspd: GRASPD names the binary. Nothing is built or run in a container here.
+"""Checks the files of deploy/ against the binary GRASPD. Nothing is built or run in a container.
 
     GRASPD=target/release/graspd python -m unittest discover --start-directory tests/python --pattern test_deploy.py
 """
@@ -18,24 +18,24 @@ import yaml
 ROOT = Path(__file__).resolve().parents[2]
 DEPLOY = ROOT / "deploy"
 KUBERNETES = DEPLOY / "kubernetes"
-# Kinds that a cluster only knows once somebody installs them: there is no schema to check them by.
-ADDED = {"PodMonitor", "ServingRuntime", "InferenceService"}
+# Custom resources, for which there is no schema.
+CUSTOM = {"PodMonitor", "ServingRuntime", "InferenceService"}
 
 
 def load(path):
-    """The documents of a file, but for empty ones."""
+    """The non-empty documents of a file."""
     return [document for document in yaml.safe_load_all(path.read_text()) if document]
 
 
 def flags():
-    """The variables that `graspd --help` names, with their defaults."""
-    said = subprocess.run([os.environ["GRASPD"], "--help"], env={}, capture_output=True, text=True, check=True).stdout
-    found = re.findall(r"\[env: (\w+)=\](?: \[default: (\S+)\])?", " ".join(said.split()))
-    return {**dict(found), **({"ORT_DYLIB_PATH": ""} if "ORT_DYLIB_PATH" in said else {})}
+    """The environment variables of `graspd --help`, with their defaults."""
+    text = subprocess.run([os.environ["GRASPD"], "--help"], env={}, capture_output=True, text=True, check=True).stdout
+    found = re.findall(r"\[env: (\w+)=\](?: \[default: (\S+)\])?", " ".join(text.split()))
+    return {**dict(found), **({"ORT_DYLIB_PATH": ""} if "ORT_DYLIB_PATH" in text else {})}
 
 
 def instructions():
-    """The Dockerfile's, by stage: the stage's base, then pairs of an instruction and its text. Before the first: ""."""
+    """The Dockerfile by stage: pairs of an instruction and its text, FROM first. The part before the stages is ""."""
     stage, stages = "", {"": []}
     text = re.sub(r"^#.*\n", "", (DEPLOY / "Dockerfile").read_text(), flags=re.MULTILINE).replace("\\\n", " ")
     for word, rest in re.findall(r"^([A-Z]+) +(.*)$", text, flags=re.MULTILINE):
@@ -48,13 +48,13 @@ def instructions():
 
 
 def image(device):
-    """What makes the image for a device: its own base, then what all have."""
+    """The instructions of the image for a device: those of its base, then the common ones."""
     stages = instructions()
     return stages[device] + stages["graspd"]
 
 
 def variables(stage):
-    """What ENV sets in a stage."""
+    """The variables that ENV sets in a stage."""
     return dict(pair.split("=", 1) for word, rest in stage if word == "ENV" for pair in rest.split())
 
 
@@ -67,27 +67,27 @@ class DockerfileTest(unittest.TestCase):
         self.stages = instructions()
         self.images = [image("cpu"), image("cuda")]
 
-    def test_the_image_for_cpus_is_built_if_none_is_named(self):
+    def test_the_default_image_is_for_cpus(self):
         self.assertIn(("ARG", "DEVICE=cpu"), self.stages[""])
         *_, (name, steps) = self.stages.items()
         self.assertEqual((name, steps[0]), ("graspd", ("FROM", "${DEVICE}")))
 
-    def test_nobody_is_root(self):
+    def test_the_user_is_not_root(self):
         user = dict(self.stages["graspd"])["USER"]
-        self.assertTrue(all(int(number) > 0 for number in user.split(":")), f"{user}: Kubernetes wants numbers, not root")
+        self.assertTrue(all(int(number) > 0 for number in user.split(":")), f"{user}: must be numeric and not root")
 
-    def test_what_is_set_are_flags(self):
+    def test_environment_variables_are_flags(self):
         known = flags()
         for stage in self.images:
             self.assertLessEqual(set(variables(stage)), set(known))
 
-    def test_what_is_listened_to_is_exposed(self):
+    def test_listening_ports_are_exposed(self):
         for stage in self.images:
             environment = variables(stage)
             listened = {port(environment[name]) for name in ["GRASPD_LISTEN", "GRASPD_HTTP"]}
             self.assertEqual({int(number) for number in dict(stage)["EXPOSE"].split()}, listened)
 
-    def test_what_is_copied_is_there(self):
+    def test_copied_files_exist(self):
         ignored = (ROOT / ".dockerignore").read_text().splitlines()
         self.assertIn("*", ignored)
         admitted = [line.removeprefix("!") for line in ignored if line.startswith("!")]
@@ -113,7 +113,7 @@ class DockerfileTest(unittest.TestCase):
             self.assertIn(f"$(python /native.py {stage})", dict(self.stages[stage])["RUN"])
             self.assertIn(f"native.py {stage} ", native)
 
-    def test_what_is_built_are_packages(self):
+    def test_built_packages_exist(self):
         built = re.findall(r"--package (\S+)", dict(self.stages["build"])["RUN"])
         members = tomllib.loads((ROOT / "Cargo.toml").read_text())["workspace"]["members"]
         packages = {tomllib.loads((ROOT / path / "Cargo.toml").read_text())["package"]["name"] for path in members}
@@ -126,14 +126,14 @@ class ComposeTest(unittest.TestCase):
         (self.compose,) = load(DEPLOY / "compose.yaml")
         self.services = self.compose["services"]
 
-    def test_what_is_mounted_is_there(self):
+    def test_mounted_files_exist(self):
         for name, service in self.services.items():
             for volume in service.get("volumes", []):
                 source = volume.split(":")[0]
                 known = (DEPLOY / source).exists() if source.startswith(".") else source in self.compose["volumes"]
                 self.assertTrue(known, f"{name}: {volume}")
 
-    def test_grafana_finds_what_it_shows(self):
+    def test_grafana_finds_dashboard_and_data_source(self):
         grafana = self.services["grafana"]
         mounted = {target: source for source, target, *_ in (volume.split(":") for volume in grafana["volumes"])}
         home = grafana["environment"]["GF_DASHBOARDS_DEFAULT_HOME_DASHBOARD_PATH"]
@@ -145,19 +145,19 @@ class ComposeTest(unittest.TestCase):
         (prometheus,) = load(DEPLOY / "prometheus/prometheus.yml")
         self.assertEqual(source["jsonData"]["timeInterval"], prometheus["global"]["scrape_interval"])
 
-    def test_prometheus_watches_graspd(self):
+    def test_prometheus_scrapes_graspd(self):
         (prometheus,) = load(DEPLOY / "prometheus/prometheus.yml")
         ((target,),) = [config["targets"] for job in prometheus["scrape_configs"] for config in job["static_configs"]]
         self.assertIn(target.split(":")[0], self.services)
         self.assertEqual(port(target), port(variables(image("cpu"))["GRASPD_HTTP"]))
 
-    def test_graspd_is_built_from_the_dockerfile_and_may_drain(self):
+    def test_graspd_is_built_from_the_dockerfile_and_has_time_to_drain(self):
         graspd = self.services["graspd"]
         build = DEPLOY / graspd["build"]["context"] / graspd["build"]["dockerfile"]
         self.assertEqual(build.resolve(), DEPLOY / "Dockerfile")
         self.assertGreater(float(graspd["stop_grace_period"].removesuffix("s")), float(flags()["GRASPD_DRAIN_TIMEOUT"]))
 
-    def test_all_are_locked_in_watched_and_pinned(self):
+    def test_services_are_confined_monitored_and_pinned(self):
         for name, service in self.services.items():
             self.assertTrue(service["read_only"], name)
             self.assertEqual(service["cap_drop"], ["ALL"], name)
@@ -182,10 +182,10 @@ class KubernetesTest(unittest.TestCase):
 
     def test_the_manifests_are_valid(self):
         for kind, manifest in self.objects.items():
-            if kind not in ADDED:
+            if kind not in CUSTOM:
                 kubernetes_validate.validate(manifest, "1.33", strict=True)
 
-    def test_kustomizations_name_what_there_is(self):
+    def test_kustomizations_name_existing_files_and_objects(self):
         named = {KUBERNETES / "prometheus-adapter.yaml"}
         for path in KUBERNETES.rglob("kustomization.yaml"):
             (kustomization,) = load(path)
@@ -198,7 +198,7 @@ class KubernetesTest(unittest.TestCase):
                 self.assertEqual([container["name"] for container in containers], [self.container["name"]])
         self.assertEqual(named, set(KUBERNETES.rglob("*.yaml")))
 
-    def test_all_select_the_pods(self):
+    def test_selectors_match_the_pods(self):
         labels = self.template["metadata"]["labels"]
         spread = [constraint["labelSelector"] for constraint in self.pod["topologySpreadConstraints"]]
         self.assertEqual(spread, [{"matchLabels": labels}])
@@ -222,15 +222,15 @@ class KubernetesTest(unittest.TestCase):
         named += [endpoint["port"] for endpoint in self.objects["PodMonitor"]["spec"]["podMetricsEndpoints"]]
         self.assertLessEqual(set(named), set(self.ports))
 
-    def test_probes_ask_what_there_is(self):
+    def test_probes_use_existing_services(self):
         proto = (ROOT / "proto/proto/grasp/v1/grasp.proto").read_text()
         package, service = re.search(r"^package (\S+);", proto, re.M)[1], re.search(r"^service (\w+)", proto, re.M)[1]
-        asked = {"port": self.ports["grpc"], "service": f"{package}.{service}"}
+        probe = {"port": self.ports["grpc"], "service": f"{package}.{service}"}
         for name in ["startupProbe", "readinessProbe"]:
-            self.assertEqual(self.container[name]["grpc"], asked)
+            self.assertEqual(self.container[name]["grpc"], probe)
         self.assertEqual(self.container["livenessProbe"]["httpGet"], {"path": "/healthz", "port": "http"})
 
-    def test_pods_may_drain(self):
+    def test_pods_have_time_to_drain(self):
         known = flags()
         environment = {entry["name"]: entry["value"] for entry in self.container["env"]}
         self.assertLessEqual(set(environment), set(known))
@@ -238,7 +238,7 @@ class KubernetesTest(unittest.TestCase):
         before = self.container["lifecycle"]["preStop"]["sleep"]["seconds"]
         self.assertGreater(self.pod["terminationGracePeriodSeconds"], before + drain)
 
-    def test_pods_are_locked_in(self):
+    def test_pods_are_confined(self):
         self.assertTrue(self.pod["securityContext"]["runAsNonRoot"])
         self.assertEqual(self.pod["securityContext"]["seccompProfile"], {"type": "RuntimeDefault"})
         self.assertFalse(self.pod["automountServiceAccountToken"])
@@ -249,13 +249,13 @@ class KubernetesTest(unittest.TestCase):
         resources = self.container["resources"]
         self.assertEqual(int(resources["limits"]["cpu"]), int(resources["requests"]["cpu"]))
 
-    def test_the_autoscaler_goes_by_what_the_adapter_tells(self):
+    def test_the_autoscaler_uses_the_metric_of_the_adapter(self):
         (metric,) = self.objects["HorizontalPodAutoscaler"]["spec"]["metrics"]
         (adapter,) = load(KUBERNETES / "prometheus-adapter.yaml")
         (rule,) = adapter["rules"]["custom"]
         self.assertEqual(rule["name"]["as"], metric["pods"]["metric"]["name"])
 
-    def test_options_set_flags_and_what_the_image_reads(self):
+    def test_options_set_flags_and_the_model_folder_of_the_image(self):
         (patch,) = load(KUBERNETES / "options/gpu/kustomization.yaml")[0]["patches"]
         (container,) = yaml.safe_load(patch["patch"])["spec"]["template"]["spec"]["containers"]
         self.assertLessEqual({entry["name"] for entry in container["env"]}, set(flags()))
@@ -265,18 +265,18 @@ class KubernetesTest(unittest.TestCase):
         self.assertEqual(mount["mountPath"], variables(image("cpu"))["GRASPD_MODELS"])
         self.assertEqual([volume["name"] for volume in pod["volumes"]], [mount["name"]])
 
-    def test_kserve_runs_the_same(self):
+    def test_kserve_runs_the_same_container(self):
         (runtime,), (service,) = (load(KUBERNETES / "kserve" / file) for file in ["runtime.yaml", "service.yaml"])
         self.assertEqual((runtime["kind"], service["kind"]), ("ServingRuntime", "InferenceService"))
         predictor = service["spec"]["predictor"]
-        self.assertGreater(predictor["maxReplicas"], predictor["minReplicas"], "it must be able to scale")
+        self.assertGreater(predictor["maxReplicas"], predictor["minReplicas"], "the service must scale")
         model = predictor["model"]
         self.assertEqual(model["runtime"], runtime["metadata"]["name"])
         self.assertIn(model["protocolVersion"], runtime["spec"]["protocolVersions"])
         formats = [known["name"] for known in runtime["spec"]["supportedModelFormats"]]
         self.assertIn(model["modelFormat"]["name"], formats)
         (container,) = runtime["spec"]["containers"]
-        # What is inside it, Kubernetes knows: as a pod's it has to be valid.
+        # There is no schema for the runtime, but its container must be valid in a pod.
         pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "graspd"}, "spec": {"containers": [container]}}
         kubernetes_validate.validate(pod, "1.33", strict=True)
         self.assertEqual(container["name"], "kserve-container")

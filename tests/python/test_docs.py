@@ -1,6 +1,5 @@
-"""What docs/ tells people to type, typed: each document's blocks in their order, in a folder with models/zoo, beside a
-graspd that stands for the one on port 50051. What a block prints must be what the document has below it, as `text`.
-grpcurl is not needed: what it would do is done here.
+"""Runs the code blocks of each document in docs/ in order, in a folder with models/zoo. A server on a free port replaces
+the one on port 50051. The output of a block must match the `text` block below it. grpcurl is emulated.
 
     GRASPD=target/release/graspd GRASP=target/release/grasp GRASP_SIM=target/release/grasp-sim GRASPD_MODELS=models/zoo \\
     ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
@@ -37,12 +36,12 @@ from server import Server
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PORT = "127.0.0.1:50051"
-# A fence's language and what is in it.
+# Language and content of a code block.
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 def setUpModule():
-    """Installs the package as a user would, but with those that are here."""
+    """Installs the Python package, with the dependencies that are already installed."""
     folder = unittest.enterModuleContext(tempfile.TemporaryDirectory())
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-build-isolation"]
     subprocess.run([*pip, "--target", folder, ROOT / "client/python"], check=True)
@@ -51,34 +50,34 @@ def setUpModule():
 
 
 def grpcurl(*arguments):
-    """What grpcurl does, as far as the documents use it: it knows of messages what the server tells."""
+    """Emulates grpcurl as far as the documents use it, with the message types from the server's reflection."""
     parser = argparse.ArgumentParser("grpcurl")
     parser.add_argument("-plaintext", action="store_true", required=True)
     parser.add_argument("-d", default="{}", metavar="JSON")
     parser.add_argument("address")
     parser.add_argument("verb")
     parser.add_argument("symbol", nargs="?")
-    asked = parser.parse_args(arguments)
-    with grpc.insecure_channel(asked.address) as channel:
+    parsed = parser.parse_args(arguments)
+    with grpc.insecure_channel(parsed.address) as channel:
         database = ProtoReflectionDescriptorDatabase(channel)
         pool = DescriptorPool(database)
-        if asked.verb == "list":
+        if parsed.verb == "list":
             print(*sorted(database.get_services()), sep="\n")
-        elif asked.verb == "describe":
+        elif parsed.verb == "describe":
             message = DescriptorProto()
-            pool.FindMessageTypeByName(asked.symbol).CopyToProto(message)
+            pool.FindMessageTypeByName(parsed.symbol).CopyToProto(message)
             print(message)
         else:
-            service, name = asked.verb.split("/")
+            service, name = parsed.verb.split("/")
             method = pool.FindServiceByName(service).methods_by_name[name]
             kinds = [GetMessageClass(kind) for kind in (method.input_type, method.output_type)]
-            request = json_format.Parse(sys.stdin.read() if asked.d == "@" else asked.d, kinds[0]())
-            call = channel.unary_unary(f"/{asked.verb}", kinds[0].SerializeToString, kinds[1].FromString)
+            request = json_format.Parse(sys.stdin.read() if parsed.d == "@" else parsed.d, kinds[0]())
+            call = channel.unary_unary(f"/{parsed.verb}", kinds[0].SerializeToString, kinds[1].FromString)
             print(json_format.MessageToJson(call(request)))
 
 
 class Page:
-    """A document, and what the examples in it have made so far."""
+    """A document, and the state of its examples."""
 
     def __init__(self, name, server, folder):
         self.path, self.server, self.http, self.folder = DOCS / name, server.grpc, server.http, folder
@@ -91,16 +90,16 @@ class Page:
         }
 
     def blocks(self):
-        """Language, text, first line, and what must be printed: None where the document does not say."""
+        """Language, text, first line and expected output of each block. The output is None if none is documented."""
         found = list(BLOCK.finditer(self.text))
         for block, following in zip(found, [*found[1:], None]):
-            said = None
+            expected = None
             if following and following[1] == "text" and not self.text[block.end() : following.start()].strip():
-                said = following[2]
-            yield block[1], block[2], self.text.count("\n", 0, block.start(2)) + 1, said
+                expected = following[2]
+            yield block[1], block[2], self.text.count("\n", 0, block.start(2)) + 1, expected
 
     def run(self, language, code, line):
-        """What a block prints. In Python one goes on where the last one ended."""
+        """Runs a block and returns its output. Python blocks share their variables."""
         code = code.replace(PORT, self.server)
         if language == "sh":
             command = ["sh", "-euc", code]
@@ -109,7 +108,7 @@ class Page:
                 raise AssertionError(f"{self.path}:{line}: {result.stdout}{result.stderr}")
             return result.stdout
         printed = io.StringIO()
-        # With the lines of the document, should it fail.
+        # Line numbers in a traceback are those of the document.
         program = compile("\n" * (line - 1) + code, self.path, "exec")
         with contextlib.chdir(self.folder), contextlib.redirect_stdout(printed):
             exec(program, self.names)
@@ -117,18 +116,18 @@ class Page:
 
 
 def shortened(code):
-    """Measures for one second, and leaves out commands that need a Docker engine."""
+    """Reduces measurements to one second, and removes commands that need a Docker engine."""
     return re.sub(r"(?m)^docker .*\n", "", re.sub(r"--seconds \d+", "--seconds 1", code))
 
 
-def pattern(said):
-    """… is anything, and a space any space."""
-    return r"\s+".join(".*".join(map(re.escape, word.split("…"))) for word in said.split()) + r"\s*"
+def pattern(expected):
+    """A regular expression in which … matches any text, and a space any white space."""
+    return r"\s+".join(".*".join(map(re.escape, word.split("…"))) for word in expected.split()) + r"\s*"
 
 
 class DocsTest(unittest.TestCase):
     def page(self, name, edited=lambda code: code):
-        """The document once all of its blocks have been run."""
+        """Runs all blocks of a document."""
         folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
         shutil.copytree(os.environ["GRASPD_MODELS"], folder / "models/zoo")
         (folder / "bin").mkdir()
@@ -141,13 +140,13 @@ class DocsTest(unittest.TestCase):
         with mock.patch.dict(os.environ, {"GRASPD_MODELS": str(folder / "models/zoo")}):
             server = self.enterContext(Server("--watch", 0.2))
         page = Page(name, server, folder)
-        for language, code, line, said in page.blocks():
+        for language, code, line, expected in page.blocks():
             if language not in ["sh", "python"]:
                 continue
             printed = page.run(language, edited(code), line)
-            if said is not None:
-                self.assertRegex(printed, rf"\A{pattern(said)}\Z", f"{page.path}:{line}")
-        # Clients and their channels go before the server does.
+            if expected is not None:
+                self.assertRegex(printed, rf"\A{pattern(expected)}\Z", f"{page.path}:{line}")
+        # Clients and their channels are closed before the server.
         self.addCleanup(page.names.clear)
         return page
 
@@ -167,9 +166,9 @@ class DocsTest(unittest.TestCase):
         with urlopen(f"http://{page.http}/metrics") as metrics:
             served = set(re.findall(r"^# TYPE (graspd_\w+)", metrics.read().decode(), re.MULTILINE))
         table = page.text.partition("## What the metrics mean")[2].partition("## Log")[0]
-        told = set(re.findall(r"`(graspd_\w+)", table))
-        # Nothing has been loaded anew yet.
-        self.assertEqual(served | {"graspd_reloads_total"}, told)
+        documented = set(re.findall(r"`(graspd_\w+)", table))
+        # No reload has taken place yet.
+        self.assertEqual(served | {"graspd_reloads_total"}, documented)
 
     def test_conventions(self):
         self.page("conventions.md")
@@ -177,8 +176,8 @@ class DocsTest(unittest.TestCase):
     def test_own_model(self):
         self.page("own-model.md")
 
-    def test_networks_are_refused_as_own_model_says(self):
-        """Each row of its table by an example of its own."""
+    def test_errors_of_own_model(self):
+        """Each row of the table of errors has an example."""
         zoo = onnx.load(Path(os.environ["GRASPD_MODELS"], "vgn-packed.onnx"))
 
         def changed(change):

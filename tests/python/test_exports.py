@@ -1,4 +1,4 @@
-"""What `grasp detect`, which GRASP names, writes for other programs, read as they read it."""
+"""Tests the files that `grasp detect` (GRASP) writes for other programs, with parsers like theirs."""
 
 import csv
 import json
@@ -24,11 +24,11 @@ class ExportTest(unittest.TestCase):
         command = [os.environ["GRASP"], "detect", folder / "volume.npy", "--threshold", "0.3", "--frame-id", "base", "--json"]
         command += [argument for form, path in files.items() for argument in (f"--{form}", path)]
         environment = {**os.environ, "GRASPD_SERVER": server.grpc}
-        said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
-        cls.grasps = json.loads(said)["grasps"]
+        output = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+        cls.grasps = json.loads(output)["grasps"]
         cls.files = {form: path.read_text() for form, path in files.items()}
 
-    def test_there_are_some(self):
+    def test_there_are_grasps(self):
         self.assertGreater(len(self.grasps), 1)
 
     def test_csv_is_a_table(self):

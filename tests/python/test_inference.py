@@ -1,4 +1,4 @@
-"""NVIDIA's client of Triton, unchanged, against the Open Inference Protocol of graspd.
+"""Tests graspd's Open Inference Protocol with NVIDIA's unmodified Triton client.
 
     GRASPD=target/release/graspd GRASPD_MODELS=models/zoo ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
     $(python3 tests/tools.py python) -m unittest discover --start-directory tests/python --pattern test_inference.py
@@ -38,7 +38,7 @@ class InferenceTest(unittest.TestCase):
         return {name: result.as_numpy(name) for name in CHANNELS}
 
     def version(self):
-        """The only one there is."""
+        """The only version."""
         (version,) = self.client.get_model_metadata(MODEL).versions
         return version
 
@@ -47,11 +47,11 @@ class InferenceTest(unittest.TestCase):
         self.assertTrue(self.client.is_server_ready())
         self.assertTrue(self.client.is_model_ready(MODEL))
         self.assertTrue(self.client.is_model_ready(MODEL, self.version()))
-        # The last of them is no network.
-        for name, version in [("nobody", ""), (MODEL, "7"), ("shaf", "")]:
+        # shaf has no network.
+        for name, version in [("missing", ""), (MODEL, "7"), ("shaf", "")]:
             self.assertFalse(self.client.is_model_ready(name, version))
 
-    def test_what_there_is_is_described(self):
+    def test_server_and_model_metadata(self):
         server = self.client.get_server_metadata()
         self.assertEqual((server.name, list(server.extensions)), ("graspd", ["model_configuration"]))
         model = self.client.get_model_metadata(MODEL)
@@ -62,13 +62,13 @@ class InferenceTest(unittest.TestCase):
         wanted = {name: ("FP32", [-1, channels, *EDGE]) for name, channels in {"tsdf": 1, **CHANNELS}.items()}
         self.assertEqual(tensors, wanted)
         config = self.client.get_model_config(MODEL, as_json=True)["config"]
-        # As many volumes as may wait, by default.
+        # The default length of the queue.
         self.assertEqual((config["name"], config["max_batch_size"], config["backend"]), (MODEL, 32, "onnxruntime"))
         dims = {one["name"]: (one["data_type"], one["dims"]) for one in [*config["input"], *config["output"]]}
         wanted = {name: ("TYPE_FP32", [str(edge) for edge in shape[1:]]) for name, (_, shape) in wanted.items()}
         self.assertEqual(dims, wanted)
 
-    def test_the_maps_are_those_of_a_network_of_grasps(self):
+    def test_the_maps_are_valid(self):
         maps = self.maps(VOLUMES)
         for name, channels in CHANNELS.items():
             self.assertEqual((maps[name].shape, maps[name].dtype), ((2, channels, *EDGE), np.float32))
@@ -76,14 +76,14 @@ class InferenceTest(unittest.TestCase):
         self.assertTrue(0 <= maps["quality"].min() < 0.5 < maps["quality"].max() <= 1)
         np.testing.assert_allclose(np.linalg.norm(maps["rotation"], axis=1), 1, atol=1e-3)
 
-    def test_a_volume_is_answered_the_same_in_a_batch_and_alone(self):
+    def test_results_do_not_depend_on_the_batch(self):
         both = self.maps(VOLUMES)
         for index in range(2):
             alone = self.maps(VOLUMES[index : index + 1])
             for name in CHANNELS:
                 np.testing.assert_array_equal(both[name][index], alone[name][0], name)
 
-    def test_the_answer_says_by_whom_and_how_fast(self):
+    def test_replies_have_id_model_and_latency(self):
         version = self.version()
         response = self.infer(VOLUMES, request_id="from triton", model_version=version).get_response()
         self.assertEqual((response.id, response.model_name, response.model_version), ("from triton", MODEL, version))
@@ -92,7 +92,7 @@ class InferenceTest(unittest.TestCase):
         self.assertLessEqual({f"{stage}_seconds" for stage in stages}, set(seconds))
         self.assertTrue(0 < seconds["inference_seconds"] < seconds["total_seconds"])
 
-    def test_only_the_outputs_that_were_asked_for_come(self):
+    def test_only_requested_outputs_are_returned(self):
         result = self.infer(VOLUMES, outputs=[InferRequestedOutput("width")])
         self.assertEqual([output.name for output in result.get_response().outputs], ["width"])
         np.testing.assert_array_equal(result.as_numpy("width"), self.maps(VOLUMES)["width"])
@@ -114,16 +114,16 @@ class InferenceTest(unittest.TestCase):
             np.testing.assert_array_equal(result.as_numpy("quality"), wanted)
         self.assertEqual(numbers, set(range(8)))
 
-    def test_mistakes_have_their_status(self):
+    def test_errors_have_their_status_code(self):
         other = self.tensor(VOLUMES, "input")
         double = self.tensor(VOLUMES.astype(np.float64), datatype="FP64")
         unknown = [InferRequestedOutput("grip")]
-        for ask, status, said in [
-            (lambda: self.infer(VOLUMES, model="nobody"), "NOT_FOUND", "model_name: `nobody` not found"),
+        for call, status, message in [
+            (lambda: self.infer(VOLUMES, model="missing"), "NOT_FOUND", "model_name: `missing` not found"),
             (lambda: self.infer(VOLUMES, model="shaf"), "NOT_FOUND", "available: vgn-packed"),
             (lambda: self.infer(VOLUMES, model_version="7"), "NOT_FOUND", "vgn-packed 7"),
-            (lambda: self.client.get_model_metadata("nobody"), "NOT_FOUND", "model_name"),
-            (lambda: self.client.get_model_config("nobody"), "NOT_FOUND", "model_name"),
+            (lambda: self.client.get_model_metadata("missing"), "NOT_FOUND", "model_name"),
+            (lambda: self.client.get_model_config("missing"), "NOT_FOUND", "model_name"),
             (lambda: self.infer(VOLUMES[:, :, 1:]), "INVALID_ARGUMENT", "inputs[0].shape is [2, 1, 39, 40, 40]"),
             (lambda: self.infer(VOLUMES[:0]), "INVALID_ARGUMENT", "inputs[0].shape is [0, 1, 40, 40, 40]"),
             (lambda: self.client.infer(MODEL, [other]), "INVALID_ARGUMENT", "inputs[0].name is `input`"),
@@ -132,10 +132,10 @@ class InferenceTest(unittest.TestCase):
             (lambda: self.infer(VOLUMES * np.float32(np.nan)), "INVALID_ARGUMENT", "NaN"),
             (lambda: self.infer(VOLUMES, outputs=unknown), "INVALID_ARGUMENT", "outputs is `grip`"),
         ]:
-            with self.subTest(said), self.assertRaises(InferenceServerException) as caught:
-                ask()
+            with self.subTest(message), self.assertRaises(InferenceServerException) as caught:
+                call()
             self.assertEqual(caught.exception.status(), f"StatusCode.{status}")
-            self.assertIn(said, caught.exception.message())
+            self.assertIn(message, caught.exception.message())
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The jobs of deploy/label, run as Kubernetes and Slurm would run them; GRASP_SIM names `grasp-sim`."""
+"""Runs the jobs of deploy/label as Kubernetes and Slurm would, with `grasp-sim` from GRASP_SIM."""
 
 import os
 import re
@@ -35,7 +35,7 @@ class LabelJobsTest(unittest.TestCase):
         return result.stdout
 
     def files(self, folder):
-        """What is in a data set, as processed files: their names and their bytes."""
+        """The content of a data set in the processed format: sorted grasps, and scene files by name."""
         out = self.folder / f"{folder.name}-processed"
         self.run_as(["grasp-sim", "convert", "--from", folder, "--format", "processed", "--out", out])
         grasps = sorted((out / "grasps.csv").read_text().splitlines())
@@ -46,7 +46,7 @@ class LabelJobsTest(unittest.TestCase):
             manifest = yaml.safe_load((DEPLOY / name).read_text())
             kubernetes_validate.validate(manifest, "1.33", strict=True)
 
-    def test_the_kustomization_names_what_the_job_uses(self):
+    def test_the_kustomization_matches_the_job(self):
         kustomization = yaml.safe_load((DEPLOY / "kustomization.yaml").read_text())
         pod = yaml.safe_load((DEPLOY / "label.yaml").read_text())["spec"]["template"]["spec"]
         (container,) = pod["containers"]
@@ -69,8 +69,8 @@ class LabelJobsTest(unittest.TestCase):
             self.run_as(command, **{**environment, "DATA": data, "SCENES": 11, "JOB_COMPLETION_INDEX": index})
 
         merge = yaml.safe_load((DEPLOY / "merge.yaml").read_text())["spec"]["template"]["spec"]["containers"][0]
-        said = self.run_as([part.replace("/data/packed", str(data)) for part in merge["command"]])
-        self.assertIn("11 scenes from 8 folders", said)
+        output = self.run_as([part.replace("/data/packed", str(data)) for part in merge["command"]])
+        self.assertIn("11 scenes from 8 folders", output)
         alone = self.folder / "alone"
         self.run_as(["grasp-sim", "label", *container["args"], "--points", 6, "--scenes", 11, "--out", alone])
         self.assertEqual(self.files(data / "whole"), self.files(alone))
@@ -83,10 +83,10 @@ class LabelJobsTest(unittest.TestCase):
             self.run_as(["sh", script], DATA=data, SCENES=9, SLURM_ARRAY_TASK_ID=task, SLURM_SUBMIT_DIR=DEPLOY.parents[1])
         parts = sorted(data.glob("part-*"))
         self.assertEqual(len(parts), last - first + 1)
-        said = self.run_as(["grasp-sim", "merge", *parts, "--out", self.folder / "whole"])
-        self.assertIn(f"9 scenes from {len(parts)} folders", said)
+        output = self.run_as(["grasp-sim", "merge", *parts, "--out", self.folder / "whole"])
+        self.assertIn(f"9 scenes from {len(parts)} folders", output)
 
-    def test_what_is_missing_is_said(self):
+    def test_missing_variables_are_reported(self):
         result = subprocess.run(["sh", DEPLOY / "label.sh"], env={"PATH": os.environ["PATH"]}, capture_output=True, text=True)
         self.assertNotEqual(result.returncode, 0)
         self.assertIn("DATA", result.stderr)

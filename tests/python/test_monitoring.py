@@ -1,4 +1,4 @@
-"""deploy/prometheus and deploy/grafana, tried on a real Prometheus that watches a real graspd, asked in every way.
+"""Tests deploy/prometheus and deploy/grafana with a real Prometheus that scrapes a real graspd under mixed requests.
 
     GRASPD=target/release/graspd GRASPD_MODELS=models/zoo ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
     GRASPD_PROMETHEUS=$(python3 tests/tools.py prometheus) GRASPD_PROMTOOL=$(python3 tests/tools.py promtool) \\
@@ -29,19 +29,19 @@ from test_client import generate
 ROOT = Path(__file__).resolve().parents[2]
 DEPLOY = ROOT / "deploy"
 RULES = DEPLOY / "prometheus"
-# What is waited for takes a few seconds on a quiet machine.
-PATIENCE = 90
+# Timeout, seconds. On an idle machine a few seconds suffice.
+TIMEOUT = 90
 
 
 def eventually(what, attempt):
-    """What `attempt` returns, once that is anything."""
-    end = time.monotonic() + PATIENCE
+    """Calls `attempt` until its result is true, and returns the result."""
+    end = time.monotonic() + TIMEOUT
     while time.monotonic() < end:
         result = attempt()
         if result:
             return result
         time.sleep(0.1)
-    raise AssertionError(f"in vain for {PATIENCE} s: {what}")
+    raise AssertionError(f"timeout after {TIMEOUT} s: {what}")
 
 
 def rules(name):
@@ -49,7 +49,7 @@ def rules(name):
 
 
 def measured(alert):
-    """What an alert compares with a number."""
+    """The expression that an alert compares with its threshold."""
     return re.fullmatch(r"(.+) [<>] [\d.]+", alert["expr"])[1]
 
 
@@ -62,13 +62,13 @@ def panels():
 
 
 class FilesTest(unittest.TestCase):
-    """What can be said of the files as they are."""
+    """Checks of the files themselves."""
 
     def promtool(self, *arguments):
         result = subprocess.run([os.environ["GRASPD_PROMTOOL"], *arguments], cwd=RULES, capture_output=True, text=True)
         self.assertEqual(result.returncode, 0, result.stdout + result.stderr)
 
-    def test_promtool_finds_nothing_wrong(self):
+    def test_promtool_finds_no_errors(self):
         self.promtool("check", "rules", "--lint-fatal", "rules.yml", "alerts.yml")
         self.promtool("check", "config", "--lint-fatal", "prometheus.yml")
 
@@ -85,12 +85,12 @@ class FilesTest(unittest.TestCase):
         self.assertTrue(silent)
         self.assertEqual(fired, {alert["alert"] for alert in rules("alerts.yml")})
 
-    def test_every_alert_says_what_to_do(self):
+    def test_every_alert_has_severity_summary_and_description(self):
         for alert in rules("alerts.yml"):
             self.assertIn(alert["labels"]["severity"], ["critical", "warning"], alert)
             self.assertEqual(set(alert["annotations"]), {"summary", "description"}, alert)
 
-    def test_panels_have_a_place_of_their_own(self):
+    def test_panels_do_not_overlap(self):
         ids = [panel["id"] for panel in dashboard()["panels"]]
         self.assertEqual(len(ids), len(set(ids)))
         taken = {}
@@ -110,12 +110,12 @@ class MonitoringTest(unittest.TestCase):
         cls.addClassCleanup(folder.cleanup)
         cls.folder = Path(folder.name)
         cls.start_graspd()
-        cls.keep_asking()
+        cls.keep_requesting()
         cls.start_prometheus()
 
     @classmethod
     def run_process(cls, name, command):
-        """Starts it, and returns what reads its output. Whatever happens, it ends with the tests."""
+        """Starts a process, and returns a function that reads its output. The process ends with the tests."""
         output = cls.folder / f"{name}.log"
         with output.open("w") as file:
             process = subprocess.Popen(command, stdout=file, stderr=file, start_new_session=True)
@@ -131,7 +131,7 @@ class MonitoringTest(unittest.TestCase):
 
         def read():
             if process.poll() is not None:
-                raise AssertionError(f"{name} has ended:\n{output.read_text()}")
+                raise AssertionError(f"{name} exited:\n{output.read_text()}")
             return output.read_text()
 
         cls.addClassCleanup(end)
@@ -139,7 +139,7 @@ class MonitoringTest(unittest.TestCase):
 
     @classmethod
     def start_graspd(cls):
-        """With one session and a short queue, so that it refuses; and with a file that cannot be served."""
+        """Starts graspd with one session and a short queue, so that it refuses requests, and adds an invalid file."""
         models = cls.folder / "models"
         models.mkdir()
         for model in Path(os.environ["GRASPD_MODELS"]).glob("*.onnx"):
@@ -151,8 +151,8 @@ class MonitoringTest(unittest.TestCase):
         (models / "broken.onnx").write_text("no model")
 
     @classmethod
-    def keep_asking(cls):
-        """Good requests, several at once, late ones, wrong ones, and ones for nobody, until the tests are over."""
+    def keep_requesting(cls):
+        """Sends requests during the tests: valid, concurrent, late and invalid ones, and for a missing model."""
         os.environ.setdefault("GRASPD_PROTO", str(ROOT / "proto/proto"))
         stubs = tempfile.TemporaryDirectory()
         cls.addClassCleanup(stubs.cleanup)
@@ -168,7 +168,7 @@ class MonitoringTest(unittest.TestCase):
         volume = pb.Volume(data=values.tobytes(), dtype=pb.DATA_TYPE_F32, **size)
         good = pb.DetectGraspsRequest(volume=volume)
         wrong = pb.DetectGraspsRequest(volume=pb.Volume(data=b"short", dtype=pb.DATA_TYPE_F32, **size))
-        strange = pb.DetectGraspsRequest(volume=volume, options=pb.Options(model="nobody"))
+        missing = pb.DetectGraspsRequest(volume=volume, options=pb.Options(model="missing"))
 
         def outcome(request, timeout=10):
             try:
@@ -177,28 +177,28 @@ class MonitoringTest(unittest.TestCase):
             except grpc.RpcError as error:
                 return error.code().name
 
-        cls.outcomes, cls.asking = set(), threading.Event()
+        cls.outcomes, cls.stopped = set(), threading.Event()
 
-        def ask():
+        def send():
             with ThreadPoolExecutor(8) as several:
-                while not cls.asking.wait(0.1):
+                while not cls.stopped.wait(0.1):
                     cls.outcomes.update(several.map(outcome, [good] * 8))
                     cls.outcomes.add(outcome(good, timeout=0.001))
-                    cls.outcomes.update(map(outcome, [good, wrong, strange]))
+                    cls.outcomes.update(map(outcome, [good, wrong, missing]))
 
-        thread = threading.Thread(target=ask)
+        thread = threading.Thread(target=send)
         thread.start()
         cls.addClassCleanup(thread.join)
-        cls.addClassCleanup(cls.asking.set)
+        cls.addClassCleanup(cls.stopped.set)
 
     @classmethod
     def start_prometheus(cls):
-        """With our configuration: only whom it watches and how often is another matter."""
+        """Starts Prometheus with the shipped configuration, except for the targets and the intervals."""
         config = yaml.safe_load((RULES / "prometheus.yml").read_text())
         config["global"] = {"scrape_interval": "1s", "evaluation_interval": "1s"}
         config["rule_files"] = [str(RULES / file) for file in config["rule_files"]]
         (job,) = config["scrape_configs"]
-        # On a cluster these two labels say which pod it is.
+        # In a cluster these two labels identify the pod.
         job["static_configs"] = [{"targets": [cls.http], "labels": {"namespace": "robots", "pod": "graspd-0"}}]
         path = cls.folder / "prometheus.yml"
         path.write_text(yaml.safe_dump(config))
@@ -208,21 +208,21 @@ class MonitoringTest(unittest.TestCase):
         cls.prometheus = eventually("Prometheus listens", lambda: listening.search(read()))[1]
         eventually("Prometheus is ready", lambda: "Server is ready to receive web requests" in read())
 
-    def ask(self, page, **parameters):
-        """A page of Prometheus' HTTP API."""
+    def query(self, page, **parameters):
+        """Queries Prometheus' HTTP API."""
         with urlopen(f"http://{self.prometheus}/api/v1/{page}?{urlencode(parameters)}", timeout=10) as reply:
             return json.load(reply)["data"]
 
     def data(self, expression):
-        """What an expression yields, once there are numbers among it."""
+        """Waits until an expression yields finite values, and returns them."""
 
         def numbers():
-            result = self.ask("query", query=expression)["result"]
+            result = self.query("query", query=expression)["result"]
             return [series for series in result if math.isfinite(float(series["value"][1]))]
 
         return eventually(expression, numbers)
 
-    def test_graspd_ends_requests_in_every_way_that_others_can_cause(self):
+    def test_graspd_counts_every_status_that_clients_can_cause(self):
         wanted = {"OK", "RESOURCE_EXHAUSTED", "DEADLINE_EXCEEDED", "INVALID_ARGUMENT", "NOT_FOUND"}
         eventually(f"{wanted}", lambda: self.outcomes >= wanted)
         counted = {series["metric"]["code"] for series in self.data("graspd_requests_total > 0")}
@@ -233,14 +233,14 @@ class MonitoringTest(unittest.TestCase):
             with self.subTest(rule["record"]):
                 self.data(rule["record"])
 
-    def test_what_alerts_measure_yields_data(self):
+    def test_expressions_of_alerts_yield_data(self):
         for alert in rules("alerts.yml"):
             with self.subTest(alert["alert"]):
                 self.data(measured(alert))
 
     def test_an_alert_is_raised_with_its_text(self):
         def raised():
-            alerts = self.ask("alerts")["alerts"]
+            alerts = self.query("alerts")["alerts"]
             return [alert for alert in alerts if alert["labels"]["alertname"] == "GraspdRejectedFiles"]
 
         (alert,) = eventually("GraspdRejectedFiles is pending", raised)
@@ -248,7 +248,7 @@ class MonitoringTest(unittest.TestCase):
 
     def test_no_rule_has_an_error(self):
         def evaluated():
-            known = [rule for group in self.ask("rules")["groups"] for rule in group["rules"]]
+            known = [rule for group in self.query("rules")["groups"] for rule in group["rules"]]
             return known if all(rule["health"] != "unknown" for rule in known) else []
 
         known = eventually("all rules are evaluated", evaluated)
@@ -256,7 +256,7 @@ class MonitoringTest(unittest.TestCase):
         self.assertEqual(len(known), len(rules("rules.yml")) + len(rules("alerts.yml")))
 
     def test_panels_show_data(self):
-        # As Grafana does it, with nothing chosen, then with all that can be.
+        # As in Grafana: first without, then with a selected instance and model.
         anything = {"instance": ".*", "model": ".*"}
         chosen = {"instance": re.escape(self.http), "model": re.escape(self.model)}
         for panel in panels():
@@ -269,32 +269,32 @@ class MonitoringTest(unittest.TestCase):
                         self.assertNotIn("$", expression)
                         lines = [series["metric"] for series in self.data(expression)]
                         if "legendFormat" in target and "vector(0)" not in expression:
-                            # By their legends they can be told apart.
+                            # Legends are unique.
                             legend = target["legendFormat"].replace("{{", "{").replace("}}", "}")
                             self.assertEqual(len({legend.format(**labels) for labels in lines}), len(lines))
 
-    def test_a_dashboard_without_a_card_shows_0(self):
+    def test_gpu_panels_show_0_without_a_gpu(self):
         for panel in panels():
             for target in panel["targets"]:
                 if "DCGM" in target["expr"]:
                     self.assertEqual([series["value"][1] for series in self.data(target["expr"])], ["0"])
 
-    def test_what_can_be_chosen_is_there(self):
+    def test_variables_of_the_dashboard_have_values(self):
         choices = [variable for variable in dashboard()["templating"]["list"] if variable["type"] == "query"]
         for variable, wanted in zip(choices, [self.http, self.model], strict=True):
             selector, label = re.fullmatch(r"label_values\((.+), (\w+)\)", variable["query"]["query"]).groups()
             self.assertEqual(variable["name"], label)
-            there = lambda: self.ask(f"label/{label}/values", **{"match[]": selector})
+            there = lambda: self.query(f"label/{label}/values", **{"match[]": selector})
             self.assertIn(wanted, eventually(selector, there))
 
-    def test_the_autoscaler_is_told_how_many_wait(self):
+    def test_the_autoscaler_receives_the_number_of_waiting_requests(self):
         adapter = yaml.safe_load((DEPLOY / "kubernetes/prometheus-adapter.yaml").read_text())
         (rule,) = adapter["rules"]["custom"]
         series = self.data(rule["seriesQuery"])[0]
         matchers = 'namespace="robots", pod=~"graspd-0"'
         filled = {"GroupBy": "pod", "Series": series["metric"]["__name__"], "LabelMatchers": matchers}
-        (told,) = self.data(re.sub(r"<<\.(\w+)>>", lambda name: filled[name[1]], rule["metricsQuery"]))
-        self.assertEqual(told["metric"], {"pod": "graspd-0"})
+        (sample,) = self.data(re.sub(r"<<\.(\w+)>>", lambda name: filled[name[1]], rule["metricsQuery"]))
+        self.assertEqual(sample["metric"], {"pod": "graspd-0"})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The package client/python, installed into a fresh folder, against graspd.
+"""Tests the package client/python, installed into an empty folder, against graspd.
 
     GRASPD=target/release/graspd GRASPD_MODELS=models/zoo ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
     $(python3 tests/tools.py python) -m unittest discover --start-directory tests/python --pattern test_package.py
@@ -29,7 +29,7 @@ from server import Server
 PACKAGE = Path(__file__).resolve().parents[2] / "client/python"
 INSTALLED = tempfile.TemporaryDirectory()
 atexit.register(INSTALLED.cleanup)
-# As a user would, but with the packages that are here.
+# Installs the package, with the dependencies that are already installed.
 PIP = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--target"]
 subprocess.run([*PIP, INSTALLED.name, PACKAGE], check=True)
 sys.path.insert(0, INSTALLED.name)
@@ -52,7 +52,7 @@ def positions(detection):
 
 
 def readme():
-    """Its example."""
+    """The example in the README."""
     (example,) = re.findall(r"```python\n(.*?)```", (PACKAGE / "README.md").read_text(), re.DOTALL)
     return example
 
@@ -80,7 +80,7 @@ class DetectTest(ServerTest):
         self.assertEqual(best.dropped.over_limit, len(found.grasps) - 1)
         self.assertEqual(sum(vars(best.dropped).values()) + 1, scene.RESOLUTION**3)
 
-    def test_volumes_come_in_every_dtype_and_order(self):
+    def test_volumes_of_every_dtype_and_memory_order(self):
         values = scene.volume(*CAMERAS)
         steps = np.rint(values * 255).astype(np.uint8)
         for same in [
@@ -93,7 +93,7 @@ class DetectTest(ServerTest):
             for other in others:
                 self.assertEqual(other, first)
 
-    def test_poses_move_the_grasps_and_stamps_come_back(self):
+    def test_grasps_are_in_the_volumes_frame_with_its_stamp(self):
         pose = graspd.Pose((0.5, -0.2, 0.1), (0.0, 0.0, 0.6, 0.8))
         own = self.client.detect(scene.volume(*CAMERAS), LOW)
         for given in [pose, pose.matrix()]:
@@ -103,7 +103,7 @@ class DetectTest(ServerTest):
             for grasp, other in zip(own.grasps, moved.grasps, strict=True):
                 np.testing.assert_allclose(other.pose.matrix(), pose.matrix() @ grasp.pose.matrix(), atol=1e-6)
 
-    def test_depth_is_answered_like_the_volume_that_it_makes(self):
+    def test_depth_images_give_the_grasps_of_their_volume(self):
         pose = graspd.Pose((0.4, 0.0, 1.1), (0.0, 0.0, 0.6, 0.8))
         workspace = graspd.Workspace(pose, size=0.3, frame_id="base", stamp=7)
         wanted = self.client.detect(graspd.Volume(scene.volume(*CAMERAS), pose=pose), LOW)
@@ -112,7 +112,7 @@ class DetectTest(ServerTest):
         self.assertEqual((found.frame_id, found.stamp), ("base", 7))
         self.assertTrue(found.latency.total > found.latency.fusion > 0)
 
-        # As hand-eye calibration gives the poses, in the millimetres of a driver.
+        # Poses from hand-eye calibration, depth in millimetres.
         millimetres = [
             graspd.DepthView(
                 np.rint(scene.depth(camera) * 1e3).astype(np.uint16),
@@ -124,14 +124,14 @@ class DetectTest(ServerTest):
         rounded = self.client.detect_from_depth(millimetres, workspace, LOW)
         np.testing.assert_allclose(positions(rounded)[0], positions(found)[0], atol=0.01)
 
-    def test_points_are_answered_like_the_depth_that_they_were_seen_in(self):
+    def test_point_clouds_give_grasps_at_the_block(self):
         clouds = [graspd.CloudView(scene.cloud(pose), (0, 0, 0), np.linalg.inv(pose)) for pose in CAMERAS]
         for model in ["vgn-packed", "gpd", "shaf"]:
             found = self.client.detect_from_cloud(clouds, options=graspd.Options(model=model))
             self.assertTrue(found.grasps and all(map(scene.is_at_the_block, found.grasps)), found)
             self.assertEqual(found.model, model)
 
-    def test_the_models_are_listed(self):
+    def test_models_are_listed(self):
         network, gpd, shaf = self.client.models()
         self.assertEqual([network.name, gpd.name, shaf.name], ["vgn-packed", "gpd", "shaf"])
         self.assertEqual((network.resolution, network.provider, shaf.resolution), (scene.RESOLUTION, "cpu", 0))
@@ -142,73 +142,73 @@ class DetectTest(ServerTest):
 
 
 class OptionsTest(ServerTest):
-    def ask(self, **options):
+    def detect(self, **options):
         options = graspd.Options(**{"model": "shaf", "explain": True, **options})
         return self.client.detect_from_depth(views(), options=options)
 
     def tips(self, found, finger_depth=0.05):
         return np.array([(grasp.pose.matrix() @ [0, 0, finger_depth, 1])[:3] for grasp in found.grasps])
 
-    def test_where_grasps_are_is_kept(self):
-        every = self.ask()
-        inside = self.ask(region=graspd.Box((0.1, 0.0, 0.0), np.array([0.2, 0.15, 0.3])))
+    def test_region_approach_and_height_are_respected(self):
+        every = self.detect()
+        inside = self.detect(region=graspd.Box((0.1, 0.0, 0.0), np.array([0.2, 0.15, 0.3])))
         self.assertTrue(0 < len(inside.grasps) < len(every.grasps) and inside.dropped.region > 0)
         self.assertTrue((self.tips(inside)[:, 1] <= 0.15).all())
-        steep = self.ask(approach=graspd.Cone((0, 0, -3), 0.3))
+        steep = self.detect(approach=graspd.Cone((0, 0, -3), 0.3))
         self.assertTrue(0 < len(steep.grasps) < len(every.grasps) and steep.dropped.approach > 0)
         self.assertTrue(all(grasp.pose.matrix()[2, 2] <= -np.cos(0.3) for grasp in steep.grasps))
-        high = self.ask(min_height=0.12)
+        high = self.detect(min_height=0.12)
         self.assertTrue(0 < len(high.grasps) < len(every.grasps) and high.dropped.height > 0)
         self.assertTrue((self.tips(high)[:, 2] >= 0.1199).all())
 
-    def test_hands_that_would_meet_something_are_marked_or_dropped(self):
+    def test_colliding_grasps_are_flagged_or_dropped(self):
         off, flagged, filtered, buried = (
-            self.ask(model="vgn-packed", threshold=0.1, collision=graspd.CollisionCheck(*check))
+            self.detect(model="vgn-packed", threshold=0.1, collision=graspd.CollisionCheck(*check))
             for check in [("off",), ("flag",), ("filter",), ("flag", 0.3)]
         )
         free = [grasp for grasp in flagged.grasps if not grasp.collides]
         self.assertTrue(0 < len(free) < len(flagged.grasps))
         self.assertEqual([replace(grasp, collides=None) for grasp in flagged.grasps], list(off.grasps))
         left = {grasp.pose.position for grasp in filtered.grasps}
-        self.assertLessEqual({grasp.pose.position for grasp in free}, left, "more, where neighbours take their place")
+        self.assertLessEqual({grasp.pose.position for grasp in free}, left, "neighbours of dropped grasps may be added")
         self.assertGreaterEqual(filtered.dropped.collision, len(flagged.grasps) - len(free))
-        self.assertTrue(all(grasp.collides for grasp in buried.grasps), "under a table")
+        self.assertTrue(all(grasp.collides for grasp in buried.grasps), "the table is above all grasps")
 
-    def test_poses_are_told_as_the_robot_wants_them(self):
-        own = self.ask()
+    def test_poses_have_the_requested_convention(self):
+        own = self.detect()
         up = graspd.Retreat(0.2, direction=(0, 0, 1))
-        tcp = self.ask(convention=graspd.Convention("tcp", "x"), pregrasp_distance=0.12, retreat=up)
+        tcp = self.detect(convention=graspd.Convention("tcp", "x"), pregrasp_distance=0.12, retreat=up)
         flange = graspd.Pose((0.0, 0.0, 0.1034))
-        parent = self.ask(convention=graspd.Convention("parent", parent_from_grasp=flange))
-        turn = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-        for grasp, told, link in zip(own.grasps, tcp.grasps, parent.grasps, strict=True):
+        parent = self.detect(convention=graspd.Convention("parent", parent_from_grasp=flange))
+        rotation = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+        for grasp, actual, link in zip(own.grasps, tcp.grasps, parent.grasps, strict=True):
             hand = np.linalg.inv(grasp.pose.matrix())
-            offset = hand @ told.pose.matrix()
+            offset = hand @ actual.pose.matrix()
             np.testing.assert_allclose(offset[:3, 3], [0, 0, 0.05], atol=1e-6)
-            np.testing.assert_allclose(offset[:3, :3], turn, atol=1e-6)
-            np.testing.assert_allclose((hand @ told.pregrasp.matrix())[:3, 3], [0, 0, 0.05 - 0.12], atol=1e-6)
-            lifted = np.subtract(told.retreat.position, told.pose.position)
+            np.testing.assert_allclose(offset[:3, :3], rotation, atol=1e-6)
+            np.testing.assert_allclose((hand @ actual.pregrasp.matrix())[:3, 3], [0, 0, 0.05 - 0.12], atol=1e-6)
+            lifted = np.subtract(actual.retreat.position, actual.pose.position)
             np.testing.assert_allclose(lifted, [0, 0, 0.2], atol=1e-6)
             np.testing.assert_allclose(hand @ link.pose.matrix() @ flange.matrix(), np.eye(4), atol=1e-6)
 
-    def test_a_longer_hand_has_its_fingertips_in_the_same_place(self):
+    def test_the_fingertips_do_not_depend_on_the_finger_depth(self):
         palm = graspd.Box((-0.02, -0.05, -0.1), (0.02, 0.05, 0.0))
-        own = self.ask(model="vgn-packed")
-        found = self.ask(model="vgn-packed", gripper=graspd.Gripper(0.08, 0.1, 0.01, 0.02, palm))
+        own = self.detect(model="vgn-packed")
+        found = self.detect(model="vgn-packed", gripper=graspd.Gripper(0.08, 0.1, 0.01, 0.02, palm))
         np.testing.assert_allclose(self.tips(found, 0.1), self.tips(own), atol=1e-6)
-        narrow = self.ask(model="vgn-packed", gripper=graspd.Gripper(0.04, 0.05, 0.01, 0.02))
+        narrow = self.detect(model="vgn-packed", gripper=graspd.Gripper(0.04, 0.05, 0.01, 0.02))
         self.assertTrue(0 < len(narrow.grasps) < len(own.grasps) and narrow.dropped.width > 0)
 
 
-class MistakesTest(ServerTest):
-    def test_the_server_names_the_field(self):
+class ErrorsTest(ServerTest):
+    def test_errors_name_the_field(self):
         volume, view = scene.volume(*CAMERAS), views()[0]
         unseen = volume.copy()
         unseen[1, 2, 3] = np.nan
         detect, from_depth = self.client.detect, self.client.detect_from_depth
         parent = graspd.Convention("parent")
         long = graspd.Pose(quaternion=(0, 0, 0, 2))
-        for ask, field in [
+        for call, field in [
             (lambda: detect(unseen), "volume.data"),
             (lambda: detect(graspd.Volume(volume, voxel_size=0.01)), "volume.voxel_size"),
             (lambda: detect(graspd.Volume(volume, pose=long)), "volume.pose.orientation"),
@@ -220,16 +220,16 @@ class MistakesTest(ServerTest):
             (lambda: from_depth([view], graspd.Workspace(size=0.5)), "workspace.size"),
         ]:
             with self.subTest(field), self.assertRaises(graspd.InvalidArgument) as caught:
-                ask()
+                call()
             error = caught.exception
             self.assertEqual((error.field, error.code), (field, grpc.StatusCode.INVALID_ARGUMENT))
             self.assertTrue(error.message.startswith(field) and error.request_id)
             self.assertEqual(vars(pickle.loads(pickle.dumps(error))), vars(error))
 
-    def test_a_model_that_is_not_there(self):
+    def test_missing_models(self):
         volume, there_are = scene.volume(*CAMERAS), "NOT_FOUND: .* available: vgn-packed [0-9.]+, .*gpd 1, shaf 1"
         for field, options in [
-            ("options.model", graspd.Options(model="nobody")),
+            ("options.model", graspd.Options(model="missing")),
             ("options.version", graspd.Options(model="shaf", version="0")),
         ]:
             with self.subTest(field), self.assertRaisesRegex(graspd.NotFound, there_are) as caught:
@@ -240,10 +240,10 @@ class MistakesTest(ServerTest):
                 self.assertEqual(error.field, field)
             self.assertEqual(caught.exception.request_id, "mine")
 
-    def test_what_cannot_be_asked_is_a_value_error(self):
+    def test_invalid_arguments_raise_value_errors(self):
         volume, depth, pose = scene.volume(*CAMERAS), scene.depth(CAMERAS[0]), np.eye(4)
         never = graspd.CollisionCheck("never")
-        for ask, said in [
+        for call, expected in [
             (lambda: graspd.Volume(volume[:-1]), r"must be a cube .* got shape \(39, 40, 40\)"),
             (lambda: graspd.Volume(np.zeros((0, 0, 0))), "must be a cube"),
             (lambda: graspd.DepthView(depth[None], scene.K, camera_from_task=pose), "row"),
@@ -259,10 +259,10 @@ class MistakesTest(ServerTest):
             (lambda: graspd.Client("127.0.0.1:1", token=" "), "token is empty"),
             (lambda: graspd.Client("127.0.0.1:1", token="two\nlines"), "token"),
         ]:
-            with self.subTest(said), self.assertRaisesRegex(ValueError, said):
-                ask()
+            with self.subTest(expected), self.assertRaisesRegex(ValueError, expected):
+                call()
 
-    def test_time_that_is_up_and_nobody_there(self):
+    def test_passed_deadlines_and_unreachable_servers(self):
         volume = scene.volume(*CAMERAS)
         with graspd.Client(self.server.grpc, timeout=1e-4) as client, self.assertRaises(graspd.DeadlineExceeded):
             client.detect(volume)
@@ -271,7 +271,7 @@ class MistakesTest(ServerTest):
 
 
 class StreamTest(ServerTest):
-    def test_a_stream_answers_in_order(self):
+    def test_replies_are_in_order(self):
         volume = scene.volume(*CAMERAS)
         volumes = [graspd.Volume(volume if i != 3 else 2 * volume, frame_id=str(i)) for i in range(8)]
         answers = list(self.client.detect_stream(iter(volumes), LOW))
@@ -282,7 +282,7 @@ class StreamTest(ServerTest):
         self.assertEqual([answer.frame_id for answer in answers], [str(i) for i in range(8) if i != 3])
         self.assertTrue(all(answer.grasps == answers[0].grasps for answer in answers))
 
-    def test_what_ends_the_volumes_is_raised_after_their_answers(self):
+    def test_an_error_of_the_iterable_is_raised_after_the_replies(self):
         def volumes():
             yield scene.volume(*CAMERAS)
             raise OSError("the camera is unplugged")
@@ -292,7 +292,7 @@ class StreamTest(ServerTest):
         with self.assertRaisesRegex(OSError, "unplugged"):
             next(answers)
 
-    def test_a_server_that_goes_ends_the_stream_with_an_error(self):
+    def test_a_server_that_shuts_down_ends_the_stream_with_an_error(self):
         with Server() as server, graspd.Client(server.grpc) as client:
             answers = client.detect_stream(itertools.repeat(scene.volume(*CAMERAS)))
             next(answers)
@@ -300,7 +300,7 @@ class StreamTest(ServerTest):
             with self.assertRaises(graspd.Unavailable):
                 list(answers)
 
-    def test_one_may_leave_a_stream(self):
+    def test_a_stream_can_be_abandoned(self):
         for _ in self.client.detect_stream(itertools.repeat(scene.volume(*CAMERAS))):
             break
         self.assertTrue(self.client.detect(scene.volume(*CAMERAS), LOW).grasps)
@@ -327,7 +327,7 @@ class TrackTest(ServerTest):
             self.assertEqual(tracking.add(options=replace(LOW, max_grasps=1)).grasps, kept.grasps[:1])
         self.wait_until_none_is_tracked()
 
-    def test_a_bad_view_costs_neither_the_stream_nor_the_volume(self):
+    def test_an_invalid_view_ends_neither_the_stream_nor_the_volume(self):
         good = views()[0]
         behind = np.eye(4)
         behind[:3, 3] = [-0.15, -0.15, -1.0]
@@ -341,7 +341,7 @@ class TrackTest(ServerTest):
             self.assertEqual(tracking.add().grasps, kept.grasps)
         self.wait_until_none_is_tracked()
 
-    def test_as_many_volumes_are_kept_as_were_allowed_and_none_for_ever(self):
+    def test_tracked_volumes_are_limited_and_expire(self):
         with self.client.track() as tracking:
             tracking.add(views(), LOW)
             with self.client.track() as other, self.assertRaisesRegex(graspd.ResourceExhausted, "--max-tracked"):
@@ -357,7 +357,7 @@ class TrackTest(ServerTest):
 
 
 def refused(server):
-    """How often graspd had no place in its queue."""
+    """The number of requests that were refused because the queue was full."""
     with graspd.Client(server.grpc) as client:
         network = client.models()[0]
     return server.metric(f'graspd_requests_total{{code="RESOURCE_EXHAUSTED",model="{network.name} {network.version}"}}')
@@ -366,7 +366,7 @@ def refused(server):
 class RetryTest(unittest.TestCase):
     PATIENT = graspd.Retry(attempts=1000, pause=0.01, longest=0.1)
 
-    def test_who_is_refused_by_a_busy_server_comes_back(self):
+    def test_refused_requests_are_retried(self):
         volume = scene.volume(*CAMERAS)
         with Server("--queue", 1) as server, ThreadPoolExecutor(8) as threads:
             with graspd.Client(server.grpc, retry=graspd.Retry.NONE) as client:
@@ -382,14 +382,14 @@ class RetryTest(unittest.TestCase):
                 self.assertTrue(all(found.grasps for found in threads.map(client.detect, [volume] * 64)))
             self.assertGreater(refused(server), before)
 
-    def test_who_lost_the_server_finds_the_next_one(self):
+    def test_requests_are_retried_while_the_server_restarts(self):
         volume = scene.volume(*CAMERAS)
         with Server() as server:
             client = self.enterContext(graspd.Client(server.grpc, retry=self.PATIENT))
             self.assertTrue(client.detect(volume).grasps)
         with ThreadPoolExecutor(1) as thread:
             call = thread.submit(client.detect, volume)
-            # As long as it would take gRPC by itself to lose its patience.
+            # Long enough that gRPC's own reconnection backoff would exceed the limit below.
             time.sleep(3)
             self.assertFalse(call.done())
             with Server(listen=server.grpc):
@@ -397,7 +397,7 @@ class RetryTest(unittest.TestCase):
                 self.assertTrue(call.result().grasps)
                 self.assertLess(time.monotonic() - started, 1.5)
 
-    def test_pauses_grow_up_to_the_longest_and_end(self):
+    def test_pauses_grow_up_to_the_longest_and_attempts_are_limited(self):
         retry = graspd.Retry(attempts=6, pause=0.1, longest=0.4)
         busy = graspd.ResourceExhausted(grpc.StatusCode.RESOURCE_EXHAUSTED, "busy")
         for attempts, most in enumerate([0.1, 0.2, 0.4, 0.4, 0.4], 1):
@@ -412,7 +412,7 @@ class SecurityTest(unittest.TestCase):
     def setUp(self):
         self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
 
-    def test_only_bearers_of_a_token_are_answered(self):
+    def test_requests_without_a_valid_token_are_refused(self):
         file = self.folder / "tokens"
         file.write_text("good-secret\n")
         with Server("--token-file", file) as server:
@@ -424,13 +424,13 @@ class SecurityTest(unittest.TestCase):
                     self.assertTrue(tracking.add(views(), LOW).grasps)
             for token in ["bad-secret", None]:
                 with graspd.Client(server.grpc, token=token) as client:
-                    self.assertTrue(client.health(), "a probe has no token")
+                    self.assertTrue(client.health(), "health checks need no token")
                     with self.assertRaises(graspd.Unauthenticated) as caught:
                         client.models()
                     self.assertNotIn("secret", repr(caught.exception))
 
     def certificate(self, name, signer=None):
-        """Writes NAME.pem and NAME.key: a CA, or what one has signed for this machine."""
+        """Writes NAME.pem and NAME.key: a CA, or a certificate for this machine, signed by one."""
         signed = ["-CA", f"{signer}.pem", "-CAkey", f"{signer}.key", "-addext", "basicConstraints=critical,CA:FALSE"]
         subprocess.run(
             ["openssl", "req", "-x509", "-noenc", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1"]
@@ -443,8 +443,8 @@ class SecurityTest(unittest.TestCase):
         )
         return self.folder / f"{name}.pem", self.folder / f"{name}.key"
 
-    @unittest.skipUnless(shutil.which("openssl"), "there is no openssl to make certificates with")
-    def test_over_tls_both_sides_show_who_they_are(self):
+    @unittest.skipUnless(shutil.which("openssl"), "openssl is not installed")
+    def test_mutual_tls(self):
         (ca, _), (stranger, _) = self.certificate("ca"), self.certificate("stranger")
         cert, key = self.certificate("server", "ca")
         client_cert, client_key = self.certificate("client", "ca")
@@ -465,28 +465,28 @@ class AsyncioTest(unittest.IsolatedAsyncioTestCase):
     async def asyncSetUp(self):
         self.client = await self.enterAsyncContext(graspd.aio.Client(self.server.grpc, retry=RetryTest.PATIENT))
 
-    async def test_it_answers_what_the_other_client_answers(self):
+    async def test_results_equal_those_of_the_blocking_client(self):
         volume = scene.volume(*CAMERAS)
         clouds = [graspd.CloudView(scene.cloud(pose), (0, 0, 0), np.linalg.inv(pose)) for pose in CAMERAS]
         with graspd.Client(self.server.grpc) as other:
-            for ask in [
+            for call in [
                 lambda client: client.detect(volume, LOW),
                 lambda client: client.detect_from_depth(views(), options=LOW),
                 lambda client: client.detect_from_cloud(clouds, options=LOW),
             ]:
-                found = await ask(self.client)
+                found = await call(self.client)
                 self.assertTrue(found.grasps)
-                self.assertEqual(found.grasps, ask(other).grasps)
+                self.assertEqual(found.grasps, call(other).grasps)
             self.assertEqual(await self.client.models(), other.models())
         self.assertTrue(await self.client.health())
 
-    async def test_calls_run_at_the_same_time_and_come_back(self):
+    async def test_calls_run_concurrently_and_are_retried(self):
         volume = scene.volume(*CAMERAS)
         found = await asyncio.gather(*(self.client.detect(volume, LOW) for _ in range(32)))
         self.assertTrue(all(answer.grasps == found[0].grasps for answer in found))
         self.assertGreater(refused(self.server), 0)
 
-    async def test_mistakes_are_told(self):
+    async def test_errors_are_raised(self):
         with self.assertRaises(graspd.InvalidArgument) as caught:
             await self.client.detect(scene.volume(*CAMERAS), graspd.Options(threshold=2.0))
         self.assertEqual(caught.exception.field, "options.threshold")
@@ -494,7 +494,7 @@ class AsyncioTest(unittest.IsolatedAsyncioTestCase):
             with self.assertRaises(graspd.Unavailable):
                 await client.models()
 
-    async def test_a_stream_answers_in_order_until_it_breaks(self):
+    async def test_stream_replies_are_in_order_until_an_error(self):
         volume = scene.volume(*CAMERAS)
 
         async def volumes():
@@ -509,7 +509,7 @@ class AsyncioTest(unittest.IsolatedAsyncioTestCase):
         self.assertIsInstance(answers.pop(1), graspd.InvalidArgument)
         self.assertEqual([answer.frame_id for answer in answers], ["0", "2", "3"])
 
-    async def test_a_volume_is_tracked(self):
+    async def test_volumes_are_tracked(self):
         async with self.client.track(graspd.Workspace(frame_id="base")) as tracking:
             with self.assertRaisesRegex(graspd.InvalidArgument, "views"):
                 await tracking.add([replace(views()[0], k=np.eye(3))])
@@ -534,18 +534,18 @@ class PackageTest(ServerTest):
         self.assertEqual(result.returncode, 0, result.stdout + result.stderr)
         return result.stdout
 
-    def test_the_readme_does_what_it_says(self):
+    def test_the_example_of_the_readme_runs(self):
         frame_from_camera = np.linalg.inv(CAMERAS[0])
         frame_from_camera[:3, 3] += [0.4, -0.15, 0.0]
         arrays = {"volume": scene.volume(*CAMERAS), "depth": scene.depth(CAMERAS[0]), "k": scene.K}
         for name, array in {**arrays, "camera": frame_from_camera}.items():
             np.save(self.folder / f"{name}.npy", array)
         example = self.folder / "example.py"
-        # The page's port may be taken on this machine.
+        # The port of the README may be in use on this machine.
         example.write_text(readme().replace("127.0.0.1:50051", self.server.grpc))
-        said = self.run_python(example)
-        self.assertRegex(said, r"^0\.9\d+ 0\.0\d+ \(.*\) \(.*\)\n")
-        self.assertIn("workspace.size is wrong: workspace.size is -1, must be above 0", said)
+        output = self.run_python(example)
+        self.assertRegex(output, r"^0\.9\d+ 0\.0\d+ \(.*\) \(.*\)\n")
+        self.assertIn("workspace.size is wrong: workspace.size is -1, must be above 0", output)
         self.run_python("-m", "mypy", "--strict", "--cache-dir", self.folder / "cache", example)
 
     def test_the_types_are_right(self):
@@ -563,7 +563,7 @@ class PackageTest(ServerTest):
         )
         self.assertEqual(installed, ours)
 
-    def test_everything_of_the_interface_has_its_place(self):
+    def test_dataclasses_have_all_fields_of_their_messages(self):
         for ours, theirs in [
             *((getattr(graspd, name), getattr(grasp_pb2, name)) for name in OPTIONS),
             (graspd.Detection, grasp_pb2.DetectGraspsResponse),
@@ -578,32 +578,32 @@ class PackageTest(ServerTest):
 
 
 class WireTest(unittest.TestCase):
-    def test_what_is_absent_is_none_and_zero_is_not(self):
+    def test_absent_values_are_none_and_zero_is_not(self):
         for azimuth in [None, 0.0, -90.0]:
             self.assertEqual(wire.model(grasp_pb2.Model(camera_azimuth=azimuth)).camera_azimuth, azimuth)
 
-    def test_errors_of_streams_name_the_field_if_it_is_one(self):
+    def test_errors_in_streams_name_the_field(self):
         for field in [None, "options.model"]:
             error = grasp_pb2.Error(code=grpc.StatusCode.NOT_FOUND.value[0], message="not found", field=field)
-            told = wire.outcome(grasp_pb2.DetectGraspsStreamResponse(request_id="mine", error=error))
+            actual = wire.outcome(grasp_pb2.DetectGraspsStreamResponse(request_id="mine", error=error))
             wanted = graspd.NotFound(grpc.StatusCode.NOT_FOUND, error.message, field, request_id="mine")
-            self.assertEqual((type(told), vars(told)), (type(wanted), vars(wanted)))
+            self.assertEqual((type(actual), vars(actual)), (type(wanted), vars(wanted)))
 
 
 class PoseTest(unittest.TestCase):
     def test_a_matrix_and_back(self):
-        turns = Rotation.random(1000, rng=1).as_matrix().tolist()
-        turns += Rotation.from_rotvec(np.pi * np.vstack([np.eye(3), [0.6, 0.8, 0.0]])).as_matrix().tolist()
-        for turn in [np.eye(3), *turns]:
+        rotations = Rotation.random(1000, rng=1).as_matrix().tolist()
+        rotations += Rotation.from_rotvec(np.pi * np.vstack([np.eye(3), [0.6, 0.8, 0.0]])).as_matrix().tolist()
+        for rotation in [np.eye(3), *rotations]:
             matrix = np.eye(4)
-            matrix[:3, :3], matrix[:3, 3] = turn, (0.1, -0.2, 3.0)
+            matrix[:3, :3], matrix[:3, 3] = rotation, (0.1, -0.2, 3.0)
             pose = graspd.Pose.from_matrix(matrix)
             np.testing.assert_allclose(pose.matrix(), matrix, atol=1e-12)
-            np.testing.assert_allclose(Rotation.from_quat(pose.quaternion).as_matrix(), turn, atol=1e-12)
+            np.testing.assert_allclose(Rotation.from_quat(pose.quaternion).as_matrix(), rotation, atol=1e-12)
 
-    def test_what_is_no_pose_is_refused(self):
+    def test_invalid_matrices_are_rejected(self):
         pose = Rotation.from_euler("xyz", [0.1, 0.2, 0.3])
-        for spoil in [
+        for break_matrix in [
             lambda matrix: 2 * matrix,
             lambda matrix: matrix * np.nan,
             lambda matrix: matrix[[1, 0, 2, 3]],
@@ -612,7 +612,7 @@ class PoseTest(unittest.TestCase):
             matrix = np.eye(4)
             matrix[:3, :3] = pose.as_matrix()
             with self.assertRaisesRegex(ValueError, "a rotation and a translation"):
-                graspd.Pose.from_matrix(spoil(matrix))
+                graspd.Pose.from_matrix(break_matrix(matrix))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ SIMULATOR = ROOT / "sim/pybullet"
 PORT = "127.0.0.1:50051"
 HAS_PYBULLET = importlib.util.find_spec("pybullet") is not None
 without_pybullet = unittest.skipUnless(
-    HAS_PYBULLET, "there is no pybullet: it has a wheel for Python 3.11 on Linux and x86-64 alone"
+    HAS_PYBULLET, "pybullet has wheels only for Python 3.11 on Linux x86-64"
 )
 
 if HAS_PYBULLET:
@@ -249,10 +249,10 @@ class CommandTest(unittest.TestCase):
             f"--objects objects "
             f"--pybullet {python} --graspd {shlex.quote(graspd)}"
         )
-        played = [json.loads(line) for line in (self.folder / "tables.jsonl").read_text().splitlines()]
-        there = {(one["method"], one["scenario"], one["objects"]) for one in played if one["simulator"] == "pybullet"}
+        runs = [json.loads(line) for line in (self.folder / "tables.jsonl").read_text().splitlines()]
+        evaluated = {(run["method"], run["scenario"], run["objects"]) for run in runs if run["simulator"] == "pybullet"}
         planners = [("random", "packed"), ("random", "pile"), ("shaf", "packed"), ("shaf", "pile"), ("vgn", "packed")]
-        self.assertEqual(there, {(*planner, objects) for planner in planners for objects in ["test", "objects"]})
+        self.assertEqual(evaluated, {(*planner, objects) for planner in planners for objects in ["test", "objects"]})
         text = (self.folder / "tables.md").read_text()
         self.assertIn("| packed GSR %, rapier | packed GSR %, PyBullet | published |", text)
         self.assertIn("| packed, rapier | packed, PyBullet | pile, rapier | pile, PyBullet |", text)

@@ -36,12 +36,21 @@ pub fn grasp_sim() -> &'static Path {
     &BINARIES["grasp-sim"]
 }
 
+/// The client library's example.
+///
+/// # Panics
+/// When it does not build.
+#[must_use]
+pub fn example() -> &'static Path {
+    &BINARIES["detect"]
+}
+
 fn build() -> HashMap<String, PathBuf> {
     let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let mut command = Command::new(env!("CARGO"));
     // From the workspace's root, as a relative CARGO_TARGET_DIR is meant.
     // All of the workspace at once, as `make test` tests it: a package alone would want its dependencies built anew.
-    command.current_dir(workspace).args(["build", "--bins", "--workspace", "--exclude", "grasp-train"]);
+    command.current_dir(workspace).args(["build", "--bins", "--examples", "--workspace", "--exclude", "grasp-train"]);
     command.args(["--locked", "--message-format", "json-render-diagnostics"]);
     if !cfg!(debug_assertions) {
         command.arg("--release");

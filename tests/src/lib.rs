@@ -9,7 +9,7 @@ mod server;
 mod stolen;
 mod volumes;
 
-pub use binaries::{grasp, grasp_sim, graspd};
+pub use binaries::{example, grasp, grasp_sim, graspd};
 pub use models::{RESOLUTION, TestModel, WIDTH};
 pub use server::{Server, metric, peak_bytes, resident_bytes};
 pub use stolen::Stolen;

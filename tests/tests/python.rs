@@ -4,7 +4,7 @@ use std::ffi::OsStr;
 use std::path::Path;
 use std::process::Command;
 
-use grasp_tests::{Server, TestModel, grasp, grasp_sim, graspd};
+use grasp_tests::{Server, TestModel, example, grasp, grasp_sim, graspd};
 use tempfile::TempDir;
 
 /// Runs the tests of a file; `expected` is one of them, for unittest is content when it finds none at all.
@@ -105,6 +105,18 @@ fn a_client_in_cpp_is_built_and_gets_grasps_seen_from_python() {
     let models = models();
     let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.path().as_os_str())];
     run("test_cpp.py", &environment, "test_the_grasps_are_at_the_block");
+}
+
+#[test]
+fn the_examples_in_three_languages_print_the_same_grasps_seen_from_python() {
+    // GRASPD_CPP is the environment's.
+    let models = models();
+    let environment = [
+        ("GRASPD", graspd().as_os_str()),
+        ("GRASP_EXAMPLE", example().as_os_str()),
+        ("GRASPD_MODELS", models.path().as_os_str()),
+    ];
+    run("test_examples.py", &environment, "test_the_examples_print_the_same_grasps");
 }
 
 #[test]

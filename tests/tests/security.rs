@@ -156,7 +156,10 @@ fn half_a_configuration_is_refused() {
             vec!["--tls-cert", "/no/such.pem", "--tls-key", &key],
             "--tls-cert (GRASPD_TLS_CERT) is `/no/such.pem`: No such file",
         ),
-        (vec!["--token-file", "/dev/null"], "--token-file (GRASPD_TOKEN_FILE) is `/dev/null`: /dev/null contains no token"),
+        (
+            vec!["--token-file", "/dev/null"],
+            "--token-file (GRASPD_TOKEN_FILE) is `/dev/null`: /dev/null contains no token",
+        ),
         (vec!["--stall-timeout", "soon"], "--stall-timeout (GRASPD_STALL_TIMEOUT) is `soon`"),
         (vec!["--stall-timeout", "0"], "--stall-timeout (GRASPD_STALL_TIMEOUT) is `0`: must be greater than 0"),
         (vec!["--drain-timeout", "1e19"], "--drain-timeout (GRASPD_DRAIN_TIMEOUT) is `1e19`"),

@@ -174,11 +174,11 @@ impl Bench {
             let mut conditions = Vec::new();
             for seed in benchmark.seed..benchmark.seed + self.seeds {
                 let benchmark = Benchmark { seed, ..benchmark.clone() };
-                let played = benchmark.run(&PlannerSpec::from(name.as_str()), &params, &options, |event| match event {
+                let rounds = benchmark.run(&PlannerSpec::from(name.as_str()), &params, &options, |event| match event {
                     Event::Round => progress.inc(1),
                     Event::Attempt { .. } => watcher.attempt(name, seed, &event),
                 });
-                conditions.push(played.with_context(|| format!("planner `{name}`"))?);
+                conditions.push(rounds.with_context(|| format!("planner `{name}`"))?);
                 watcher.finish()?;
             }
             if let Some(path) = &self.failures {

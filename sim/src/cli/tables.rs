@@ -16,7 +16,7 @@ use grasp_sim::objects::ObjectSet;
 use grasp_sim::planner::PlannerSpec;
 use grasp_sim::score::{Spread, Summary};
 use grasp_sim::tables::{
-    Condition, EPSILON, EPSILONS, LEARNT_BOTH, RELEASED, Results, SCENARIOS, Simulator, TEST_OBJECTS, VIEWS,
+    Condition, EPSILON, EPSILONS, RELEASED, Results, SCENARIOS, Simulator, TEST_OBJECTS, TRAINED_ON_BOTH, VIEWS,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -25,28 +25,28 @@ use fingerprint::{decoding, digest, hash, hash_folder, simulator};
 use log::{Log, Measurement};
 use pybullet::{FOLDER, PyBullet, model};
 
-/// Plays what the paper's tables need, and writes them beside the published figures. What was played is kept beside the
-/// tables as JSON lines and not played again, unless the network, the simulator or the settings have changed.
+/// Measures the paper's tables and writes them with the published figures. Each benchmark run is stored in --results
+/// and is repeated only if the network, the simulator or the settings have changed.
 #[derive(Args)]
 pub struct Tables {
-    /// Folder of our networks: NAME-packed.onnx and NAME-pile.onnx learnt from one scenario, NAME.onnx from both;
-    /// classifiers/gpd.onnx is GPD's.
+    /// Folder of the networks. NAME-packed.onnx and NAME-pile.onnx were trained on one scenario, NAME.onnx on both;
+    /// classifiers/gpd.onnx is the classifier of GPD.
     #[arg(long, default_value = "models/zoo")]
     models: PathBuf,
 
-    /// Folder with VGN's released weights as vgn_packed.onnx and vgn_pile.onnx.
+    /// Folder with VGN's released weights, vgn_packed.onnx and vgn_pile.onnx.
     #[arg(long)]
     released: Option<PathBuf>,
 
-    /// Clear tables of other objects, too: those of this folder of URDF files. Its name is their name in the tables.
-    #[arg(long = "objects", value_name = "DIR")]
-    others: Vec<PathBuf>,
+    /// Also evaluate on the objects of this folder of URDF files. The tables use the folder's name.
+    #[arg(long, value_name = "DIR")]
+    objects: Vec<PathBuf>,
 
-    /// Clear tables in PyBullet, too, with this interpreter, which has what sim/pybullet/requirements.txt asks for.
+    /// Also evaluate in PyBullet, with this Python interpreter. It needs the packages of sim/pybullet/requirements.txt.
     #[arg(long, value_name = "PYTHON", requires = "graspd")]
     pybullet: Option<PathBuf>,
 
-    /// The server that answers there.
+    /// The graspd binary that serves the networks in PyBullet.
     #[arg(long, value_name = "PROGRAM")]
     graspd: Option<PathBuf>,
 
@@ -58,12 +58,11 @@ pub struct Tables {
     #[arg(long, default_value = "models/tables.jsonl")]
     results: PathBuf,
 
-    /// Scenes to clear for each seed.
+    /// Scenes per seed.
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
     rounds: u64,
 
-    /// How many seeds; the cameras, ε and objects that the paper does not have, and all games in PyBullet, are played with
-    /// the first alone.
+    /// Number of seeds. Views, ε and objects that are not in the paper, and PyBullet, use only the first seed.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..))]
     seeds: u64,
 
@@ -71,25 +70,25 @@ pub struct Tables {
     #[arg(long, default_value_t = 1)]
     seed: u64,
 
-    /// Observations to time each planner on.
+    /// Observations per timing of a planner.
     #[arg(long, default_value_t = 50)]
     timed: u64,
 }
 
-/// Where nothing reaches ε, the best grasp down to this quality is taken.
+/// If no grasp reaches ε, the best one down to this quality is taken.
 const FORCE: f32 = 0.5;
 
-/// A planner and what it is called.
+/// A planner and its name.
 #[derive(Clone)]
 struct Entry {
     method: String,
-    learnt: Option<&'static str>,
+    trained_on: Option<&'static str>,
     planner: String,
-    /// Of the planner's network.
+    /// SHA-256 of the planner's network.
     sha256: Option<String>,
 }
 
-/// Something to play.
+/// A benchmark run, or a timing.
 struct Task {
     key: String,
     condition: Condition,
@@ -104,19 +103,22 @@ impl Tables {
         let fingerprint = digest(&format!("{} {}", simulator(), decoding()));
         let tasks = self.tasks(&entries, &fingerprint)?;
         let mut log = Log::open(&self.results)?;
-        let missing: Vec<&Task> = tasks.iter().filter(|task| !log.played.contains_key(&task.key)).collect();
-        eprintln!("{} of {} games are to be played", missing.len(), tasks.len());
+        if let Some(folder) = self.out.parent() {
+            fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
+        }
+        let missing: Vec<&Task> = tasks.iter().filter(|task| !log.measurements.contains_key(&task.key)).collect();
+        eprintln!("{} of {} runs are missing", missing.len(), tasks.len());
         let progress = ProgressBar::new(missing.iter().map(|task| self.effort(task)).sum())
             .with_style(ProgressStyle::with_template("{wide_bar} {pos}/{len} scenes, {eta} left {msg}")?);
         let mut pybullet = self.pybullet.as_deref().zip(self.graspd.as_deref()).map(|(p, g)| PyBullet::new(p, g));
         for task in missing {
             let Condition { method, scenario, objects, simulator, .. } = &task.condition;
             progress.set_message(format!("{method} on {scenario}, {objects}, {}", simulator.name()));
-            let played = match (simulator, &mut pybullet) {
-                (Simulator::PyBullet, Some(pybullet)) => self.play_there(task, pybullet, &progress),
-                _ => self.play(task, &progress),
+            let measurement = match (simulator, &mut pybullet) {
+                (Simulator::PyBullet, Some(pybullet)) => self.run_in_pybullet(task, pybullet, &progress),
+                _ => self.run_in_rapier(task, &progress),
             };
-            log.append(played.with_context(|| format!("planner `{}`", task.planner))?)?;
+            log.append(measurement.with_context(|| format!("planner `{}`", task.planner))?)?;
         }
         progress.finish_and_clear();
         log.keep(tasks.iter().map(|task| task.key.as_str()))?;
@@ -128,11 +130,11 @@ impl Tables {
         Ok(())
     }
 
-    /// Every planner there is, with each network in it.
+    /// All planners, with each network.
     fn entries(&self) -> anyhow::Result<Vec<Entry>> {
-        let entry = |method: &str, learnt, planner: &str, file: Option<&Path>| {
+        let entry = |method: &str, trained_on, planner: &str, file: Option<&Path>| {
             let sha256 = file.map(hash).transpose()?;
-            anyhow::Ok(Entry { method: method.to_owned(), learnt, planner: planner.to_owned(), sha256 })
+            anyhow::Ok(Entry { method: method.to_owned(), trained_on, planner: planner.to_owned(), sha256 })
         };
         let mut entries = vec![entry("random", None, "random", None)?, entry("shaf", None, "shaf", None)?];
         let classifier = self.models.join("classifiers/gpd.onnx");
@@ -149,7 +151,7 @@ impl Tables {
             let scenario = SCENARIOS.into_iter().find(|scenario| name.ends_with(&format!("-{scenario}")));
             let method = match scenario {
                 Some(scenario) => name.trim_end_matches(&format!("-{scenario}")).to_owned(),
-                None => format!("{name}{LEARNT_BOTH}"),
+                None => format!("{name}{TRAINED_ON_BOTH}"),
             };
             entries.push(entry(&method, scenario, &planner, Some(path))?);
             if method == "vgn" {
@@ -168,9 +170,10 @@ impl Tables {
 
     fn tasks(&self, entries: &[Entry], fingerprint: &str) -> anyhow::Result<Vec<Task>> {
         let mut tasks = Vec::new();
-        let others = self.others.iter().map(|folder| Ok((name_of(folder), hash_folder(folder, &["urdf", "obj"])?)));
-        let others: Vec<(String, String)> = others.collect::<anyhow::Result<_>>()?;
-        let there = match &self.pybullet {
+        let object_sets =
+            self.objects.iter().map(|folder| Ok((name_of(folder), hash_folder(folder, &["urdf", "obj"])?)));
+        let object_sets: Vec<(String, String)> = object_sets.collect::<anyhow::Result<_>>()?;
+        let pybullet_files = match &self.pybullet {
             Some(_) => {
                 Some(hash_folder(Path::new(FOLDER), &["py"])? + &hash_folder(Path::new("sim/hand"), &["urdf", "obj"])?)
             }
@@ -178,15 +181,15 @@ impl Tables {
         };
         for entry in entries {
             for scenario in SCENARIOS {
-                let crossed = entry.learnt.is_some_and(|learnt| learnt != scenario);
-                let is_network = entry.learnt.is_some() || entry.method.ends_with(LEARNT_BOTH);
+                let crossed = entry.trained_on.is_some_and(|trained_on| trained_on != scenario);
+                let is_network = entry.trained_on.is_some() || entry.method.ends_with(TRAINED_ON_BOTH);
                 let of_proposals = entry.planner.starts_with("shaf:");
                 if crossed && of_proposals {
                     continue;
                 }
                 let as_published = Condition {
                     method: entry.method.clone(),
-                    learnt: entry.learnt.map(str::to_owned),
+                    trained_on: entry.trained_on.map(str::to_owned),
                     scenario: scenario.to_owned(),
                     objects: TEST_OBJECTS.to_owned(),
                     simulator: Simulator::Rapier,
@@ -199,7 +202,7 @@ impl Tables {
                     let Condition { views, epsilon, forced, .. } = &condition;
                     let scenes = if timed { self.timed } else { self.rounds };
                     let on = (scenario, views, epsilon, forced, seed, scenes, timed);
-                    let simulator = there.as_ref().filter(|_| condition.simulator == Simulator::PyBullet);
+                    let simulator = pybullet_files.as_ref().filter(|_| condition.simulator == Simulator::PyBullet);
                     let key =
                         digest(&format!("{kind:?} {:?} {on:?} {fingerprint} {of_objects} {simulator:?}", entry.sha256));
                     tasks.push(Task { key, condition, planner: entry.planner.clone(), seed, timed });
@@ -210,9 +213,9 @@ impl Tables {
                 }
                 let mut more = Vec::new();
                 if is_network && !of_proposals {
-                    let elsewhere = VIEWS.into_iter().skip(1);
+                    let other_views = VIEWS.into_iter().skip(1);
                     more.extend(
-                        elsewhere.map(|(views, _)| Condition { views: views.to_owned(), ..as_published.clone() }),
+                        other_views.map(|(views, _)| Condition { views: views.to_owned(), ..as_published.clone() }),
                     );
                     more.extend(EPSILONS.map(|epsilon| Condition { epsilon, forced: false, ..as_published.clone() }));
                 }
@@ -220,14 +223,14 @@ impl Tables {
                 add(as_published.clone(), "", self.seed, true);
 
                 let planner = PlannerSpec::from(entry.planner.as_str());
-                let is_there = there.is_some()
+                let runs_in_pybullet = pybullet_files.is_some()
                     && (matches!(planner, PlannerSpec::Random) || model(&planner, &self.models).is_some());
-                let ours = (TEST_OBJECTS.to_owned(), String::new());
-                for (objects, hash) in std::iter::once(&ours).chain(&others) {
+                let test_objects = (TEST_OBJECTS.to_owned(), String::new());
+                for (objects, hash) in std::iter::once(&test_objects).chain(&object_sets) {
                     for simulator in [Simulator::Rapier, Simulator::PyBullet] {
                         let condition = Condition { objects: objects.clone(), simulator, ..as_published.clone() };
                         let is_new = condition != as_published;
-                        if is_new && (is_there || simulator == Simulator::Rapier) {
+                        if is_new && (runs_in_pybullet || simulator == Simulator::Rapier) {
                             add(condition, hash, self.seed, false);
                         }
                     }
@@ -241,9 +244,9 @@ impl Tables {
         if task.timed { self.timed } else { self.rounds }
     }
 
-    /// The folder of a game's objects; `None` of ours.
+    /// The folder of a condition's objects; `None` for the test objects.
     fn folder(&self, condition: &Condition) -> Option<&Path> {
-        self.others.iter().map(PathBuf::as_path).find(|folder| name_of(folder) == condition.objects)
+        self.objects.iter().map(PathBuf::as_path).find(|folder| name_of(folder) == condition.objects)
     }
 
     fn benchmark(&self, condition: &Condition, seed: u64) -> anyhow::Result<Benchmark> {
@@ -263,17 +266,22 @@ impl Tables {
         })
     }
 
-    fn play_there(&self, task: &Task, pybullet: &mut PyBullet, progress: &ProgressBar) -> anyhow::Result<Measurement> {
+    fn run_in_pybullet(
+        &self,
+        task: &Task,
+        pybullet: &mut PyBullet,
+        progress: &ProgressBar,
+    ) -> anyhow::Result<Measurement> {
         let planner = PlannerSpec::from(task.planner.as_str());
         let model = model(&planner, &self.models);
         let summary =
-            pybullet.play(&task.condition, model.as_ref(), self.folder(&task.condition), self.rounds, task.seed)?;
+            pybullet.run(&task.condition, model.as_ref(), self.folder(&task.condition), self.rounds, task.seed)?;
         progress.inc(self.rounds);
         let (key, condition) = (task.key.clone(), task.condition.clone());
         Ok(Measurement { key, condition, seed: task.seed, summary: Some(summary), milliseconds: None })
     }
 
-    fn play(&self, task: &Task, progress: &ProgressBar) -> anyhow::Result<Measurement> {
+    fn run_in_rapier(&self, task: &Task, progress: &ProgressBar) -> anyhow::Result<Measurement> {
         let benchmark = self.benchmark(&task.condition, task.seed)?;
         let params = params(task.condition.epsilon, task.condition.forced);
         let planner = PlannerSpec::from(task.planner.as_str());
@@ -281,7 +289,7 @@ impl Tables {
         if task.timed {
             let mut planner = planner.build(&params, &Options::default())?;
             let mut times = Vec::new();
-            // The first is for warming up.
+            // The first one is a warm-up.
             for number in 0..=self.timed {
                 let (world, mut rng) = benchmark.scene(number);
                 let Some(observation) = benchmark.observe(&world, &mut rng) else { continue };
@@ -310,14 +318,15 @@ impl Tables {
 
     fn results(&self, entries: &[Entry], tasks: &[Task], log: &Log) -> anyhow::Result<Results> {
         let mut results = Results::default();
-        for played in tasks.iter().filter_map(|task| log.played.get(&task.key)) {
-            if let Some(summary) = &played.summary {
-                results.conditions.entry(played.condition.clone()).or_default().push(summary.clone());
+        for measurement in tasks.iter().filter_map(|task| log.measurements.get(&task.key)) {
+            if let Some(summary) = &measurement.summary {
+                results.conditions.entry(measurement.condition.clone()).or_default().push(summary.clone());
             }
-            if let Some(milliseconds) = played.milliseconds {
-                results
-                    .times
-                    .insert((played.condition.method.clone(), played.condition.scenario.clone()), milliseconds);
+            if let Some(milliseconds) = measurement.milliseconds {
+                results.times.insert(
+                    (measurement.condition.method.clone(), measurement.condition.scenario.clone()),
+                    milliseconds,
+                );
             }
         }
         for entry in entries.iter().filter(|entry| entry.method != RELEASED) {
@@ -326,8 +335,8 @@ impl Tables {
                 continue;
             };
             let metadata = Metadata::of(&ModelProto::read(path)?, path)?;
-            let noted = |key: &str| metadata.provenance.get(key).map_or_else(|| "?".to_owned(), |n| thousands(n));
-            results.data.insert(name.to_string_lossy().into_owned(), (noted("scenes"), noted("grasps")));
+            let provenance = |key: &str| metadata.provenance.get(key).map_or_else(|| "?".to_owned(), |n| thousands(n));
+            results.data.insert(name.to_string_lossy().into_owned(), (provenance("scenes"), provenance("grasps")));
         }
         for (scenario, scene) in SCENARIOS.into_iter().zip([Scene::Packed, Scene::Pile]) {
             results.test_objects.insert(scenario.to_owned(), scene.objects("test")?.listed().len());
@@ -338,20 +347,24 @@ impl Tables {
     fn head(&self, fingerprint: &str) -> String {
         let pybullet = match &self.pybullet {
             Some(_) => format!(
-                " In PyBullet ({FOLDER}) networks answer\nthrough graspd, which keeps grasps at the border of the volume; in rapier they \
-                 are dropped, as in GIGA's evaluation."
+                " In PyBullet\n  ({FOLDER}) graspd serves the networks and keeps grasps at the border of the volume;\n  in rapier \
+                 they are dropped, as in GIGA's evaluation."
             ),
             None => String::new(),
         };
         format!(
-            "# The paper's tables, here and there\n\n\
-             *6-DoF Robotic Grasping with Transformer*, Tables 1–4, beside what `make tables` measured: {} scenes of five unseen\n\
-             procedural objects for each seed from {} to {} (only the first in PyBullet, and for cameras, ε and objects that the\n\
-             paper does not have), noisy depth from one side view, ε = 0.9, `force` down to 0.5, the best grasp first, out_th 0.1.\n\
-             GSR is the share of the grasps that lifted an object, DR that of the objects cleared away; mean ± standard deviation\n\
-             over the seeds. VGN-R are VGN's released weights; the paper states its times for an RTX 3090, here it is\n\
-             {} with {} cores, ONNX Runtime's CPU provider, one observation after another.\n\
-             Simulator and decoding {}.{pybullet}\n\n",
+            "# The paper's tables\n\n\
+             Tables 1–4 of *6-DoF Robotic Grasping with Transformer*, measured by `make tables`, with the published figures.\n\n\
+             - Scenes: {} per seed, seeds {} to {}, with five unseen procedural objects each. PyBullet, and views, ε and objects\n\
+             \x20 that are not in the paper, use only the first seed.\n\
+             - Observation: one side view with depth noise. Grasps: ε = 0.9, `force` down to 0.5, the best grasp first,\n\
+             \x20 out_th 0.1.\n\
+             - GSR: share of the grasps that lifted an object. DR: share of the objects that were removed. Mean ± standard\n\
+             \x20 deviation over the seeds.\n\
+             - VGN-R: VGN's released weights.\n\
+             - Times: {} with {} cores, ONNX Runtime's CPU provider, one observation at a time. The paper's times are for an\n\
+             \x20 RTX 3090.\n\
+             - Simulator and decoding {}.{pybullet}\n\n",
             self.rounds,
             self.seed,
             self.seed + self.seeds - 1,
@@ -362,7 +375,7 @@ impl Tables {
     }
 }
 
-/// Between a network's output and the grasps: ε in hundredths, and whether the best grasp is taken below it.
+/// Decoding parameters: ε in hundredths, and whether the best grasp is taken if none reaches it.
 fn params(epsilon: u8, forced: bool) -> DecodeParams {
     let force = Some(FORCE).filter(|_| forced);
     DecodeParams { threshold: f32::from(epsilon) / 100.0, force, ..DecodeParams::benchmark() }
@@ -388,7 +401,7 @@ fn thousands(number: &str) -> String {
 fn processor() -> String {
     let text = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = text.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
-    name.map_or_else(|| "an unnamed processor".to_owned(), |(_, name)| name.trim().to_owned())
+    name.map_or_else(|| "unknown processor".to_owned(), |(_, name)| name.trim().to_owned())
 }
 
 #[cfg(test)]

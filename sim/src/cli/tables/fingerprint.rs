@@ -1,4 +1,4 @@
-//! What the results depend on, as hashes: where one changes, its tables are played again.
+//! Hashes of what the results depend on. If a hash changes, its runs are repeated.
 
 use std::path::{Path, PathBuf};
 use std::{fs, io};
@@ -16,7 +16,7 @@ use sha2::{Digest, Sha256};
 use super::params;
 use crate::cli::{Scene, parse_views};
 
-/// Changes when the simulator does: a hash of two labelled scenes.
+/// Hash of two labelled scenes, which changes with the simulator.
 pub(super) fn simulator() -> String {
     let scenes = [Scene::Pile, Scene::Packed].map(|scene| {
         let config = SceneConfig {
@@ -30,18 +30,18 @@ pub(super) fn simulator() -> String {
         };
         config.label(1)
     });
-    // Numbers alone: the names of types and fields may change.
+    // Only numbers, so that types and fields can be renamed.
     let seen = scenes.iter().flatten().flat_map(|scene| &scene.observations).flat_map(|seen| &seen.volume);
-    let tried = scenes.iter().flatten().flat_map(|scene| &scene.points).flat_map(|point| {
+    let trials = scenes.iter().flatten().flat_map(|scene| &scene.points).flat_map(|point| {
         let own = [point.share, point.clearance, f32::from(u8::from(point.success()))].map(f64::from);
         [numbers(&point.grasp), own.to_vec(), point.lifted.map(|lifted| f64::from(u8::from(lifted))).to_vec()].concat()
     });
-    digest(&format!("{:?} {:?}", seen.collect::<Vec<_>>(), tried.collect::<Vec<_>>()))
+    digest(&format!("{:?} {:?}", seen.collect::<Vec<_>>(), trials.collect::<Vec<_>>()))
 }
 
-/// Changes when decoding does: a hash of what is found in a volume and maps by chance.
+/// Hash of the grasps in a random volume with random maps, which changes with the decoder.
 pub(super) fn decoding() -> String {
-    /// The edge of a block in which quality is the same: smoothing must leave something to be found.
+    /// Edge of the blocks of constant quality, voxels. Smoothing would flatten independent voxels.
     const BLOCK: usize = 8;
     let blocks = RESOLUTION / BLOCK;
     let mut rng = ChaCha8Rng::seed_from_u64(1);
@@ -73,13 +73,13 @@ pub(super) fn digest(text: &str) -> String {
     Sha256::digest(text).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// Of a file.
+/// SHA-256 of a file.
 pub(super) fn hash(path: &Path) -> anyhow::Result<String> {
     let bytes = fs::read(path).with_context(|| path.display().to_string())?;
     Ok(Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect())
 }
 
-/// Of a folder's files with one of these extensions, by their names.
+/// Hash of a folder's files with one of these extensions, with their names.
 pub(super) fn hash_folder(folder: &Path, extensions: &[&str]) -> anyhow::Result<String> {
     let files: io::Result<Vec<PathBuf>> =
         fs::read_dir(folder).and_then(|files| files.map(|file| Ok(file?.path())).collect());

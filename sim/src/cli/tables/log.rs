@@ -1,4 +1,4 @@
-//! What was played, a JSON line each, so that an interrupted run goes on where it stopped.
+//! The file of measurements, JSON lines. An interrupted command continues from it.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions};
@@ -10,10 +10,10 @@ use grasp_sim::score::{Spread, Summary};
 use grasp_sim::tables::Condition;
 use serde::{Deserialize, Serialize};
 
-/// A line of what was played.
+/// The result of one run.
 #[derive(Clone, Serialize, Deserialize)]
 pub(super) struct Measurement {
-    /// A hash of everything that it depends on.
+    /// Hash of everything that the result depends on.
     pub(super) key: String,
     #[serde(flatten)]
     pub(super) condition: Condition,
@@ -24,11 +24,11 @@ pub(super) struct Measurement {
     pub(super) milliseconds: Option<Spread>,
 }
 
-/// What was played, in a file.
+/// The measurements by key, and their file.
 pub(super) struct Log {
     path: PathBuf,
     file: File,
-    pub(super) played: BTreeMap<String, Measurement>,
+    pub(super) measurements: BTreeMap<String, Measurement>,
 }
 
 impl Log {
@@ -37,31 +37,31 @@ impl Log {
         if let Some(folder) = path.parent() {
             fs::create_dir_all(folder).with_context(context)?;
         }
-        let mut played = BTreeMap::new();
+        let mut measurements = BTreeMap::new();
         if path.exists() {
             for line in BufReader::new(File::open(path).with_context(context)?).lines() {
-                // What a killed run left half written is played again.
+                // Ignores an incomplete line of a killed command; its run is repeated.
                 if let Ok(line) = serde_json::from_str::<Measurement>(&line.with_context(context)?) {
-                    played.insert(line.key.clone(), line);
+                    measurements.insert(line.key.clone(), line);
                 }
             }
         }
         let file = OpenOptions::new().append(true).create(true).open(path).with_context(context)?;
-        Ok(Self { path: path.to_owned(), file, played })
+        Ok(Self { path: path.to_owned(), file, measurements })
     }
 
-    pub(super) fn append(&mut self, played: Measurement) -> anyhow::Result<()> {
-        // After a half-written line a new one begins.
-        let line = format!("\n{}\n", serde_json::to_string(&played)?);
+    pub(super) fn append(&mut self, measurement: Measurement) -> anyhow::Result<()> {
+        // The first newline ends an incomplete line.
+        let line = format!("\n{}\n", serde_json::to_string(&measurement)?);
         self.file.write_all(line.as_bytes()).with_context(|| self.path.display().to_string())?;
-        self.played.insert(played.key.clone(), played);
+        self.measurements.insert(measurement.key.clone(), measurement);
         Ok(())
     }
 
-    /// Drops all but these, and puts them in this order.
+    /// Removes all other measurements, and sorts by these keys.
     pub(super) fn keep<'a>(&mut self, keys: impl Iterator<Item = &'a str>) -> anyhow::Result<()> {
         let context = || self.path.display().to_string();
-        let lines = keys.filter_map(|key| self.played.get(key));
+        let lines = keys.filter_map(|key| self.measurements.get(key));
         let text = lines.map(|line| Ok(serde_json::to_string(line)? + "\n")).collect::<anyhow::Result<String>>()?;
         let partial = self.path.with_extension("jsonl.partial");
         fs::write(&partial, text).with_context(context)?;

@@ -1,4 +1,4 @@
-//! Plays in the second simulator, where servers of this process answer.
+//! Benchmark runs in PyBullet, with planners that graspd serves.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -14,29 +14,29 @@ use tempfile::TempDir;
 
 use super::{FORCE, scene_of};
 
-/// From the root of a checkout.
+/// Relative to the root of a checkout.
 pub(super) const FOLDER: &str = "sim/pybullet";
 
-/// The second simulator.
+/// Runs the benchmark in PyBullet.
 pub(super) struct PyBullet {
     python: PathBuf,
     graspd: PathBuf,
-    /// A server for each folder of models.
+    /// One server per model folder.
     servers: BTreeMap<PathBuf, LocalServer>,
-    /// Our test objects as files, for each scenario.
+    /// URDF files of the test objects, by scenario.
     objects: BTreeMap<String, TempDir>,
 }
 
-/// A model of a folder.
+/// A model that graspd serves.
 pub(super) struct Model<'a> {
     folder: &'a Path,
     name: String,
-    /// Smallest quality of a grasp, and whether the best grasp is taken where nothing reaches it; none for a network's.
+    /// Smallest quality of a grasp; `None` for networks, which use ε and `force`.
     threshold: Option<&'static str>,
 }
 
-/// Which model of a server is the planner; `None` where no server has it. `zoo` is the folder of those that are not
-/// networks.
+/// The served model of a planner; `None` if graspd does not serve it. `zoo` is the model folder for planners without a
+/// network.
 pub(super) fn model<'a>(planner: &'a PlannerSpec, zoo: &'a Path) -> Option<Model<'a>> {
     let classical = |name: &str, threshold| Model { folder: zoo, name: name.to_owned(), threshold: Some(threshold) };
     match planner {
@@ -56,8 +56,8 @@ impl PyBullet {
         Self { python, graspd, servers: BTreeMap::new(), objects: BTreeMap::new() }
     }
 
-    /// Clears tables; without a model, by random grasps. `folder` has the objects, if they are not ours.
-    pub(super) fn play(
+    /// Runs the benchmark; without a model, with random grasps. `folder` has the objects; `None`: the test objects.
+    pub(super) fn run(
         &mut self,
         condition: &Condition,
         model: Option<&Model>,
@@ -67,7 +67,7 @@ impl PyBullet {
     ) -> anyhow::Result<Summary> {
         let objects = match folder {
             Some(folder) => folder.to_owned(),
-            None => self.ours(&condition.scenario)?,
+            None => self.test_objects(&condition.scenario)?,
         };
         let mut command = Command::new(&self.python);
         command
@@ -88,14 +88,14 @@ impl PyBullet {
         let jobs = available_parallelism().map_or(1, |n| n.get());
         command.args(["--rounds", &rounds.to_string(), "--seed", &seed.to_string(), "--jobs", &jobs.to_string()]);
         let output = command.output().with_context(|| format!("cannot run {}", self.python.display()))?;
-        let said = String::from_utf8_lossy(&output.stderr);
-        ensure!(output.status.success(), "{command:?} failed ({}): {said}", output.status);
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        ensure!(output.status.success(), "{command:?} failed ({}): {stderr}", output.status);
         let text = String::from_utf8_lossy(&output.stdout);
         let last = text.lines().last().with_context(|| format!("{command:?} printed nothing"))?;
         serde_json::from_str(last).with_context(|| format!("{command:?} printed `{last}`"))
     }
 
-    fn ours(&mut self, scenario: &str) -> anyhow::Result<PathBuf> {
+    fn test_objects(&mut self, scenario: &str) -> anyhow::Result<PathBuf> {
         if let Some(written) = self.objects.get(scenario) {
             return Ok(written.path().to_owned());
         }
