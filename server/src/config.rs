@@ -11,7 +11,7 @@ use grasp_models::{Choice, Precision, Provider, Store};
 use tonic::transport::{Certificate, Identity, ServerTlsConfig};
 
 use crate::serving::queue::Batching;
-use crate::serving::reload::Stamps;
+use crate::serving::stamps::Stamps;
 use crate::transport::request_body::Limits;
 use crate::transport::tokens::Tokens;
 use errors::ConfigErrors;

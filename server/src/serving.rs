@@ -6,4 +6,5 @@ pub(crate) mod registry;
 pub(crate) mod reload;
 pub(crate) mod scene;
 pub(crate) mod session;
+pub(crate) mod stamps;
 pub(crate) mod tracking;

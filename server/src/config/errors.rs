@@ -54,6 +54,9 @@ fn flags(command: &Command, error: &Error) -> Vec<Arg> {
         Some(ContextValue::Strings(names)) => names,
         _ => &[],
     };
+    // The names as clap prints them exist only in a built command, whose flags cannot be changed any more.
+    let mut command = command.clone();
+    command.build();
     command.get_arguments().filter(|flag| names.contains(&flag.to_string())).cloned().collect()
 }
 

@@ -11,7 +11,7 @@ use grasp_models::{Choice, Precision, Provider, Store};
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::ParseError;
 
-use crate::serving::reload::{Stamps, stamps};
+use crate::serving::stamps::{Stamps, stamps};
 use crate::transport::tokens::Tokens;
 
 /// Detects 6-DoF grasps in depth images, point clouds and TSDF volumes, over gRPC.

@@ -1,7 +1,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use grasp_models::{Entry, Options, Scan, StoreError};
 use tokio::signal::unix::Signal;
@@ -12,14 +12,9 @@ use crate::config::Config;
 use crate::readiness::State;
 use crate::serving::engine::{Engine, Serving, SessionThreads};
 use crate::serving::registry::ModelRegistry;
+use crate::serving::stamps::{CLASSIFIERS, DEFAULT, Stamps, stamps};
 use crate::telemetry::metrics::Metrics;
 use grasp_planner::Source;
-
-/// Subfolder of the model folder with GPD's classifiers.
-const CLASSIFIERS: &str = "classifiers";
-
-/// File in the model folder with the name of the default model.
-const DEFAULT: &str = "default";
 
 /// Loads the models of a folder into the registry, and reloads them when files change.
 pub(crate) struct ModelFolder {
@@ -186,22 +181,4 @@ fn classifiers(directory: &Path) -> Result<Scan, StoreError> {
 fn sources(networks: Vec<Entry>, classifiers: Vec<Entry>) -> Vec<Source> {
     let networks = networks.into_iter().map(Source::Network);
     networks.chain(classifiers.into_iter().map(Source::Gpd)).chain([Source::Shaf]).collect()
-}
-
-/// Path, modification time and size of each model file, to detect changes without reading the files.
-pub(crate) type Stamps = Vec<(PathBuf, Option<SystemTime>, u64)>;
-
-pub(crate) fn stamps(directory: &Path) -> Stamps {
-    let stamp = |path: PathBuf| {
-        // `fs::metadata` follows symbolic links, which Kubernetes swaps to update a volume.
-        let metadata = fs::metadata(&path).ok()?;
-        Some((path, metadata.modified().ok(), metadata.len()))
-    };
-    let folders = [directory.to_owned(), directory.join(CLASSIFIERS)];
-    let files = folders.iter().flat_map(fs::read_dir).flatten().flatten().map(|file| file.path());
-    let is_watched =
-        |path: &PathBuf| path.extension().is_some_and(|extension| extension == "onnx") || path.ends_with(DEFAULT);
-    let mut stamps: Vec<_> = files.filter(is_watched).filter_map(stamp).collect();
-    stamps.sort();
-    stamps
 }

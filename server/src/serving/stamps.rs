@@ -1,0 +1,29 @@
+//! Detects changes of the model folder.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+/// Subfolder of the model folder with GPD's classifiers.
+pub(super) const CLASSIFIERS: &str = "classifiers";
+
+/// File in the model folder with the name of the default model.
+pub(super) const DEFAULT: &str = "default";
+
+/// Path, modification time and size of each model file, to detect changes without reading the files.
+pub(crate) type Stamps = Vec<(PathBuf, Option<SystemTime>, u64)>;
+
+pub(crate) fn stamps(directory: &Path) -> Stamps {
+    let stamp = |path: PathBuf| {
+        // `fs::metadata` follows symbolic links, which Kubernetes swaps to update a volume.
+        let metadata = fs::metadata(&path).ok()?;
+        Some((path, metadata.modified().ok(), metadata.len()))
+    };
+    let folders = [directory.to_owned(), directory.join(CLASSIFIERS)];
+    let files = folders.iter().flat_map(fs::read_dir).flatten().flatten().map(|file| file.path());
+    let is_watched =
+        |path: &PathBuf| path.extension().is_some_and(|extension| extension == "onnx") || path.ends_with(DEFAULT);
+    let mut stamps: Vec<_> = files.filter(is_watched).filter_map(stamp).collect();
+    stamps.sort();
+    stamps
+}
