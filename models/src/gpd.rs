@@ -28,7 +28,7 @@ pub fn gpd(seed: u64) -> ModelProto {
     let mut size = IMAGE_SIZE;
     for (layer, [inputs, outputs]) in [[CHANNELS, 20], [20, 50]].into_iter().enumerate() {
         x = b.conv_2d(&format!("conv.{layer}"), &x, Conv { inputs, outputs, kernel: 5, stride: 1, bias: true });
-        x = halve(b, &x);
+        x = max_pool(b, &x);
         x = b.node("Relu", &[&x], vec![]);
         size = (size - 4) / 2;
     }
@@ -44,7 +44,7 @@ pub fn gpd(seed: u64) -> ModelProto {
 }
 
 /// Max pooling over 2 × 2 pixels.
-fn halve(b: &mut Builder, x: &str) -> String {
+fn max_pool(b: &mut Builder, x: &str) -> String {
     let attributes = vec![AttributeProto::ints("kernel_shape", &[2; 2]), AttributeProto::ints("strides", &[2; 2])];
     b.node("MaxPool", &[x], attributes)
 }

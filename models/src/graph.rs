@@ -77,7 +77,7 @@ impl Builder {
     }
 
     /// A constant list of integers.
-    pub fn whole(&mut self, values: &[i64]) -> String {
+    pub fn integers(&mut self, values: &[i64]) -> String {
         self.constant(TensorProto::from_i64("", &[values.len() as i64], values))
     }
 

@@ -6,11 +6,11 @@
 
 pub mod gpd;
 mod graph;
-mod half;
-mod heads;
+mod half_weights;
 mod metadata;
 mod networks;
 pub mod onnx;
+mod output_heads;
 mod quantize;
 mod rotation_average;
 mod runtime;
@@ -19,11 +19,11 @@ mod transformer;
 mod upsampling;
 mod vgn;
 
-pub use half::{with_full_weights, with_half_weights};
-pub use heads::{Orientation, with_published_heads};
+pub use half_weights::{with_full_weights, with_half_weights};
 pub use metadata::{Metadata, MetadataError};
 pub use networks::{Architecture, BuildError, build};
-pub use quantize::{QuantizeError, Range, quantized_activations, with_int8};
+pub use output_heads::{Orientation, with_published_heads};
+pub use quantize::{ActivationRange, QuantizeError, quantized_activations, with_int8};
 pub use rotation_average::{RotationAverageError, averaged_over_rotations};
 pub use runtime::{
     Backend, BackendError, Choice, Classifier, INPUT, LoadError, LoadReason, NameError, Network, OUTPUTS, Options,

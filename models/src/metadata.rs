@@ -98,7 +98,7 @@ impl Metadata {
                     let valid = |&size: &f64| size.is_finite() && size > 0.0;
                     metadata.voxel_size = parse("voxel_size", &value, "a number of metres above 0", valid)?;
                 }
-                // VGN's, the only one there is: (tsdf + 1) / 2 near an observed surface, 0 elsewhere, as in [`grasp::Volume`].
+                // Only VGN's convention is supported: (tsdf + 1) / 2 near an observed surface, 0 elsewhere.
                 "value_convention" if value == "vgn" => {}
                 "value_convention" => {
                     return Err(MetadataError::Property { key: "value_convention", value, expected: "`vgn`" });

@@ -6,9 +6,9 @@ use grasp::{RESOLUTION, Volume, VoxelOrigin};
 use thiserror::Error;
 
 use crate::Metadata;
-use crate::heads::Orientation;
 use crate::onnx::ModelProto;
-use crate::transformer::{Config, transformer};
+use crate::output_heads::Orientation;
+use crate::transformer::{Sizes, transformer};
 use crate::vgn::vgn;
 
 /// The network architectures of this crate.
@@ -77,8 +77,8 @@ impl Architecture {
         }
         let mut model = match self {
             Self::Vgn => vgn(resolution, orientation, seed),
-            Self::Transformer => transformer(&Config::PAPER, resolution, orientation, seed),
-            Self::TransformerSmall => transformer(&Config::SMALL, resolution, orientation, seed),
+            Self::Transformer => transformer(&Sizes::PAPER, resolution, orientation, seed),
+            Self::TransformerSmall => transformer(&Sizes::SMALL, resolution, orientation, seed),
         };
         let provenance = [
             ("architecture", self.name().to_owned()),

@@ -11,9 +11,9 @@ use thiserror::Error;
 
 use crate::onnx::{AttributeProto, GraphProto, ModelProto, NodeProto, TensorError, TensorProto};
 
-/// Range of the values of an activation.
+/// ActivationRange of the values of an activation.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Range {
+pub struct ActivationRange {
     /// Smallest value.
     pub low: f32,
     /// Largest value.
@@ -24,15 +24,15 @@ pub struct Range {
 #[derive(Debug, Error)]
 pub enum QuantizeError {
     /// The range of an activation is missing.
-    #[error("no range was observed for the activation `{0}`")]
-    Range(String),
+    #[error("no calibrated range for the activation `{0}`")]
+    MissingRange(String),
     /// A weight cannot be read.
     #[error(transparent)]
     Tensor(#[from] TensorError),
 }
 
-/// A product with a weight that can be computed with integers.
-struct Product<'a> {
+/// A convolution or matrix product with a stored weight, which can be computed in 8 bits.
+struct QuantizableProduct<'a> {
     node: &'a NodeProto,
     weight: &'a TensorProto,
     /// The axis of the weight's output channels.
@@ -58,14 +58,14 @@ pub fn quantized_activations(model: &ModelProto) -> Vec<String> {
 ///
 /// # Errors
 /// [`QuantizeError`] names the activation without a range, or the weight that cannot be read.
-pub fn with_int8(model: &ModelProto, ranges: &HashMap<String, Range>) -> Result<ModelProto, QuantizeError> {
+pub fn with_int8(model: &ModelProto, ranges: &HashMap<String, ActivationRange>) -> Result<ModelProto, QuantizeError> {
     let Some(graph) = &model.graph else { return Ok(model.clone()) };
     let products = products(graph);
     let mut quantized =
         GraphProto { node: Vec::new(), initializer: Vec::new(), value_info: Vec::new(), ..graph.clone() };
     let mut activations = HashMap::new();
     for name in products.iter().flat_map(|product| [product.input(), product.output(graph)]) {
-        let range = ranges.get(name).ok_or_else(|| QuantizeError::Range(name.to_owned()))?;
+        let range = ranges.get(name).ok_or_else(|| QuantizeError::MissingRange(name.to_owned()))?;
         activations.insert(name, range.scale());
     }
 
@@ -109,31 +109,33 @@ pub fn with_int8(model: &ModelProto, ranges: &HashMap<String, Range>) -> Result<
     Ok(ModelProto { graph: Some(quantized), ..model.clone() })
 }
 
-/// The products that are quantised, in the order of the graph.
-fn products<'a>(graph: &'a GraphProto) -> Vec<Product<'a>> {
-    let last = last(graph);
+/// The products that are quantised, in graph order.
+fn products<'a>(graph: &'a GraphProto) -> Vec<QuantizableProduct<'a>> {
+    let final_products = final_products(graph);
     let weights: HashMap<&str, &TensorProto> = graph.initializer.iter().map(|tensor| (tensor.name(), tensor)).collect();
     let mut readers: HashMap<&str, usize> = HashMap::new();
     for input in graph.node.iter().flat_map(|node| &node.input) {
         *readers.entry(input).or_default() += 1;
     }
-    let product = |node: &'a NodeProto| {
-        let weight = *weights.get(node.input.get(1)?.as_str())?;
-        let axis = match (node.op_type(), weight.dims.len()) {
-            ("Conv", _) => 0,
-            ("ConvTranspose", _) | ("MatMul", 2) => 1,
-            _ => return None,
+    let product =
+        |node: &'a NodeProto| {
+            let weight = *weights.get(node.input.get(1)?.as_str())?;
+            let axis = match (node.op_type(), weight.dims.len()) {
+                ("Conv", _) => 0,
+                ("ConvTranspose", _) | ("MatMul", 2) => 1,
+                _ => return None,
+            };
+            // Weight and bias are replaced, so they must be stored and have no other reader.
+            let stored = |name: &str| name.is_empty() || (weights.contains_key(name) && readers[name] == 1);
+            let own = node.input[1..].iter().all(|name| stored(name));
+            (own && weight.is_float() && !final_products.contains(node.output[0].as_str()))
+                .then_some(QuantizableProduct { node, weight, axis })
         };
-        // Weight and bias are replaced, so they must be stored and have no other reader.
-        let stored = |name: &str| name.is_empty() || (weights.contains_key(name) && readers[name] == 1);
-        let own = node.input[1..].iter().all(|name| stored(name));
-        (own && weight.is_float() && !last.contains(node.output[0].as_str())).then_some(Product { node, weight, axis })
-    };
     graph.node.iter().filter_map(product).collect()
 }
 
-/// The outputs of the products that no other product follows.
-fn last(graph: &GraphProto) -> HashSet<&str> {
+/// The outputs of the products that no other product depends on.
+fn final_products(graph: &GraphProto) -> HashSet<&str> {
     let (mut followed, mut last) = (HashSet::new(), HashSet::new());
     for node in graph.node.iter().rev() {
         let is_product = matches!(node.op_type(), "Conv" | "ConvTranspose" | "MatMul");
@@ -148,7 +150,7 @@ fn last(graph: &GraphProto) -> HashSet<&str> {
     last
 }
 
-impl Product<'_> {
+impl QuantizableProduct<'_> {
     fn input(&self) -> &str {
         &self.node.input[0]
     }
@@ -165,7 +167,7 @@ impl Product<'_> {
     }
 }
 
-impl Range {
+impl ActivationRange {
     /// Scale and zero point of u8 for this range extended to 0. Padding needs an exact 0.
     fn scale(self) -> (f32, u8) {
         let (low, high) = (self.low.min(0.0), self.high.max(0.0));
@@ -189,8 +191,8 @@ fn quantize_activation(graph: &mut GraphProto, name: &str, (scale, zero): (f32, 
 }
 
 /// Quantises the product's weight to i8 and returns the scales of its output channels.
-fn quantize_weight(graph: &mut GraphProto, product: &Product) -> Result<Vec<f32>, TensorError> {
-    let Product { weight, axis, .. } = *product;
+fn quantize_weight(graph: &mut GraphProto, product: &QuantizableProduct) -> Result<Vec<f32>, TensorError> {
+    let QuantizableProduct { weight, axis, .. } = *product;
     let values = weight.to_f32()?;
     let dims: Vec<usize> = weight.dims.iter().map(|&dim| dim as usize).collect();
     let inner: usize = dims[axis + 1..].iter().product();
@@ -226,7 +228,7 @@ fn quantize_bias(
     input_scale: f32,
 ) -> Result<(), QuantizeError> {
     let bias = from.initializer.iter().find(|tensor| tensor.name() == name);
-    let values = bias.ok_or_else(|| QuantizeError::Range(name.to_owned()))?.to_f32()?;
+    let values = bias.ok_or_else(|| QuantizeError::MissingRange(name.to_owned()))?.to_f32()?;
     let scales: Vec<f32> = weight_scales.iter().map(|scale| scale * input_scale).collect();
     let values: Vec<i32> = values.iter().zip(&scales).map(|(value, scale)| (value / scale).round() as i32).collect();
     let [stored, scale, zero] = ["i32", "scale", "zero"].map(|suffix| format!("{name}.{suffix}"));

@@ -1,9 +1,9 @@
-//! Binding to ONNX Runtime. No other module uses it.
+//! Binding to ONNX Runtime. No other module of the workspace calls it.
 
-mod agreement;
 mod backend;
+mod batch_session;
 mod classifier;
-mod plan;
+mod reference_check;
 
 use std::env::consts::{DLL_PREFIX, DLL_SUFFIX};
 use std::fs;
@@ -22,11 +22,11 @@ use tracing::warn;
 use crate::{Entry, Metadata, MetadataError};
 
 pub use backend::{Backend, BackendError, Choice, NameError, Precision, Provider};
+pub use batch_session::batch_sizes;
 pub use classifier::Classifier;
-pub use plan::batch_sizes;
 
-use backend::Machine;
-use plan::{Model, Outputs, Plan};
+use backend::AvailableBackends;
+use batch_session::{BatchSession, ModelFile, OutputTensors};
 
 /// The input of every network: `[batch, 1, N, N, N]`.
 pub const INPUT: &str = "tsdf";
@@ -128,7 +128,7 @@ pub enum LoadReason {
     Backend(#[from] BackendError),
     /// The requested backend computes other outputs than the reference.
     #[error("with {backend} the outputs differ from the reference: {what}; use another provider or precision")]
-    Disagrees {
+    DiffersFromReference {
         /// The backend.
         backend: Backend,
         /// The difference.
@@ -189,9 +189,10 @@ fn runtime() -> Result<&'static Runtime, RuntimeError> {
 fn load_library() -> Result<Runtime, RuntimeError> {
     let library = std::env::var_os("ORT_DYLIB_PATH").filter(|path| !path.is_empty());
     let library = library.map_or_else(|| PathBuf::from(format!("{DLL_PREFIX}onnxruntime{DLL_SUFFIX}")), PathBuf::from);
-    let refuse = |error: &dyn std::fmt::Display| RuntimeError::Library { reason: error.to_string() };
-    let builder = ort::init_from(&library).map_err(|error| refuse(&error))?;
-    let environment = builder.with_name("graspd").with_telemetry(false).build().map_err(|error| refuse(&error))?;
+    let library_error = |error: &dyn std::fmt::Display| RuntimeError::Library { reason: error.to_string() };
+    let builder = ort::init_from(&library).map_err(|error| library_error(&error))?;
+    let environment =
+        builder.with_name("graspd").with_telemetry(false).build().map_err(|error| library_error(&error))?;
     environment.set_log_level(LogLevel::Warning);
     let info = RuntimeInfo { version: version(ort::info(), &library), library };
     Ok(Runtime { info, environment })
@@ -238,12 +239,12 @@ pub struct Network {
     metadata: Metadata,
     backend: Backend,
     /// By batch size, smallest first.
-    plans: Vec<Plan>,
+    sessions: Vec<BatchSession>,
 }
 
 /// The output maps of a batch. They borrow the network's buffers, which the next run overwrites.
 pub struct Output<'a> {
-    outputs: &'a Outputs,
+    outputs: &'a OutputTensors,
     batch: usize,
     voxels: usize,
 }
@@ -266,10 +267,10 @@ impl Network {
         let load = || {
             runtime()?;
             let bytes = entry.bytes()?;
-            let model = Model::new(&entry.path, &bytes, options);
-            let first = Self::choose(&model, options)?;
+            let model = ModelFile::new(&entry.path, &bytes, options);
+            let first = Self::load_fastest(&model, options)?;
             let backend = first.backend();
-            let others = (1..count).map(|_| Self::with(&model, backend, options.max_batch));
+            let others = (1..count).map(|_| Self::load_with(&model, backend, options.max_batch));
             iter::once(Ok(first)).chain(others).take(count).collect::<Result<_, LoadReason>>()
         };
         load().map_err(|reason| LoadError { path: entry.path.clone(), reason })
@@ -278,51 +279,52 @@ impl Network {
     fn try_load(path: &Path, options: &Options) -> Result<Self, LoadReason> {
         // Fails early if ONNX Runtime cannot be loaded.
         runtime()?;
-        Self::choose(&Model::new(path, &fs::read(path)?, options), options)
+        Self::load_fastest(&ModelFile::new(path, &fs::read(path)?, options), options)
     }
 
     /// Loads with the first allowed backend whose outputs match the reference.
-    fn choose(model: &Model, options: &Options) -> Result<Self, LoadReason> {
-        if let Some(file) = &model.weights_elsewhere {
+    fn load_fastest(model: &ModelFile, options: &Options) -> Result<Self, LoadReason> {
+        if let Some(file) = &model.external_weights {
             return Err(LoadReason::Split(file.clone()));
         }
-        let backends = Machine::here().backends(options.provider, options.precision, model.is_int8)?;
+        let backends = AvailableBackends::here().backends(options.provider, options.precision, model.is_int8)?;
         let (&last, others) = backends.split_last().ok_or(RuntimeError::EmptyBatch)?;
         for &backend in others {
-            match Self::checked(model, backend, options.max_batch) {
+            match Self::load_checked(model, backend, options.max_batch) {
                 Ok(network) => return Ok(network),
                 Err(error) => {
                     warn!(model = %model.path.display(), %backend, %error, "backend rejected, trying the next one")
                 }
             }
         }
-        Self::checked(model, last, options.max_batch)
+        Self::load_checked(model, last, options.max_batch)
     }
 
-    /// Loads with one backend and compares the outputs with the reference: the unmodified file on the CPU kernels. No
-    /// comparison if this backend is the reference.
-    fn checked(model: &Model, backend: Backend, max_batch: usize) -> Result<Self, LoadReason> {
-        let mut network = Self::with(model, backend, max_batch)?;
+    /// Loads with one backend and compares its outputs with the reference, which is the unmodified file on the CPU
+    /// kernels. If the backend is the reference, there is no comparison.
+    fn load_checked(model: &ModelFile, backend: Backend, max_batch: usize) -> Result<Self, LoadReason> {
+        let mut network = Self::load_with(model, backend, max_batch)?;
         let original = model.original();
         if backend.provider != Provider::Cpu || original.is_some() {
-            let mut reference = Self::with(original.as_ref().unwrap_or(model), Backend::REFERENCE, 1)?;
-            if let Some(what) = agreement::difference(&mut network, max_batch, &mut reference)? {
-                return Err(LoadReason::Disagrees { backend, what });
+            let mut reference = Self::load_with(original.as_ref().unwrap_or(model), Backend::REFERENCE, 1)?;
+            if let Some(what) = reference_check::difference(&mut network, max_batch, &mut reference)? {
+                return Err(LoadReason::DiffersFromReference { backend, what });
             }
         }
         Ok(network)
     }
 
-    fn with(model: &Model, backend: Backend, max_batch: usize) -> Result<Self, LoadReason> {
-        let plans = Plan::all(model, backend, max_batch)?;
-        let session = plans[0].session();
-        let resolution = check_signature(session.inputs(), session.outputs(), plans[0].size().map(|size| size as i64))?;
+    fn load_with(model: &ModelFile, backend: Backend, max_batch: usize) -> Result<Self, LoadReason> {
+        let sessions = BatchSession::all(model, backend, max_batch)?;
+        let session = sessions[0].session();
+        let resolution =
+            check_signature(session.inputs(), session.outputs(), sessions[0].size().map(|size| size as i64))?;
         let metadata = read_metadata(session, Metadata::defaults(model.path, resolution))?;
         if let Some(resolution) = resolution.filter(|&resolution| resolution != metadata.resolution) {
             let what = format!("N is {} in the metadata and {resolution} in the input", metadata.resolution);
             return Err(LoadReason::Signature { what });
         }
-        Ok(Self { metadata, backend, plans })
+        Ok(Self { metadata, backend, sessions })
     }
 
     /// The backend in use.
@@ -362,9 +364,9 @@ impl Network {
             }
         }
         let voxels = expected.pow(3);
-        let Self { metadata, plans, .. } = self;
-        let refused = |error| refusal(&metadata.name, &error);
-        let input = plan(plans, batch.len())?.input(batch.len(), expected).map_err(refused)?;
+        let Self { metadata, sessions, .. } = self;
+        let failed = |error| run_error(&metadata.name, &error);
+        let input = session_for(sessions, batch.len())?.input(batch.len(), expected).map_err(failed)?;
         for (values, volume) in input.chunks_exact_mut(voxels).zip(batch) {
             values.copy_from_slice(volume.values());
         }
@@ -377,20 +379,21 @@ impl Network {
     /// # Errors
     /// [`RuntimeError`] if this batch size is not supported or ONNX Runtime fails.
     pub fn run(&mut self, batch: usize) -> Result<Output<'_>, RuntimeError> {
-        let Self { metadata, plans, .. } = self;
+        let Self { metadata, sessions, .. } = self;
         let resolution = metadata.resolution;
-        let outputs = plan(plans, batch)?.run(batch, resolution).map_err(|error| refusal(&metadata.name, &error))?;
+        let outputs =
+            session_for(sessions, batch)?.run(batch, resolution).map_err(|error| run_error(&metadata.name, &error))?;
         Ok(Output { outputs, batch, voxels: resolution.pow(3) })
     }
 }
 
-/// The smallest plan for a batch of this size.
-fn plan(plans: &mut [Plan], batch: usize) -> Result<&mut Plan, RuntimeError> {
+/// The session with the smallest batch size that fits a batch.
+fn session_for(sessions: &mut [BatchSession], batch: usize) -> Result<&mut BatchSession, RuntimeError> {
     if batch == 0 {
         return Err(RuntimeError::EmptyBatch);
     }
-    let largest = plans.last().and_then(Plan::size).unwrap_or(usize::MAX);
-    plans.iter_mut().find(|plan| plan.takes(batch)).ok_or(RuntimeError::Batch { got: batch, largest })
+    let largest = sessions.last().and_then(BatchSession::size).unwrap_or(usize::MAX);
+    sessions.iter_mut().find(|session| session.fits(batch)).ok_or(RuntimeError::Batch { got: batch, largest })
 }
 
 impl Output<'_> {
@@ -420,7 +423,7 @@ impl Output<'_> {
     }
 }
 
-fn refusal(model: &str, error: &ort::Error) -> RuntimeError {
+fn run_error(model: &str, error: &ort::Error) -> RuntimeError {
     RuntimeError::Run { model: model.to_owned(), reason: error.to_string() }
 }
 

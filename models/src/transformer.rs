@@ -3,8 +3,8 @@
 //! Where the paper gives no details, layers and initialisation follow MONAI's UNETR.
 
 use crate::graph::{Builder, Conv, Init};
-use crate::heads::{Orientation, heads, volume};
 use crate::onnx::{AttributeProto, ModelProto};
+use crate::output_heads::{Orientation, output_heads, volume_input};
 
 /// Edge of a patch, voxels. The decoder doubles the size three times.
 const PATCH: usize = 8;
@@ -14,7 +14,7 @@ const EPSILON: f32 = 1e-5;
 
 /// The sizes of a transformer.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Config {
+pub(crate) struct Sizes {
     /// K: dimension of tokens.
     pub hidden: usize,
     /// L: number of transformer blocks.
@@ -25,11 +25,11 @@ pub(crate) struct Config {
     pub mlp: usize,
     /// D: number of features per voxel.
     pub features: usize,
-    /// The blocks, counted from 1, whose outputs are skip connections to the decoder: the finer and the coarser one.
+    /// The blocks, from 1, whose outputs are the skip connections to the decoder: the finer one, then the coarser one.
     pub skips: [usize; 2],
 }
 
-impl Config {
+impl Sizes {
     /// The paper's network with the encoder of ViT-B, 87 M parameters.
     pub const PAPER: Self = Self { hidden: 768, layers: 12, heads: 12, mlp: 3072, features: 16, skips: [4, 7] };
 
@@ -39,30 +39,30 @@ impl Config {
 }
 
 /// The transformer for volumes of `resolution`³ voxels, a multiple of 8.
-pub(crate) fn transformer(config: &Config, resolution: usize, orientation: Orientation, seed: u64) -> ModelProto {
-    let Config { hidden, features, skips, .. } = *config;
+pub(crate) fn transformer(sizes: &Sizes, resolution: usize, orientation: Orientation, seed: u64) -> ModelProto {
+    let Sizes { hidden, features, skips, .. } = *sizes;
     let mut builder = Builder::new("transformer", seed);
     let b = &mut builder;
     let edge = resolution / PATCH;
 
-    let input = volume(b, resolution);
-    let mut tokens = serialize(b, &input, hidden, edge);
-    let mut carried = [String::new(), String::new()];
-    for layer in 1..=config.layers {
-        tokens = block(b, &format!("block.{layer}"), &tokens, config, edge.pow(3));
+    let input = volume_input(b, resolution);
+    let mut tokens = patch_tokens(b, &input, hidden, edge);
+    let mut skip_tokens = [String::new(), String::new()];
+    for layer in 1..=sizes.layers {
+        tokens = block(b, &format!("block.{layer}"), &tokens, sizes, edge.pow(3));
         if let Some(skip) = skips.iter().position(|&skip| skip == layer) {
-            carried[skip] = volumetric(b, &tokens, hidden, edge);
+            skip_tokens[skip] = tokens_to_grid(b, &tokens, hidden, edge);
         }
     }
     let tokens = layer_norm(b, "norm", &tokens, hidden);
-    let [fine, coarse] = carried;
+    let [fine, coarse] = skip_tokens;
 
     // Each decoder step doubles the size, halves the features and concatenates a skip of equal size and features.
     let coarse = b.conv_transpose("skip.coarse.0", &coarse, hidden, 4 * features);
     let fine = b.conv_transpose("skip.fine.0", &fine, hidden, 2 * features);
     let fine = b.conv_transpose("skip.fine.1", &fine, 2 * features, 2 * features);
     let input = residual_block(b, "skip.input", &input, 1, features);
-    let mut x = volumetric(b, &tokens, hidden, edge);
+    let mut x = tokens_to_grid(b, &tokens, hidden, edge);
     let mut inputs = hidden;
     for (name, skip, outputs) in
         [("decoder.0", coarse, 4 * features), ("decoder.1", fine, 2 * features), ("decoder.2", input, features)]
@@ -72,13 +72,13 @@ pub(crate) fn transformer(config: &Config, resolution: usize, orientation: Orien
         x = residual_block(b, name, &x, 2 * outputs, outputs);
         inputs = outputs;
     }
-    heads(b, &x, features, resolution, orientation);
+    output_heads(b, &x, features, resolution, orientation);
     builder.finish()
 }
 
-/// The paper, section "Serialization": projects each patch to a token and adds a learned position embedding. Returns
+/// The paper, section "Serialization": projects each patch to a token and adds a trainable position embedding. Returns
 /// `[batch, M, K]`.
-fn serialize(b: &mut Builder, volume: &str, hidden: usize, edge: usize) -> String {
+fn patch_tokens(b: &mut Builder, volume: &str, hidden: usize, edge: usize) -> String {
     // A convolution with stride equal to its kernel is a linear projection of every patch.
     let weight = b.parameter("patch.weight", &[hidden, 1, PATCH, PATCH, PATCH], Init::Normal(0.02));
     let bias = b.parameter("patch.bias", &[hidden], Init::Constant(0.0));
@@ -94,10 +94,10 @@ fn serialize(b: &mut Builder, volume: &str, hidden: usize, edge: usize) -> Strin
 
 /// The paper, section "Encoding with Transformer Blocks": attention and a feed-forward network, each with a preceding
 /// normalisation and a residual connection.
-fn block(b: &mut Builder, name: &str, x: &str, config: &Config, tokens: usize) -> String {
-    let Config { hidden, mlp, .. } = *config;
+fn block(b: &mut Builder, name: &str, x: &str, sizes: &Sizes, tokens: usize) -> String {
+    let Sizes { hidden, mlp, .. } = *sizes;
     let y = layer_norm(b, &format!("{name}.norm.0"), x, hidden);
-    let y = attention(b, &format!("{name}.attention"), &y, config, tokens);
+    let y = attention(b, &format!("{name}.attention"), &y, sizes, tokens);
     let x = b.node("Add", &[x, &y], vec![]);
     let y = layer_norm(b, &format!("{name}.norm.1"), &x, hidden);
     let y = b.linear(&format!("{name}.mlp.0"), &y, hidden, mlp, true);
@@ -107,12 +107,12 @@ fn block(b: &mut Builder, name: &str, x: &str, config: &Config, tokens: usize) -
 }
 
 /// Multi-head self-attention: softmax(q·k / √(K/H))·v per head, then one projection.
-fn attention(b: &mut Builder, name: &str, x: &str, config: &Config, tokens: usize) -> String {
-    let Config { hidden, heads, .. } = *config;
+fn attention(b: &mut Builder, name: &str, x: &str, sizes: &Sizes, tokens: usize) -> String {
+    let Sizes { hidden, heads, .. } = *sizes;
     let size = hidden / heads;
     let qkv = b.linear(&format!("{name}.qkv"), x, hidden, 3 * hidden, false);
-    let sizes = b.whole(&[hidden as i64; 3]);
-    let [q, k, v] = b.nodes("Split", &[&qkv, &sizes], vec![AttributeProto::int("axis", -1)]);
+    let parts = b.integers(&[hidden as i64; 3]);
+    let [q, k, v] = b.nodes("Split", &[&qkv, &parts], vec![AttributeProto::int("axis", -1)]);
     let mut head = |value: &str, order: &[i64]| {
         let split = reshape(b, value, &[0, tokens as i64, heads as i64, size as i64]);
         transpose(b, &split, order)
@@ -146,7 +146,7 @@ fn layer_norm(b: &mut Builder, name: &str, x: &str, hidden: usize) -> String {
 }
 
 /// Rearranges tokens to the grid of their patches (`Proj` in the paper): `[batch, K, n, n, n]`.
-fn volumetric(b: &mut Builder, tokens: &str, hidden: usize, edge: usize) -> String {
+fn tokens_to_grid(b: &mut Builder, tokens: &str, hidden: usize, edge: usize) -> String {
     let channels_first = transpose(b, tokens, &[0, 2, 1]);
     let edge = edge as i64;
     reshape(b, &channels_first, &[0, hidden as i64, edge, edge, edge])
@@ -181,7 +181,7 @@ fn leaky_relu(b: &mut Builder, x: &str) -> String {
 }
 
 fn reshape(b: &mut Builder, x: &str, dims: &[i64]) -> String {
-    let shape = b.whole(dims);
+    let shape = b.integers(dims);
     b.node("Reshape", &[x, &shape], vec![])
 }
 

@@ -15,11 +15,11 @@ use crate::onnx::{AttributeProto, DataType, DimensionValue, GraphProto, ModelPro
 /// The model with all suitable convolutions folded, or `None` if there are none. Weights must be f32.
 pub(crate) fn with_upsampling_folded(model: &ModelProto) -> Option<ModelProto> {
     let graph = model.graph.as_ref()?;
-    let facts = Facts::of(graph);
+    let index = GraphIndex::of(graph);
     let mut nodes = Vec::new();
     let mut weights = Vec::new();
     for node in &graph.node {
-        match facts.folded(node) {
+        match index.folded(node) {
             Some(folded) => {
                 weights.extend(folded.initializers());
                 nodes.extend(folded.nodes());
@@ -30,7 +30,7 @@ pub(crate) fn with_upsampling_folded(model: &ModelProto) -> Option<ModelProto> {
     if weights.is_empty() {
         return None;
     }
-    // Removes unused nodes. Repeated, because a removed node may have been the only reader of another.
+    // Removes unused nodes. Repeated, because a removed node can be the only reader of another.
     loop {
         let mut read: HashSet<String> = nodes.iter().flat_map(|node| node.input.iter().cloned()).collect();
         read.extend(graph.output.iter().map(|output| output.name().to_owned()));
@@ -51,13 +51,13 @@ pub(crate) fn with_upsampling_folded(model: &ModelProto) -> Option<ModelProto> {
 /// it. Only if no other node reads the upsampled array.
 #[must_use]
 pub fn upsampled_convolutions(graph: &GraphProto) -> HashMap<usize, usize> {
-    let facts = Facts::of(graph);
-    let pair = |(index, node): (usize, &NodeProto)| {
-        facts.folded(node)?;
+    let index = GraphIndex::of(graph);
+    let pair = |(position, node): (usize, &NodeProto)| {
+        index.folded(node)?;
         let large = node.input.first()?;
         let readers = graph.node.iter().filter(|node| node.input.contains(large)).count();
         let resize = graph.node.iter().position(|node| node.output.contains(large))?;
-        (readers == 1).then_some((index, resize))
+        (readers == 1).then_some((position, resize))
     };
     graph.node.iter().enumerate().filter_map(pair).collect()
 }
@@ -66,22 +66,22 @@ pub fn upsampled_convolutions(graph: &GraphProto) -> HashMap<usize, usize> {
 /// returns the size of the small kernel.
 #[must_use]
 pub fn upsampled_taps(kernel: usize) -> ([Vec<usize>; 2], usize) {
-    let small = Small::of(kernel);
+    let small = SmallKernel::of(kernel);
     ([0, 1].map(|parity| (0..kernel).map(|tap| small.position(parity, tap)).collect()), small.kernel)
 }
 
-/// Lookup tables of a graph.
-struct Facts<'a> {
+/// Lookup tables of a graph, by the name of a value.
+struct GraphIndex<'a> {
     /// Initialisers and constants.
     constants: HashMap<&'a str, &'a TensorProto>,
     /// The node that computes a value.
-    makers: HashMap<&'a str, &'a NodeProto>,
+    producers: HashMap<&'a str, &'a NodeProto>,
     /// The edge of a value of shape `[batch, channels, edge, edge, edge]`.
     edges: HashMap<&'a str, usize>,
 }
 
 /// A convolution over a small array that replaces one over an upsampled array.
-struct Folded<'a> {
+struct FoldedConvolution<'a> {
     /// The replaced convolution.
     node: &'a NodeProto,
     /// Name of the small array.
@@ -94,25 +94,25 @@ struct Folded<'a> {
     bias: Option<TensorProto>,
 }
 
-impl<'a> Facts<'a> {
+impl<'a> GraphIndex<'a> {
     fn of(graph: &'a GraphProto) -> Self {
-        let mut facts = Self { constants: HashMap::new(), makers: HashMap::new(), edges: HashMap::new() };
-        facts.constants.extend(graph.initializer.iter().map(|tensor| (tensor.name(), tensor)));
+        let mut index = Self { constants: HashMap::new(), producers: HashMap::new(), edges: HashMap::new() };
+        index.constants.extend(graph.initializer.iter().map(|tensor| (tensor.name(), tensor)));
         for input in &graph.input {
-            if let Some(edge) = cube(input) {
-                facts.edges.insert(input.name(), edge);
+            if let Some(edge) = cube_edge(input) {
+                index.edges.insert(input.name(), edge);
             }
         }
         for node in &graph.node {
             if let ("Constant", Some(value)) = (node.op_type(), node.attribute("value").and_then(|a| a.t.as_ref())) {
-                facts.constants.extend(node.output.iter().map(|name| (name.as_str(), value)));
+                index.constants.extend(node.output.iter().map(|name| (name.as_str(), value)));
             }
-            if let Some(edge) = facts.edge_after(node) {
-                facts.edges.extend(node.output.iter().map(|name| (name.as_str(), edge)));
+            if let Some(edge) = index.edge_after(node) {
+                index.edges.extend(node.output.iter().map(|name| (name.as_str(), edge)));
             }
-            facts.makers.extend(node.output.iter().map(|name| (name.as_str(), node)));
+            index.producers.extend(node.output.iter().map(|name| (name.as_str(), node)));
         }
-        facts
+        index
     }
 
     fn numbers(&self, name: &str) -> Option<Vec<f32>> {
@@ -135,9 +135,9 @@ impl<'a> Facts<'a> {
                 };
                 (all(1, -1), all(2, i64::MIN), all(4, -1)).eq(&(Some(()), Some(()), Some(()))).then_some(edge)
             }
-            "Resize" => self.doubles(node).then_some(2 * edge),
+            "Resize" => self.is_upsampling_by_2(node).then_some(2 * edge),
             "Conv" => {
-                let Shape { kernel, pad, stride } = shape(node)?;
+                let ConvShape { kernel, pad, stride } = conv_shape(node)?;
                 Some((edge + 2 * pad).checked_sub(kernel)? / stride + 1)
             }
             _ => None,
@@ -145,12 +145,12 @@ impl<'a> Facts<'a> {
     }
 
     /// Whether a node is a nearest-neighbour upsampling by 2 along each axis.
-    fn doubles(&self, node: &NodeProto) -> bool {
-        let says = |name: &str, value: &str| node.attribute(name).is_some_and(|a| a.s() == value.as_bytes());
+    fn is_upsampling_by_2(&self, node: &NodeProto) -> bool {
+        let has = |name: &str, value: &str| node.attribute(name).is_some_and(|a| a.s() == value.as_bytes());
         let scales = node.input.get(2).and_then(|scales| self.numbers(scales));
-        says("mode", "nearest")
-            && says("coordinate_transformation_mode", "asymmetric")
-            && says("nearest_mode", "floor")
+        has("mode", "nearest")
+            && has("coordinate_transformation_mode", "asymmetric")
+            && has("nearest_mode", "floor")
             && node.attribute("axes").is_none()
             && (scales.is_some_and(|scales| scales == [1.0, 1.0, 2.0, 2.0, 2.0]) || self.sizes_double(node))
     }
@@ -159,7 +159,7 @@ impl<'a> Facts<'a> {
     /// `interpolate(x, 40)` by `torch.onnx.export` for an x with edge 20.
     fn sizes_double(&self, node: &NodeProto) -> bool {
         let [of, _, _, sizes] = node.input.as_slice() else { return false };
-        let (Some(sizes), Some(&edge)) = (self.makers.get(sizes.as_str()), self.edges.get(of.as_str())) else {
+        let (Some(sizes), Some(&edge)) = (self.producers.get(sizes.as_str()), self.edges.get(of.as_str())) else {
             return false;
         };
         let [kept, doubled] = sizes.input.as_slice() else { return false };
@@ -174,13 +174,13 @@ impl<'a> Facts<'a> {
     /// Whether a value is the first two dimensions of another, as either of torch's exporters writes it.
     fn is_batch_and_channels(&self, value: &str, of: &str) -> bool {
         let shape = |name: &str| {
-            let node = self.makers.get(name)?;
+            let node = self.producers.get(name)?;
             (node.op_type() == "Shape" && node.input == [of]).then(|| {
-                let says = |name: &str| node.attribute(name).map(AttributeProto::i);
-                (says("start").unwrap_or(0), says("end"))
+                let integer = |name: &str| node.attribute(name).map(AttributeProto::i);
+                (integer("start").unwrap_or(0), integer("end"))
             })
         };
-        let Some(node) = self.makers.get(value) else { return false };
+        let Some(node) = self.producers.get(value) else { return false };
         match (node.op_type(), node.input.as_slice()) {
             ("Shape", _) => shape(value) == Some((0, Some(2))),
             ("Slice", [all, start, end, axes]) => {
@@ -194,14 +194,14 @@ impl<'a> Facts<'a> {
     }
 
     /// The replacement of a node, if it can be folded.
-    fn folded(&self, node: &'a NodeProto) -> Option<Folded<'a>> {
+    fn folded(&self, node: &'a NodeProto) -> Option<FoldedConvolution<'a>> {
         let large = node.input.first()?;
-        let resize = *self.makers.get(large.as_str())?;
-        if node.op_type() != "Conv" || resize.op_type() != "Resize" || !self.doubles(resize) {
+        let resize = *self.producers.get(large.as_str())?;
+        if node.op_type() != "Conv" || resize.op_type() != "Resize" || !self.is_upsampling_by_2(resize) {
             return None;
         }
-        let Shape { kernel, pad, stride } = shape(node)?;
-        let small = Small::of(kernel);
+        let ConvShape { kernel, pad, stride } = conv_shape(node)?;
+        let small = SmallKernel::of(kernel);
         if stride != 1 || kernel % 2 == 0 || pad != kernel / 2 || small.kernel >= kernel {
             return None;
         }
@@ -224,11 +224,11 @@ impl<'a> Facts<'a> {
             TensorProto::from_f32(&format!("{name}.weight"), &[8 * channels, inputs, edge, edge, edge], &values);
         let input = resize.input.first()?;
         let edge = *self.edges.get(input.as_str())?;
-        Some(Folded { node, input, edge, channels: channels as usize, weight, bias })
+        Some(FoldedConvolution { node, input, edge, channels: channels as usize, weight, bias })
     }
 }
 
-impl Folded<'_> {
+impl FoldedConvolution<'_> {
     fn initializers(&self) -> impl Iterator<Item = TensorProto> {
         let [split, join] = self.sizes();
         [Some(self.weight.clone()), self.bias.clone(), Some(split), Some(join)].into_iter().flatten()
@@ -258,13 +258,13 @@ impl Folded<'_> {
         ];
         let inputs = [self.input, self.weight.name()].into_iter().chain(self.bias.as_ref().map(TensorProto::name));
         let inputs: Vec<String> = inputs.map(str::to_owned).collect();
-        let [all, apart, beside] = ["eight", "apart", "beside"].map(|what| self.name(what));
+        let [parts, split, interleaved] = ["eight", "apart", "beside"].map(|what| self.name(what));
         let order = AttributeProto::ints("perm", &[0, 4, 5, 1, 6, 2, 7, 3]);
         [
-            node("Conv", inputs, &all, attributes),
-            node("Reshape", vec![all.clone(), self.name("split")], &apart, vec![]),
-            node("Transpose", vec![apart.clone()], &beside, vec![order]),
-            node("Reshape", vec![beside.clone(), self.name("join")], &self.node.output[0], vec![]),
+            node("Conv", inputs, &parts, attributes),
+            node("Reshape", vec![parts.clone(), self.name("split")], &split, vec![]),
+            node("Transpose", vec![split.clone()], &interleaved, vec![order]),
+            node("Reshape", vec![interleaved.clone(), self.name("join")], &self.node.output[0], vec![]),
         ]
     }
 }
@@ -284,13 +284,13 @@ fn node(op: &str, input: Vec<String>, output: &str, attribute: Vec<AttributeProt
 ///
 /// The output 2i + p, with p 0 or 1, reads the large array at 2i + p + d, for d from −r to r. This is the small array
 /// at i + ⌊(p + d) / 2⌋.
-struct Small {
+struct SmallKernel {
     /// Radius of the large kernel.
     r: usize,
     kernel: usize,
 }
 
-impl Small {
+impl SmallKernel {
     fn of(kernel: usize) -> Self {
         let r = kernel / 2;
         Self { r, kernel: 2 * r.div_ceil(2) + 1 }
@@ -324,14 +324,14 @@ impl Small {
 }
 
 /// Parameters of a convolution that are equal along every axis.
-struct Shape {
+struct ConvShape {
     kernel: usize,
     pad: usize,
     stride: usize,
 }
 
 /// The parameters of a convolution, if they are equal along every axis and there are no groups or dilations.
-fn shape(node: &NodeProto) -> Option<Shape> {
+fn conv_shape(node: &NodeProto) -> Option<ConvShape> {
     let same = |name: &str, count: usize, default: Option<usize>| {
         let Some(attribute) = node.attribute(name) else { return default };
         let first = attribute.ints.first()?;
@@ -343,7 +343,7 @@ fn shape(node: &NodeProto) -> Option<Shape> {
     if whole("group") != 1 || same("dilations", 3, Some(1)) != Some(1) || !padded {
         return None;
     }
-    Some(Shape {
+    Some(ConvShape {
         kernel: same("kernel_shape", 3, None)?,
         pad: same("pads", 6, Some(0))?,
         stride: same("strides", 3, Some(1))?,
@@ -351,7 +351,7 @@ fn shape(node: &NodeProto) -> Option<Shape> {
 }
 
 /// The edge of an input `[batch, channels, edge, edge, edge]`.
-fn cube(input: &crate::onnx::ValueInfoProto) -> Option<usize> {
+fn cube_edge(input: &crate::onnx::ValueInfoProto) -> Option<usize> {
     let shape = input.tensor_type()?.shape.as_ref()?;
     let [_, _, x, y, z] = shape.dim.as_slice() else { return None };
     match (&x.value, x == y && y == z) {
@@ -368,7 +368,7 @@ mod tests {
     #[test]
     fn taps_of_the_small_kernel_match_those_of_the_large_one() {
         for (kernel, small) in [(3, 3), (5, 3), (7, 5), (9, 5)] {
-            let axis = Small::of(kernel);
+            let axis = SmallKernel::of(kernel);
             assert_eq!(axis.kernel, small);
             for parity in 0..2 {
                 for tap in 0..kernel {
@@ -402,8 +402,8 @@ mod tests {
         assert!(weights(&folded) < 2 * weights(&vgn), "the old weights are removed");
         assert!(with_upsampling_folded(&folded).is_none());
 
-        let turns = averaged_over_rotations(&vgn).unwrap();
-        assert_eq!(count(&with_upsampling_folded(&turns).unwrap(), "Resize"), 1);
+        let averaged = averaged_over_rotations(&vgn).unwrap();
+        assert_eq!(count(&with_upsampling_folded(&averaged).unwrap(), "Resize"), 1);
         assert!(with_upsampling_folded(&Architecture::TransformerSmall.build(40, 0).unwrap()).is_none());
     }
 

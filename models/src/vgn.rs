@@ -2,15 +2,15 @@
 //! Clutter", CoRL 2020, with the layer sizes of its released code.
 
 use crate::graph::{Builder, Conv};
-use crate::heads::{Orientation, heads, volume};
 use crate::onnx::{AttributeProto, ModelProto};
+use crate::output_heads::{Orientation, output_heads, volume_input};
 
 /// VGN for volumes of `resolution`³ voxels (a multiple of 8). With quaternions it has 313,238 parameters at every
 /// resolution.
 pub(crate) fn vgn(resolution: usize, orientation: Orientation, seed: u64) -> ModelProto {
     let mut builder = Builder::new("vgn", seed);
     let b = &mut builder;
-    let mut x = volume(b, resolution);
+    let mut x = volume_input(b, resolution);
 
     for (layer, [inputs, outputs, kernel]) in [[1, 16, 5], [16, 32, 3], [32, 64, 3]].into_iter().enumerate() {
         x = conv_relu(b, &format!("encoder.{layer}"), &x, Conv { inputs, outputs, kernel, stride: 2, bias: true });
@@ -19,7 +19,7 @@ pub(crate) fn vgn(resolution: usize, orientation: Orientation, seed: u64) -> Mod
         x = conv_relu(b, &format!("decoder.{layer}"), &x, Conv { inputs, outputs, kernel, stride: 1, bias: true });
         x = double(b, &x);
     }
-    heads(b, &x, 16, resolution, orientation);
+    output_heads(b, &x, 16, resolution, orientation);
     builder.finish()
 }
 

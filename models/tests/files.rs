@@ -27,7 +27,7 @@ fn named(name: &str, version: &str) -> ModelProto {
 }
 
 #[test]
-fn metadata_travels_in_the_file() {
+fn metadata_is_stored_in_the_file() {
     let model = with(|metadata| {
         metadata.name = "pile".to_owned();
         metadata.version = "2.1".to_owned();
@@ -55,7 +55,7 @@ fn a_file_without_metadata_follows_vgns_conventions() {
 }
 
 #[test]
-fn metadata_that_cannot_be_is_named() {
+fn invalid_metadata_is_an_error_that_names_the_property() {
     for (key, value) in [
         ("resolution", "0"),
         ("resolution", "forty"),
@@ -73,8 +73,8 @@ fn metadata_that_cannot_be_is_named() {
 }
 
 #[test]
-fn a_network_for_volumes_that_cannot_be_is_refused() {
-    // By its property, then by the shape of its input.
+fn an_unsupported_resolution_is_an_error() {
+    // From the property, then from the shape of the input.
     let model = with(|metadata| metadata.resolution = 257);
     let error = Metadata::of(&model, Path::new("vgn.onnx")).unwrap_err().to_string();
     assert!(error.contains("257") && error.contains("from 1 to 256"), "{error}");
@@ -87,7 +87,7 @@ fn a_network_for_volumes_that_cannot_be_is_refused() {
 }
 
 #[test]
-fn a_store_gives_the_newest_version_or_the_one_asked_for() {
+fn a_store_returns_the_newest_or_the_requested_version() {
     let folder = tempfile::tempdir().unwrap();
     for (file, name, version) in [("a", "pile", "1.9"), ("b", "pile", "1.10"), ("c", "packed", "3")] {
         named(name, version).write(&folder.path().join(file).with_extension("onnx")).unwrap();
@@ -103,7 +103,7 @@ fn a_store_gives_the_newest_version_or_the_one_asked_for() {
 }
 
 #[test]
-fn a_models_hash_is_that_of_its_file() {
+fn the_hash_of_a_model_is_the_sha256_of_its_file() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("vgn.onnx");
     vgn().write(&path).unwrap();
@@ -113,7 +113,7 @@ fn a_models_hash_is_that_of_its_file() {
 }
 
 #[test]
-fn a_folder_that_cannot_be_served_is_refused_by_name() {
+fn errors_of_a_folder_name_every_invalid_file() {
     let folder = tempfile::tempdir().unwrap();
     assert!(matches!(Store::open(&folder.path().join("none")), Err(StoreError::Io { .. })));
     assert!(matches!(Store::open(folder.path()), Err(StoreError::Empty(_))));
@@ -130,7 +130,7 @@ fn a_folder_that_cannot_be_served_is_refused_by_name() {
     fs::write(folder.path().join("b.onnx"), "").unwrap();
     assert!(Store::open(folder.path()).unwrap_err().to_string().contains("no graph"));
 
-    // All of them at once, a line each.
+    // One line per invalid file.
     with(|metadata| metadata.resolution = 300).write(&folder.path().join("c.onnx")).unwrap();
     named("pile", "1").write(&folder.path().join("d.onnx")).unwrap();
     let error = Store::open(folder.path()).unwrap_err().to_string();

@@ -4,18 +4,18 @@ use std::process::Command;
 
 use grasp_models::onnx::{ModelProto, TensorProto};
 use grasp_models::{
-    Architecture, BuildError, Orientation, Range, averaged_over_rotations, build, gpd, quantized_activations,
+    ActivationRange, Architecture, BuildError, Orientation, averaged_over_rotations, build, gpd, quantized_activations,
     with_full_weights, with_half_weights, with_int8,
 };
 use prost::Message;
 
 #[test]
-fn parameters_are_those_of_the_publications() {
+fn networks_have_the_published_number_of_parameters() {
     let parameters = |name| {
         let initializers = build(name, 0).unwrap().graph.unwrap().initializer;
         initializers.iter().filter(|tensor| tensor.is_float()).map(TensorProto::elements).sum::<usize>()
     };
-    assert_eq!(parameters("vgn"), 313_238, "VGN's released weights have as many");
+    assert_eq!(parameters("vgn"), 313_238, "the number of VGN's released weights");
     // ViT-B's twelve blocks (85,026,816), its final norm, the patches and their positions, and the decoder.
     let blocks = 12 * (3 * 768 * 768 + (768 + 1) * 768 + (768 + 1) * 3072 + (3072 + 1) * 768 + 4 * 768);
     let ends = 2 * 768 + (512 + 1) * 768 + 125 * 768;
@@ -29,7 +29,7 @@ fn parameters_are_those_of_the_publications() {
 }
 
 #[test]
-fn a_seed_decides_every_byte() {
+fn the_same_seed_gives_the_same_bytes() {
     for architecture in [Architecture::Vgn, Architecture::TransformerSmall] {
         let bytes = |seed| architecture.build(16, seed).unwrap().encode_to_vec();
         assert_eq!(bytes(7), bytes(7));
@@ -38,7 +38,7 @@ fn a_seed_decides_every_byte() {
 }
 
 #[test]
-fn weights_start_as_pytorch_starts_them() {
+fn weights_are_initialised_as_in_pytorch() {
     let model = build("vgn", 1).unwrap();
     let tensor = &model.graph.as_ref().unwrap().initializer[2];
     assert_eq!(tensor.name(), "encoder.1.weight");
@@ -50,7 +50,7 @@ fn weights_start_as_pytorch_starts_them() {
 }
 
 #[test]
-fn what_cannot_be_built_is_named() {
+fn an_unknown_network_or_resolution_is_an_error() {
     let error = build("vng", 0).unwrap_err();
     assert!(matches!(error, BuildError::Name(_)));
     assert!(error.to_string().contains("`vng`") && error.to_string().contains("transformer-small"), "{error}");
@@ -61,7 +61,7 @@ fn what_cannot_be_built_is_named() {
 }
 
 #[test]
-fn a_file_is_read_as_it_was_written() {
+fn model_files_round_trip() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("vgn.onnx");
     let model = build("vgn", 3).unwrap();
@@ -76,7 +76,7 @@ fn a_file_is_read_as_it_was_written() {
 }
 
 #[test]
-fn tensors_are_read_in_every_form() {
+fn tensors_are_read_in_every_encoding() {
     let raw = TensorProto::from_f32("x", &[2], &[1.5, -2.0]);
     let typed = TensorProto { raw_data: None, float_data: vec![1.5, -2.0], ..raw.clone() };
     assert_eq!(raw.to_f32().unwrap(), typed.to_f32().unwrap());
@@ -94,12 +94,12 @@ fn tensors_are_read_in_every_form() {
 }
 
 #[test]
-fn weights_are_stored_as_halves_and_restored() {
+fn weights_are_stored_as_f16_and_restored() {
     let model = build("vgn", 5).unwrap();
     let halves = with_half_weights(&model).unwrap();
     let (before, after) = (model.encode_to_vec().len(), halves.encode_to_vec().len());
     assert!(after < before * 55 / 100, "{after} of {before} bytes");
-    assert_eq!(with_half_weights(&halves).unwrap(), halves, "once is enough");
+    assert_eq!(with_half_weights(&halves).unwrap(), halves, "a second conversion changes nothing");
     let restored = with_full_weights(&halves).unwrap();
     let (graph, original) = (restored.graph.as_ref().unwrap(), model.graph.as_ref().unwrap());
     assert_eq!(graph.node, original.node);
@@ -114,7 +114,7 @@ fn weights_are_stored_as_halves_and_restored() {
     let weight = &mut large.graph.as_mut().unwrap().initializer[0];
     weight.set_f32(&vec![1e5; weight.elements()]);
     let kept = with_half_weights(&large).unwrap().graph.unwrap().initializer[0].clone();
-    assert_eq!(kept, large.graph.unwrap().initializer[0], "what f16 does not hold stays f32");
+    assert_eq!(kept, large.graph.unwrap().initializer[0], "weights beyond the range of f16 stay f32");
 }
 
 #[test]
@@ -124,11 +124,12 @@ fn the_onnx_checker_accepts_every_network() {
     let networks = Architecture::ALL.map(|architecture| (architecture.name(), architecture.build(40, 0).unwrap()));
     let vgn = build("vgn", 0).unwrap();
     let half = with_half_weights(&vgn).unwrap();
-    let ranges = quantized_activations(&vgn).into_iter().map(|name| (name, Range { low: -1.0, high: 2.0 })).collect();
+    let ranges =
+        quantized_activations(&vgn).into_iter().map(|name| (name, ActivationRange { low: -1.0, high: 2.0 })).collect();
     let int8 = with_int8(&vgn, &ranges).unwrap();
     let axes = Architecture::Vgn.build_with(40, Orientation::Axes, 0).unwrap();
-    let turns = averaged_over_rotations(&axes).unwrap();
-    let others = [("gpd", gpd::gpd(0)), ("half", half), ("int8", int8), ("axes", axes), ("turns", turns)];
+    let averaged = averaged_over_rotations(&axes).unwrap();
+    let others = [("gpd", gpd::gpd(0)), ("half", half), ("int8", int8), ("axes", axes), ("averaged", averaged)];
     for (name, model) in networks.into_iter().chain(others) {
         let path = folder.path().join(format!("{name}.onnx"));
         model.write(&path).unwrap();

@@ -1,4 +1,4 @@
-//! The networks in ONNX Runtime. `ORT_DYLIB_PATH` must name its library, which `make test` takes care of.
+//! The networks in ONNX Runtime. `ORT_DYLIB_PATH` must name its library, which `make test` sets.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -32,7 +32,7 @@ fn volume(resolution: usize, seed: usize) -> Volume {
 }
 
 #[test]
-fn the_library_says_what_it_is() {
+fn the_version_of_the_library_is_reported() {
     let (_folder, _) = save(&build("vgn", 0).unwrap());
     let info = init().unwrap();
     let numbers: Vec<u32> = info.version.split('.').map(|part| part.parse().unwrap()).collect();
@@ -40,7 +40,7 @@ fn the_library_says_what_it_is() {
 }
 
 #[test]
-fn vgn_gives_qualities_unit_quaternions_and_widths() {
+fn vgn_outputs_qualities_unit_quaternions_and_widths() {
     let mut network = load(&build("vgn", 0).unwrap());
     assert_eq!(network.metadata().name, "vgn");
     let output = network.infer(&[&volume(40, 0)]).unwrap();
@@ -57,7 +57,7 @@ fn vgn_gives_qualities_unit_quaternions_and_widths() {
 }
 
 #[test]
-fn heads_apart_give_what_they_give_together() {
+fn separate_heads_give_the_same_outputs_as_the_merged_convolution() {
     let volume = volume(40, 3);
     for (name, orientation) in [("vgn", Orientation::Axes), ("transformer-small", Orientation::Quaternion)] {
         let model = name.parse::<Architecture>().unwrap().build_with(40, orientation, 5).unwrap();
@@ -97,8 +97,8 @@ fn rotation_of(axes: [f32; 6]) -> UnitQuaternion<f64> {
     UnitQuaternion::from_quaternion(quaternion)
 }
 
-/// The volume after a quarter turn about the vertical through its middle: what was at (x, y) is at (−y, x).
-fn turned(volume: &Volume) -> Volume {
+/// The volume rotated by 90° about the vertical through its middle: the value at (x, y) moves to (−y, x).
+fn rotated(volume: &Volume) -> Volume {
     let n = volume.resolution();
     let value = |index: usize| {
         let (x, y, z) = (index / (n * n), index / n % n, index % n);
@@ -108,14 +108,14 @@ fn turned(volume: &Volume) -> Volume {
 }
 
 #[test]
-fn an_average_over_turns_turns_with_the_volume() {
+fn the_output_of_a_rotation_average_rotates_with_the_volume() {
     const N: usize = 16;
     let single = Architecture::Vgn.build_with(N, Orientation::Axes, 3).unwrap();
     let mut network = load(&averaged_over_rotations(&single).unwrap());
     let (volume, other) = (volume(N, 1), volume(N, 2));
-    let turned = turned(&volume);
-    let answers = network.infer(&[&volume, &turned, &other]).unwrap();
-    let (before, after) = (answers.maps(0), answers.maps(1));
+    let rotated = rotated(&volume);
+    let output = network.infer(&[&volume, &rotated, &other]).unwrap();
+    let (before, after) = (output.maps(0), output.maps(1));
     let quarter = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
     let voxels = N.pow(3);
     let rotation = |map: &[f32], voxel: usize| {
@@ -133,9 +133,12 @@ fn an_average_over_turns_turns_with_the_volume() {
         assert!(angle < 1e-2, "voxel {voxel}: {angle}");
     }
     let mut single = load(&single);
-    let alone = single.infer(&[&volume, &turned]).unwrap();
+    let alone = single.infer(&[&volume, &rotated]).unwrap();
     let difference = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-    assert!(difference(alone.maps(0).quality, before.quality) > 1e-4, "the network alone does not turn");
+    assert!(
+        difference(alone.maps(0).quality, before.quality) > 1e-4,
+        "the output of the network alone does not rotate exactly"
+    );
 
     let quaternions = build("vgn", 0).unwrap();
     assert_eq!(averaged_over_rotations(&quaternions), Err(RotationAverageError::NotAxes));
@@ -144,10 +147,10 @@ fn an_average_over_turns_turns_with_the_volume() {
 }
 
 #[test]
-fn axes_become_the_rotation_they_mean() {
+fn regressed_axes_are_converted_to_their_rotation() {
     for approach in [[0.0, 0.0, -1.0], [0.6, 0.0, -0.8], [-0.6, 0.64, -0.48], [0.0, 1.0, 0.0], [0.8, -0.36, 0.48]] {
         let [x, y, z] = approach;
-        // No length matters but those against each other.
+        // Only the ratio of the components has an effect.
         let given = [-3.0 * z, 3.0 * x, 3.0 * y];
         let rotation =
             |turn: [f32; 2], level: f32| rotation_of([given[0], given[1], given[2], turn[0], turn[1], level]);
@@ -157,9 +160,9 @@ fn axes_become_the_rotation_they_mean() {
         let across = |a: Vector3<f64>, b: Vector3<f64>| a.dot(&b).abs() < 2e-3;
         for turn in [[1.0, 0.02], [0.5, 0.5], [-0.7, 0.1], [0.2, -0.9]] {
             assert!((rotation(turn, 0.0) * Vector3::z() - approach).norm() < 1e-5, "{approach} turned by {turn:?}");
-            assert!(across(closing(turn, 0.0), closing(turn.map(|t| -t), 0.0)), "the opposite is a quarter turn off");
+            assert!(across(closing(turn, 0.0), closing(turn.map(|t| -t), 0.0)), "the opposite direction closes at 90°");
         }
-        // Half an angle: the second is 45° on from the first.
+        // Half the angle: the closing lines of directions at 90° are at 45°.
         let cosine = closing([1.0, 0.0], 0.0).dot(&closing([0.0, 1.0], 0.0)).abs();
         assert!((cosine - 0.5_f64.sqrt()).abs() < 1e-5, "{cosine}");
         if x != 0.0 || y != 0.0 {
@@ -175,7 +178,7 @@ fn axes_become_the_rotation_they_mean() {
 }
 
 #[test]
-fn a_batch_is_its_volumes_one_by_one() {
+fn a_batch_gives_the_same_outputs_as_single_volumes() {
     for architecture in Architecture::ALL {
         let mut network = load(&architecture.build(16, 0).unwrap());
         let volumes = [0, 1, 2].map(|seed| volume(16, seed));
@@ -195,22 +198,22 @@ fn a_batch_is_its_volumes_one_by_one() {
             let worst = together.iter().zip(alone).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             assert!(worst <= 1e-4, "{architecture}: volume {index} differs by {worst}");
         }
-        assert_ne!(alone[0], alone[1], "the volumes differ, so do the maps");
+        assert_ne!(alone[0], alone[1], "other volumes have other maps");
     }
 }
 
 #[test]
-fn running_again_computes_the_same() {
+fn repeated_runs_give_the_same_outputs() {
     let mut network = load(&Architecture::Vgn.build(16, 0).unwrap());
     let first = network.infer(&[&volume(16, 0)]).unwrap().maps(0).quality.to_vec();
     let other = network.infer(&[&volume(16, 1)]).unwrap().maps(0).quality.to_vec();
-    assert_ne!(first, other, "the new input is read");
+    assert_ne!(first, other, "another volume has another output");
     network.fill(&[&volume(16, 0)]).unwrap();
     assert_eq!(network.run(1).unwrap().maps(0).quality, first);
 }
 
 #[test]
-fn what_does_not_fit_is_refused() {
+fn an_empty_batch_or_another_resolution_is_an_error() {
     let mut network = load(&Architecture::Vgn.build(16, 0).unwrap());
     assert!(matches!(network.infer(&[]), Err(RuntimeError::EmptyBatch)));
     let error = network.infer(&[&volume(8, 0)]).err().unwrap().to_string();
@@ -227,7 +230,7 @@ fn refusal(change: impl FnOnce(&mut ModelProto)) -> String {
 }
 
 #[test]
-fn a_file_that_is_no_grasp_network_is_refused() {
+fn a_file_with_another_signature_is_an_error() {
     let output = |index: usize| {
         move |model: &mut ModelProto| {
             model.graph.as_mut().unwrap().output.remove(index);
@@ -282,7 +285,7 @@ fn a_file_that_is_no_grasp_network_is_refused() {
 }
 
 #[test]
-fn a_file_cut_short_is_refused() {
+fn a_truncated_file_is_an_error() {
     let (_folder, path) = save(&build("vgn", 0).unwrap());
     let bytes = fs::read(&path).unwrap();
     fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
@@ -302,13 +305,13 @@ fn images(count: u64) -> Vec<Image> {
 }
 
 #[test]
-fn a_classifier_scores_each_image_by_itself() {
+fn a_classifier_scores_images_independently() {
     let (_folder, path) = save(&gpd::gpd(0));
     let mut classifier = Classifier::load(&path, &Options::default()).unwrap();
     let images = images(40);
     let together = classifier.score(&images).unwrap();
     assert_eq!(together.len(), images.len());
-    assert!(together.iter().any(|score| (score - together[0]).abs() > 1e-5), "the images differ, so do the scores");
+    assert!(together.iter().any(|score| (score - together[0]).abs() > 1e-5), "other images have other scores");
     for (image, together) in images.iter().zip(together) {
         let alone = classifier.score(std::slice::from_ref(image)).unwrap();
         assert!((alone[0] - together).abs() < 1e-5);
@@ -317,7 +320,7 @@ fn a_classifier_scores_each_image_by_itself() {
 }
 
 #[test]
-fn a_network_is_no_classifier_and_a_classifier_no_network() {
+fn a_network_is_not_loaded_as_a_classifier_nor_a_classifier_as_a_network() {
     let (_folder, path) = save(&build("vgn", 0).unwrap());
     let error = Classifier::load(&path, &Options::default()).err().unwrap().to_string();
     assert!(error.contains("network.onnx: found `tsdf` instead of `images`; a classifier has the input"), "{error}");
@@ -329,14 +332,18 @@ fn a_network_is_no_classifier_and_a_classifier_no_network() {
 }
 
 #[test]
-fn what_runs_a_network_is_what_was_asked_for() {
+fn a_network_runs_on_the_requested_backend() {
     let (_folder, path) = save(&build("vgn", 0).unwrap());
     let reference = Network::load(&path, &Options::default()).unwrap();
     assert_eq!(reference.backend(), Backend::REFERENCE);
     let auto = Network::load(&path, &Options::auto(2)).unwrap().backend();
     let explicit =
         Options { threads: 2, provider: Some(auto.provider), precision: Some(auto.precision), ..Options::default() };
-    assert_eq!(Network::load(&path, &explicit).unwrap().backend(), auto, "what auto takes can be asked for");
+    assert_eq!(
+        Network::load(&path, &explicit).unwrap().backend(),
+        auto,
+        "the backend that `auto` selects can be requested"
+    );
 
     let refused = |options: Options| Network::load(&path, &options).err().unwrap().to_string();
     let card = refused(Options { provider: Some(Provider::TensorRt), ..Options::default() });
@@ -347,10 +354,10 @@ fn what_runs_a_network_is_what_was_asked_for() {
     assert!(half.contains("`cpu` does not support fp16"), "{half}");
 }
 
-/// The library that `make` fetches on x86-64 Linux has OpenVINO, and this is where it is seen to run.
+/// The library that `make` downloads on x86-64 Linux has OpenVINO.
 #[test]
 #[cfg(all(target_os = "linux", target_arch = "x86_64"))]
-fn openvino_gives_the_networks_answers() {
+fn openvino_outputs_match_the_reference() {
     let (_folder, path) = save(&Architecture::Vgn.build_with(40, Orientation::Axes, 0).unwrap());
     let volumes = [volume(40, 1), volume(40, 2), volume(40, 3)];
     let mut reference = Network::load(&path, &Options::default()).unwrap();
@@ -360,7 +367,7 @@ fn openvino_gives_the_networks_answers() {
         let options = Options { threads: 2, provider, precision: Some(precision), max_batch: 3 };
         let mut network = match Network::load(&path, &options) {
             Ok(network) => network,
-            // Older processors do not multiply bf16, and say so.
+            // Older processors have no bf16 instructions.
             Err(error) if precision == Precision::Bf16 && error.to_string().contains("does not support bf16") => {
                 break;
             }

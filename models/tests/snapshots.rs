@@ -16,7 +16,7 @@ use grasp_models::{Network, Options};
 const TOLERANCE: f64 = 2e-3;
 
 #[test]
-fn the_shipped_networks_still_give_the_outputs_that_they_were_shipped_with() {
+fn outputs_of_the_shipped_networks_match_their_snapshots() {
     for path in scenes::networks() {
         let mut network = Network::load(&path, &Options::default()).unwrap();
         let mut text = String::new();

@@ -3,7 +3,7 @@
 use std::f64::consts::PI;
 
 use grasp::{FINGER_DEPTH, Grasp, MAX_OPENING, RESOLUTION, SurfacePoint};
-use grasp_data::{MAX_CLEARANCE, TURNS, Trial};
+use grasp_data::{DISTINCT_YAWS, MAX_CLEARANCE, Trial};
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -16,7 +16,7 @@ use crate::scene::{SceneKind, generate};
 use crate::trial;
 
 /// Yaws at which a point is tried, evenly spaced from 0 to 180° inclusive.
-pub const YAWS: usize = TURNS + 1;
+pub const YAWS: usize = DISTINCT_YAWS + 1;
 
 /// Enlargement of the hand on its approach to a labelled grasp, metres per side, in addition to the contact distance.
 const SWELL: f64 = 0.0012;
@@ -118,9 +118,9 @@ impl Point {
     /// The label with lengths in voxels of `voxel_size`, or in metres if that is 1.
     #[must_use]
     pub fn trial(&self, voxel_size: f64) -> Trial {
-        let turns = (1..TURNS).filter(|turn| self.success() && self.lifted[(self.yaw + turn) % TURNS]);
+        let yaws = (1..DISTINCT_YAWS).filter(|turn| self.success() && self.lifted[(self.yaw + turn) % DISTINCT_YAWS]);
         Trial {
-            turns: turns.fold(0, |bits, turn| bits | 1 << turn),
+            yaws: yaws.fold(0, |bits, turn| bits | 1 << turn),
             share: self.share,
             clearance: self.clearance,
             ..Trial::new(&self.grasp, self.success(), voxel_size)
@@ -234,13 +234,14 @@ fn sample(cloud: &[SurfacePoint], rng: &mut impl Rng) -> (SurfacePoint, Isometry
 fn try_point(world: &World, cloud: &[SurfacePoint], rng: &mut impl Rng) -> Point {
     let (surface, pose) = sample(cloud, rng);
     let turned =
-        |yaw: usize| pose * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw as f64 * PI / TURNS as f64);
-    let tried: [Option<f64>; TURNS] = std::array::from_fn(|yaw| match trial::label(world, &turned(yaw), SWELL) {
-        trial::Outcome::Lifted { width, .. } => Some(width),
-        _ => None,
-    });
+        |yaw: usize| pose * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw as f64 * PI / DISTINCT_YAWS as f64);
+    let tried: [Option<f64>; DISTINCT_YAWS] =
+        std::array::from_fn(|yaw| match trial::label(world, &turned(yaw), SWELL) {
+            trial::Outcome::Lifted { width, .. } => Some(width),
+            _ => None,
+        });
     // The last yaw is the first rotated by 180°, and the hand is symmetric.
-    let widths: [Option<f64>; YAWS] = std::array::from_fn(|yaw| tried[yaw % TURNS]);
+    let widths: [Option<f64>; YAWS] = std::array::from_fn(|yaw| tried[yaw % DISTINCT_YAWS]);
     let lifted = widths.map(|width| width.is_some());
     let object = world.nearest(&surface.position);
     let best = middle_of_widest_run(&lifted).and_then(|yaw| widths[yaw].map(|width| (yaw, width)));

@@ -1,4 +1,4 @@
-//! Tried candidates of GPD, the training data of its classifier: an `.npz` file with
+//! Grasp candidates of GPD with their labels, the training data of its classifier: an `.npz` file with
 //!
 //! - `images`, u8 `[n, CHANNELS, IMAGE_SIZE, IMAGE_SIZE]`, 255 for 1;
 //! - `labels`, u8 `[n]`, 1 for a success;
@@ -64,7 +64,7 @@ impl Candidates {
         self.labels.iter().filter(|&&label| label).count()
     }
 
-    /// Writes a file. It appears only when it is complete; the same candidates give the same bytes.
+    /// Writes a file under a temporary name and renames it. The same candidates give the same bytes.
     ///
     /// # Errors
     /// [`DataError`] names the file.
@@ -113,7 +113,7 @@ fn write_array<T: AutoSerialize>(
     values: impl Iterator<Item = T>,
 ) -> io::Result<()> {
     archive.zip_writer().start_file(file_name_from_array_name(name), without_time())?;
-    // Buffered, because a call to the compressor for every pixel takes about as long as the trials.
+    // Buffered: a call to the compressor for every pixel takes about as long as the trials.
     let mut file = io::BufWriter::with_capacity(1 << 16, archive.zip_writer());
     let mut array = npyz::WriteOptions::new().default_dtype().shape(shape).writer(&mut file).begin_nd()?;
     array.extend(values)?;

@@ -4,21 +4,21 @@ use std::path::{Path, PathBuf};
 use sha2::{Digest, Sha256};
 
 use crate::error::{At, DataError};
-use crate::table::Unit;
+use crate::grasp_table::LengthUnit;
 use crate::{Scene, Trial, edge_of, packed, processed};
 
 /// The format of a folder.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Form {
-    /// Depth images and grasps in metres, as VGN and GIGA have them.
+pub enum DataFormat {
+    /// Depth images and grasps in metres: the raw format of VGN and GIGA.
     Raw,
-    /// Volumes and grasps in voxels, as VGN and GIGA have them.
+    /// Volumes and grasps in voxels: the processed format of VGN and GIGA.
     Processed,
     /// The packed format of graspd.
     Packed,
 }
 
-impl Form {
+impl DataFormat {
     /// Detects the format of a folder.
     ///
     /// # Errors
@@ -28,9 +28,9 @@ impl Form {
         if packed::is_packed(folder) {
             return Ok(Self::Packed);
         }
-        match Unit::of(folder) {
-            Some(Unit::Metres) => Ok(Self::Raw),
-            Some(Unit::Voxels) => Ok(Self::Processed),
+        match LengthUnit::of(folder) {
+            Some(LengthUnit::Metres) => Ok(Self::Raw),
+            Some(LengthUnit::Voxels) => Ok(Self::Processed),
             None => Err(DataError::Empty(folder.to_owned())),
         }
     }
@@ -55,15 +55,15 @@ impl Dataset {
     /// # Errors
     /// [`DataError`] names the invalid file.
     pub fn open(folders: &[PathBuf]) -> Result<Self, DataError> {
-        let mut dataset = Self::none();
+        let mut dataset = Self::empty();
         for folder in folders {
-            let source = match Form::of(folder)? {
-                Form::Packed => Source::Packed(packed::Reader::open(folder)?),
-                Form::Processed => Source::Memory(processed::read(folder)?),
-                Form::Raw => {
+            let source = match DataFormat::of(folder)? {
+                DataFormat::Packed => Source::Packed(packed::Reader::open(folder)?),
+                DataFormat::Processed => Source::Memory(processed::read(folder)?),
+                DataFormat::Raw => {
                     return Err(DataError::Scene {
                         path: folder.clone(),
-                        reason: "the folder holds depth images: fuse them first with `grasp-sim convert`".to_owned(),
+                        reason: "the folder holds depth images; fuse them with `grasp-sim convert`".to_owned(),
                         expected: "volumes",
                     });
                 }
@@ -82,14 +82,14 @@ impl Dataset {
 
     /// An empty data set.
     #[must_use]
-    pub fn none() -> Self {
+    pub fn empty() -> Self {
         Self { resolution: 0, sources: Vec::new(), scenes: Vec::new() }
     }
 
     /// A data set of scenes in memory; `None` unless all their volumes are cubes of one resolution.
     #[must_use]
     pub fn of(scenes: Vec<Scene>) -> Option<Self> {
-        let mut dataset = Self::none();
+        let mut dataset = Self::empty();
         dataset.add(Source::Memory(scenes)).ok()?;
         Some(dataset)
     }
@@ -99,7 +99,7 @@ impl Dataset {
         for scene in 0..source.len() {
             let resolution = source.resolution(scene)?;
             if self.resolution != 0 && resolution != self.resolution {
-                return Err(format!("a volume has {resolution}³ voxels, the volumes before have {}³", self.resolution));
+                return Err(format!("a volume has {resolution}³ voxels, the previous ones have {}³", self.resolution));
             }
             self.resolution = resolution;
             self.scenes.push((index, scene));
@@ -108,8 +108,8 @@ impl Dataset {
         Ok(())
     }
 
-    /// Adds scenes that were appended to packed folders since, and returns their number. Scenes are ordered by folder,
-    /// so scenes of later folders change their index.
+    /// Adds scenes that were appended to packed folders since the last call, and returns their number. Scenes are
+    /// ordered by folder, so the index of scenes of later folders changes.
     ///
     /// # Errors
     /// [`DataError`] names the damaged file.
@@ -208,8 +208,8 @@ impl Dataset {
         })
     }
 
-    /// A hash of 16 hexadecimal digits over the names, trials and order of the scenes. The volumes are a thousand times
-    /// larger and are left out: a data set with other volumes also has other trials.
+    /// A hash of 16 hexadecimal digits over the names, trials and order of the scenes. The volumes are not hashed,
+    /// because they are a thousand times larger, and a data set with other volumes also has other trials.
     #[must_use]
     pub fn fingerprint(&self) -> String {
         let mut hash = Sha256::new();
@@ -220,11 +220,11 @@ impl Dataset {
             hash.update(&id);
             hash.update((trials.len() as u64).to_le_bytes());
             hash.update((self.volumes(scene) as u64).to_le_bytes());
-            for Trial { position, rotation, width, success, turns, share, clearance } in &trials {
+            for Trial { position, rotation, width, success, yaws, share, clearance } in &trials {
                 for number in position.coords.iter().chain(rotation.coords.iter()).chain([width]) {
                     hash.update(number.to_le_bytes());
                 }
-                hash.update([u8::from(*success) | turns]);
+                hash.update([u8::from(*success) | yaws]);
                 hash.update(share.to_le_bytes());
                 hash.update(clearance.to_le_bytes());
             }
@@ -232,8 +232,8 @@ impl Dataset {
         hash.finalize().iter().take(8).map(|byte| format!("{byte:02x}")).collect()
     }
 
-    /// Indices of the training scenes and of the held-out scenes, about `fraction` of all. A hash of the scene's name
-    /// decides, so that a scene keeps its side when others are added.
+    /// Indices of the training scenes and of the validation scenes, about `fraction` of all. They are split by a hash of
+    /// the scene's name, so that a scene stays on its side when others are added.
     #[must_use]
     pub fn split(&self, fraction: f64) -> (Vec<usize>, Vec<usize>) {
         (0..self.len()).partition(|&index| {

@@ -46,7 +46,7 @@ pub enum DataError {
         /// What is wrong.
         reason: String,
     },
-    /// A folder holds no data set or an empty one.
+    /// A folder has no data set, or an empty one.
     #[error(
         "{}: holds no grasps; a data set is a folder with scenes-*.pack, or with grasps.csv and scenes/",
         .0.display()
@@ -62,7 +62,7 @@ pub enum DataError {
     },
     /// Two folders hold the same scene.
     #[error("scene {id} is in {} and in {}; merge only one of them", first.display(), second.display())]
-    Twice {
+    DuplicateScene {
         /// Name of the scene.
         id: String,
         /// The first folder.

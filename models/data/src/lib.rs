@@ -11,18 +11,18 @@
 mod candidates;
 mod dataset;
 mod error;
+mod grasp_table;
 pub mod packed;
 pub mod processed;
 pub mod raw;
 mod setup;
-mod table;
 mod trial;
 
 pub use candidates::Candidates;
-pub use dataset::{Dataset, Form};
+pub use dataset::{DataFormat, Dataset};
 pub use error::DataError;
 pub use setup::{Provenance, Setup};
-pub use trial::{MAX_CLEARANCE, TURNS, Trial};
+pub use trial::{DISTINCT_YAWS, MAX_CLEARANCE, Trial};
 
 /// A scene with its observed volumes and its trials.
 #[derive(Clone, Debug, PartialEq)]
@@ -78,7 +78,7 @@ mod tests {
     }
 
     #[test]
-    fn the_edge_of_a_cube_is_found() {
+    fn edge_of_returns_the_edge_of_a_cube() {
         assert_eq!(edge_of(64_000), Some(40));
         assert_eq!((edge_of(63_999), edge_of(0)), (None, None));
     }

@@ -9,10 +9,10 @@
 //! | 4 | CRC-32 of that content |
 //! | 8 | number of the scene |
 //! | 4, 4 | number of trials, number of volumes |
-//! | 41 per trial | position (voxels), quaternion x y z w, width (voxels): eight f32; one byte, bit 0: success, bit k: the grasp yawed by k · 36° is a success too; success rate of the tries and clearance (metres): two f32 |
+//! | 41 per trial | position (voxels), quaternion x y z w, width (voxels): eight f32; one byte, bit 0: success, bit k: the grasp yawed by k · 36° is a success too; share of successful executions and clearance (metres): two f32 |
 //! | N³ per volume | [`quantise`]d values, `[x][y][z]` |
 //!
-//! In versions 1 and 2 a trial has 33 bytes, without success rate and clearance: the rate is 1 for a success and 0 for
+//! In versions 1 and 2 a trial has 33 bytes, without share and clearance: the share is 1 for a success and 0 for
 //! a failure, and the clearance is unknown. Version 1 has no yaws either. A folder may hold files of several versions.
 //!
 //! All numbers are little-endian. Readers ignore an incomplete record at the end of a file. A run that continues after
@@ -35,8 +35,8 @@ const HEADER: usize = 16;
 /// Bytes of the length and the checksum before a record's content.
 const PREFIX: usize = 8;
 /// Bytes of a trial in the current version, and in versions 1 and 2.
-const TRIAL: usize = 41;
-const SHORT_TRIAL: usize = 33;
+const TRIAL_SIZE: usize = 41;
+const SHORT_TRIAL_SIZE: usize = 33;
 
 /// Size at which the writer starts the next file, bytes.
 const FILE_SIZE: u64 = 1 << 30;
@@ -56,7 +56,7 @@ impl Writer {
     /// # Errors
     /// [`DataError`] names the file.
     pub fn open(folder: &Path, setup: &Setup) -> Result<Self, DataError> {
-        setup.claim(folder)?;
+        setup.write_or_compare(folder)?;
         let mut reader = Reader::new(folder);
         reader.refresh()?;
         let next = reader.scenes.iter().map(|scene| scene.number + 1).max();
@@ -90,12 +90,12 @@ impl Writer {
         self.record.extend(number.to_le_bytes());
         self.record.extend((trials.len() as u32).to_le_bytes());
         self.record.extend((volumes.len() as u32).to_le_bytes());
-        for Trial { position: p, rotation, width, success, turns, share, clearance } in trials {
+        for Trial { position: p, rotation, width, success, yaws, share, clearance } in trials {
             let q = rotation.coords;
             for number in [p.x, p.y, p.z, q.x, q.y, q.z, q.w, *width] {
                 self.record.extend((number as f32).to_le_bytes());
             }
-            self.record.push(u8::from(*success) | turns);
+            self.record.push(u8::from(*success) | yaws);
             self.record.extend(share.to_le_bytes());
             self.record.extend(clearance.to_le_bytes());
         }
@@ -110,7 +110,7 @@ impl Writer {
             Some(open) if !full => open,
             _ => self.begin_file(edge)?,
         };
-        // After a failure no file stays open, so nothing is ever appended after an incomplete record.
+        // After an error no file is open, so nothing is appended after an incomplete record.
         file.write_all(&self.record).at(&path)?;
         self.file = Some((file, path, size + self.record.len() as u64));
         self.next = Some(number + 1);
@@ -155,23 +155,23 @@ pub(crate) fn is_packed(folder: &Path) -> bool {
 /// A reader of the complete scenes of a folder, mapped into memory.
 pub struct Reader {
     folder: PathBuf,
-    parts: Vec<Part>,
-    scenes: Vec<Location>,
+    files: Vec<PackFile>,
+    scenes: Vec<SceneLocation>,
 }
 
-struct Part {
+struct PackFile {
     path: PathBuf,
     map: Mmap,
     edge: usize,
     /// Bytes per trial.
-    trial: usize,
+    trial_size: usize,
     /// End of the last complete record.
     end: usize,
 }
 
-/// Location of a scene, validated.
-struct Location {
-    part: usize,
+/// Location of a scene in its file. Checksum and lengths are valid.
+struct SceneLocation {
+    file: usize,
     number: u64,
     trials: usize,
     volumes: usize,
@@ -191,7 +191,7 @@ impl Reader {
     }
 
     fn new(folder: &Path) -> Self {
-        Self { folder: folder.to_owned(), parts: Vec::new(), scenes: Vec::new() }
+        Self { folder: folder.to_owned(), files: Vec::new(), scenes: Vec::new() }
     }
 
     /// Finds scenes that were appended since, and returns their number.
@@ -201,20 +201,20 @@ impl Reader {
     pub fn refresh(&mut self) -> Result<usize, DataError> {
         let before = self.scenes.len();
         for (index, path) in files(&self.folder)?.into_iter().enumerate() {
-            let known = self.parts.get(index);
+            let known = self.files.get(index);
             let length = fs::metadata(&path).at(&path)?.len() as usize;
-            if length < HEADER || known.is_some_and(|part| part.map.len() == length) {
+            if length < HEADER || known.is_some_and(|file| file.map.len() == length) {
                 continue;
             }
             let map = map(&path)?;
-            let (edge, trial) = check_header(&path, &map)?;
-            let end = known.map_or(HEADER, |part| part.end);
-            let mut part = Part { path, map, edge, trial, end };
+            let (edge, trial_size) = check_header(&path, &map)?;
+            let end = known.map_or(HEADER, |file| file.end);
+            let mut file = PackFile { path, map, edge, trial_size, end };
             // Offsets of earlier records stay valid.
-            self.scenes.extend(part.read_on(index)?);
-            match self.parts.get_mut(index) {
-                Some(known) => *known = part,
-                None => self.parts.push(part),
+            self.scenes.extend(file.read_appended(index)?);
+            match self.files.get_mut(index) {
+                Some(known) => *known = file,
+                None => self.files.push(file),
             }
         }
         Ok(self.scenes.len() - before)
@@ -235,7 +235,7 @@ impl Reader {
     /// Voxels along an edge of scene `index`.
     #[must_use]
     pub fn resolution(&self, index: usize) -> usize {
-        self.parts[self.scenes[index].part].edge
+        self.files[self.scenes[index].file].edge
     }
 
     /// The number of scene `index`.
@@ -254,26 +254,29 @@ impl Reader {
     #[must_use]
     pub fn volume(&self, index: usize, observation: usize) -> &[u8] {
         let scene = &self.scenes[index];
-        let part = &self.parts[scene.part];
-        let size = part.edge.pow(3);
-        &part.map[scene.start + scene.trials * part.trial + observation * size..][..size]
+        let file = &self.files[scene.file];
+        let size = file.edge.pow(3);
+        &file.map[scene.start + scene.trials * file.trial_size + observation * size..][..size]
     }
 
     /// The trials of scene `index`.
     #[must_use]
     pub fn trials(&self, index: usize) -> Vec<Trial> {
         let scene = &self.scenes[index];
-        let part = &self.parts[scene.part];
-        part.map[scene.start..][..scene.trials * part.trial].chunks_exact(part.trial).map(trial).collect()
+        let file = &self.files[scene.file];
+        file.map[scene.start..][..scene.trials * file.trial_size]
+            .chunks_exact(file.trial_size)
+            .map(parse_trial)
+            .collect()
     }
 }
 
 /// Parses a trial of either length.
-fn trial(bytes: &[u8]) -> Trial {
+fn parse_trial(bytes: &[u8]) -> Trial {
     let [x, y, z, qx, qy, qz, qw, width] = std::array::from_fn(|i| f64::from(f32_at(bytes, 4 * i)));
     let success = bytes[32] & 1 != 0;
     let [share, clearance] = match bytes.len() {
-        SHORT_TRIAL => [if success { 1.0 } else { 0.0 }, 0.0],
+        SHORT_TRIAL_SIZE => [if success { 1.0 } else { 0.0 }, 0.0],
         _ => [f32_at(bytes, 33), f32_at(bytes, 37)],
     };
     Trial {
@@ -281,15 +284,15 @@ fn trial(bytes: &[u8]) -> Trial {
         rotation: UnitQuaternion::from_quaternion(Quaternion::new(qw, qx, qy, qz)),
         width,
         success,
-        turns: bytes[32] & !1,
+        yaws: bytes[32] & !1,
         share,
         clearance,
     }
 }
 
-impl Part {
-    /// Reads the complete records after `end`, and moves `end` behind them.
-    fn read_on(&mut self, part: usize) -> Result<Vec<Location>, DataError> {
+impl PackFile {
+    /// Reads the complete records after `end` and moves `end` behind them. `file` is the index of this file.
+    fn read_appended(&mut self, file: usize) -> Result<Vec<SceneLocation>, DataError> {
         let mut scenes = Vec::new();
         while let Some(prefix) = self.map.get(self.end..self.end + PREFIX) {
             let (length, checksum) = (u32_at(prefix, 0) as usize, u32_at(prefix, 4));
@@ -306,13 +309,13 @@ impl Part {
                 Some(counts) => [u32_at(counts, 0), u32_at(counts, 4)].map(|count| count as usize),
                 None => return Err(damaged(format!("a scene of {length} bytes is too short"))),
             };
-            if length != 16 + trials * self.trial + volumes * self.edge.pow(3) {
+            if length != 16 + trials * self.trial_size + volumes * self.edge.pow(3) {
                 return Err(damaged(format!(
                     "a scene of {trials} trials and {volumes} volumes cannot have {length} bytes"
                 )));
             }
             let number = u64::from(u32_at(content, 0)) | u64::from(u32_at(content, 4)) << 32;
-            scenes.push(Location { part, number, trials, volumes, start: start + 16 });
+            scenes.push(SceneLocation { file, number, trials, volumes, start: start + 16 });
             self.end = start + length;
         }
         Ok(scenes)
@@ -325,12 +328,12 @@ fn check_header(path: &Path, bytes: &[u8]) -> Result<(usize, usize), DataError> 
     if &bytes[..8] != MAGIC {
         return Err(damaged("the file does not begin with `graspack`".to_owned()));
     }
-    let trial = match u32_at(bytes, 8) {
-        1 | 2 => SHORT_TRIAL,
-        VERSION => TRIAL,
+    let trial_size = match u32_at(bytes, 8) {
+        1 | 2 => SHORT_TRIAL_SIZE,
+        VERSION => TRIAL_SIZE,
         version => return Err(damaged(format!("the version is {version}, must be from 1 to {VERSION}"))),
     };
-    Ok((u32_at(bytes, 12) as usize, trial))
+    Ok((u32_at(bytes, 12) as usize, trial_size))
 }
 
 #[expect(
@@ -372,12 +375,12 @@ pub fn merge(folders: &[PathBuf], into: &Path) -> Result<usize, DataError> {
             let number = reader.number(index);
             if let Some(first) = seen.insert(number, folder) {
                 let (first, second) = (first.clone(), folder.clone());
-                return Err(DataError::Twice { id: format!("{number:08}"), first, second });
+                return Err(DataError::DuplicateScene { id: format!("{number:08}"), first, second });
             }
         }
     }
     let Some(setup) = setup else { return Err(DataError::Empty(into.to_owned())) };
-    setup.claim(into)?;
+    setup.write_or_compare(into)?;
     if is_packed(into) {
         let found = "the folder already holds scenes".to_owned();
         return Err(DataError::OtherSetup { path: into.to_owned(), found });

@@ -14,7 +14,7 @@ use npyz::npz::{NpzArchive, NpzWriter};
 use rayon::prelude::*;
 
 use crate::error::{At, DataError};
-use crate::table::{self, TableWriter, Unit};
+use crate::grasp_table::{self, LengthUnit, TableWriter};
 use crate::{Scene, Setup, Trial, edge_of, quantise, without_time};
 
 const EXPECTED: &str = "`grid`, f32 [1, N, N, N] with values in [0, 1]";
@@ -33,10 +33,10 @@ impl Writer {
     /// # Errors
     /// [`DataError`] names the file.
     pub fn open(folder: &Path, setup: &Setup) -> Result<Self, DataError> {
-        setup.claim(folder)?;
+        setup.write_or_compare(folder)?;
         let scenes = folder.join("scenes");
         fs::create_dir_all(&scenes).at(&scenes)?;
-        let (table, next) = TableWriter::open(folder, Unit::Voxels)?;
+        let (table, next) = TableWriter::open(folder, LengthUnit::Voxels)?;
         Ok(Self { scenes, table, next })
     }
 
@@ -65,7 +65,7 @@ impl Writer {
 /// # Errors
 /// [`DataError`] names the invalid file and its line.
 pub fn read(folder: &Path) -> Result<Vec<Scene>, DataError> {
-    let trials = table::read(folder, Unit::Voxels)?.into_iter().collect::<Vec<_>>();
+    let trials = grasp_table::read(folder, LengthUnit::Voxels)?.into_iter().collect::<Vec<_>>();
     trials
         .into_par_iter()
         .map(|(id, trials)| {

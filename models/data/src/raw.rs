@@ -16,7 +16,7 @@ use npyz::WriterBuilder;
 use npyz::npz::{NpzArchive, NpzWriter};
 
 use crate::error::{At, DataError};
-use crate::table::{self, TableWriter, Unit};
+use crate::grasp_table::{self, LengthUnit, TableWriter};
 use crate::{Setup, Trial, without_time};
 
 const EXPECTED: &str = "`depth_imgs`, f32 [n, height, width], and `extrinsics`, [n, 7]";
@@ -45,10 +45,10 @@ impl Writer {
     /// # Errors
     /// [`DataError`] names the file.
     pub fn open(folder: &Path, setup: &Setup) -> Result<Self, DataError> {
-        setup.claim(folder)?;
+        setup.write_or_compare(folder)?;
         let scenes = folder.join("scenes");
         fs::create_dir_all(&scenes).at(&scenes)?;
-        let (table, next) = TableWriter::open(folder, Unit::Metres)?;
+        let (table, next) = TableWriter::open(folder, LengthUnit::Metres)?;
         Ok(Self { scenes, table, next, image: [setup.intrinsic.height, setup.intrinsic.width] })
     }
 
@@ -71,8 +71,8 @@ impl Writer {
     }
 }
 
-/// A reader of a folder. The table is in memory; views are read scene by scene, because all of them may exceed the
-/// memory.
+/// A reader of a folder. The table is in memory; views are read scene by scene, because all of them may be larger than
+/// the memory.
 pub struct Reader {
     folder: PathBuf,
     setup: Setup,
@@ -86,7 +86,7 @@ impl Reader {
     /// [`DataError`] names the invalid file and its line.
     pub fn open(folder: &Path) -> Result<Self, DataError> {
         let setup = Setup::read(folder)?;
-        Ok(Self { folder: folder.to_owned(), setup, trials: table::read(folder, Unit::Metres)? })
+        Ok(Self { folder: folder.to_owned(), setup, trials: grasp_table::read(folder, LengthUnit::Metres)? })
     }
 
     /// The setup of the folder.

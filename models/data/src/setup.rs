@@ -91,11 +91,12 @@ impl Setup {
         serde_json::from_str(&text).at(&path)
     }
 
-    /// Writes the setup into a folder, which is created if needed. An existing setup must be equal.
+    /// Writes the setup into a folder, which is created if it does not exist. If the folder has a setup, it must be
+    /// equal.
     ///
     /// # Errors
     /// [`DataError`] names the file.
-    pub fn claim(&self, folder: &Path) -> Result<(), DataError> {
+    pub fn write_or_compare(&self, folder: &Path) -> Result<(), DataError> {
         fs::create_dir_all(folder).at(folder)?;
         let path = folder.join("setup.json");
         match fs::read_to_string(&path) {

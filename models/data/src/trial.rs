@@ -1,13 +1,14 @@
 use grasp::Grasp;
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 
-/// Number of yaws at which a point is tried, evenly over half a turn. After half a turn the hand is the same.
-pub const TURNS: usize = 5;
+/// Number of yaws of a trial that differ: k · 36°, k from 0 to 4. The hand is symmetric, so a yaw of 180° is the same
+/// grasp.
+pub const DISTINCT_YAWS: usize = 5;
 
 /// Upper limit of [`Trial::clearance`], metres. A larger distance does not make a grasp safer.
 pub const MAX_CLEARANCE: f32 = 0.02;
 
-/// A tried grasp in the frame of the volume. Lengths are in voxels, except the clearance.
+/// The trial of a grasp, in the frame of the volume. Lengths are in voxels, except the clearance.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Trial {
     /// Position in voxels (position / voxel size, not rounded).
@@ -18,20 +19,20 @@ pub struct Trial {
     pub width: f64,
     /// Whether the grasp succeeded.
     pub success: bool,
-    /// For a success, the other yaws that succeeded too: bit k stands for k/[`TURNS`] of half a turn, from k = 1. 0 in
-    /// the formats of VGN and GIGA, which do not store yaws.
-    pub turns: u8,
-    /// Fraction of successful tries, in [0, 1]. A grasp whose first try succeeds is repeated with small pose errors,
-    /// and counts as a success if nearly all tries succeed. For a grasp with a single try it is 1 or 0.
+    /// For a success, the other yaws that succeeded too: bit k for k · 180° / [`DISTINCT_YAWS`], from k = 1. 0 in the
+    /// formats of VGN and GIGA, which do not store yaws.
+    pub yaws: u8,
+    /// Share of successful executions, in [0, 1]. A grasp whose first execution succeeds is repeated with small pose
+    /// errors, and is a success if nearly all executions succeed. With a single execution the share is 1 or 0.
     pub share: f32,
-    /// Smallest distance between the open hand on its approach and the objects, at most [`MAX_CLEARANCE`]; 0 if it is
-    /// unknown or the hand touches something. In metres in every format, because it does not depend on the voxel size.
+    /// Smallest distance between the open hand on its approach and the objects, metres, at most [`MAX_CLEARANCE`]. 0 if
+    /// it is unknown or the hand touches something.
     pub clearance: f32,
 }
 
 impl Trial {
-    /// A trial of `grasp`, given in the volume's frame (metres), converted to voxels of `voxel_size` metres. Its other
-    /// yaws, tries and clearance are unknown.
+    /// The trial of `grasp`, which is in the volume's frame in metres. `voxel_size` is in metres. The trial has no other
+    /// yaws, one execution, and an unknown clearance.
     #[must_use]
     pub fn new(grasp: &Grasp, success: bool, voxel_size: f64) -> Self {
         Self {
@@ -39,22 +40,22 @@ impl Trial {
             rotation: grasp.pose.rotation,
             width: grasp.width / voxel_size,
             success,
-            turns: 0,
+            yaws: 0,
             share: if success { 1.0 } else { 0.0 },
             clearance: 0.0,
         }
     }
 
-    /// The successful rotations: that of the grasp and its successful [yaws](Self::turns).
+    /// The valid rotations: that of the grasp, and those of the other successful [yaws](Self::yaws).
     pub fn rotations(&self) -> impl Iterator<Item = UnitQuaternion<f64>> {
-        let turn = |k: usize| {
-            UnitQuaternion::from_axis_angle(&Vector3::z_axis(), k as f64 * std::f64::consts::PI / TURNS as f64)
+        let about_approach = |k: usize| {
+            UnitQuaternion::from_axis_angle(&Vector3::z_axis(), k as f64 * std::f64::consts::PI / DISTINCT_YAWS as f64)
         };
-        let (own, turns) = (self.rotation, self.turns);
-        (0..TURNS).filter(move |&k| k == 0 || turns & (1 << k) != 0).map(move |k| own * turn(k))
+        let (own, yaws) = (self.rotation, self.yaws);
+        (0..DISTINCT_YAWS).filter(move |&k| k == 0 || yaws & (1 << k) != 0).map(move |k| own * about_approach(k))
     }
 
-    /// The grasp in metres. Its quality is 1 for a success and 0 for a failure.
+    /// The grasp in metres; `voxel_size` is in metres. Its quality is 1 for a success and 0 for a failure.
     #[must_use]
     pub fn grasp(&self, voxel_size: f64) -> Grasp {
         let translation = Translation3::from(self.position.coords * voxel_size);

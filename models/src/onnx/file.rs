@@ -11,12 +11,12 @@ use super::ModelProto;
 /// Why a file could not be read or written.
 #[derive(Debug, Error)]
 pub enum FileError {
-    /// The file system refused.
+    /// The file cannot be read or written.
     #[error("{}: {source}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
-        /// What it said.
+        /// The error of the file system.
         source: std::io::Error,
     },
     /// The bytes are not an ONNX model.
@@ -24,7 +24,7 @@ pub enum FileError {
     Decode {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The error of the decoder.
         reason: String,
     },
 }
@@ -33,13 +33,13 @@ impl ModelProto {
     /// Reads a file.
     ///
     /// # Errors
-    /// [`FileError`] names the file and what is wrong with it.
+    /// [`FileError`] names the file.
     pub fn read(path: &Path) -> Result<Self, FileError> {
         let bytes = fs::read(path).map_err(|source| FileError::Io { path: path.to_owned(), source })?;
         Self::from_bytes(&bytes).map_err(|reason| FileError::Decode { path: path.to_owned(), reason })
     }
 
-    /// Reads a file's bytes; the error says what is wrong with them.
+    /// Decodes the content of a file. The error is the reason of [`FileError::Decode`].
     pub(crate) fn from_bytes(bytes: &[u8]) -> Result<Self, String> {
         let model = Self::decode(bytes).map_err(|error| error.to_string())?;
         match &model.graph {
@@ -48,10 +48,10 @@ impl ModelProto {
         }
     }
 
-    /// Writes a file in one step: a concurrent reader gets the old file or the new one, never a part.
+    /// Writes a file under a temporary name and renames it, so that a concurrent reader gets the old file or the new one.
     ///
     /// # Errors
-    /// [`FileError`] when the file system refuses.
+    /// [`FileError::Io`] if the file cannot be written.
     pub fn write(&self, path: &Path) -> Result<(), FileError> {
         let part = path.with_extension("onnx.part");
         fs::write(&part, self.encode_to_vec())

@@ -8,14 +8,14 @@ use super::{DataType, StringStringEntryProto, TensorProto};
 /// Why a tensor's values cannot be used.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum TensorError {
-    /// The element type is not one that was asked for.
-    #[error("tensor `{name}` has elements of ONNX type {got}, {expected} needed")]
+    /// The tensor has another element type than requested.
+    #[error("tensor `{name}` has elements of ONNX type {got}, must have {expected}")]
     Type {
         /// The tensor.
         name: String,
-        /// Its element type, as `onnx.proto` numbers them.
+        /// Its element type, a number of `onnx.proto`.
         got: i32,
-        /// What was asked for.
+        /// The requested types.
         expected: &'static str,
     },
     /// The number of values does not fit the shape.
@@ -30,8 +30,8 @@ pub enum TensorError {
         /// Its shape.
         dims: Vec<i64>,
     },
-    /// The values lie in another file.
-    #[error("tensor `{name}` keeps its values in another file; save the model as a single file")]
+    /// The values are in another file.
+    #[error("tensor `{name}` has its values in another file; save the model as a single file")]
     External {
         /// The tensor.
         name: String,
@@ -81,19 +81,19 @@ impl TensorProto {
         }
     }
 
-    /// How many values its shape needs.
+    /// Number of values, from the shape.
     #[must_use]
     pub fn elements(&self) -> usize {
         self.dims.iter().map(|&dim| usize::try_from(dim).unwrap_or(0)).product()
     }
 
-    /// What it holds; `Undefined` where the number is not one of ONNX's.
+    /// Element type; `Undefined` if the number is not an element type of ONNX.
     #[must_use]
     pub fn element_type(&self) -> DataType {
         DataType::try_from(self.data_type()).unwrap_or_default()
     }
 
-    /// Whether it holds floating-point numbers.
+    /// Whether the elements are f32 or f16.
     #[must_use]
     pub fn is_float(&self) -> bool {
         matches!(self.element_type(), DataType::Float | DataType::Float16)
@@ -102,16 +102,16 @@ impl TensorProto {
     /// The values of an f32 or f16 tensor.
     ///
     /// # Errors
-    /// [`TensorError`] when it holds something else, or too little of it.
+    /// [`TensorError`] if it has another element type, another number of values, or values in another file.
     pub fn to_f32(&self) -> Result<Vec<f32>, TensorError> {
-        let halves = |bits: u16| f16::from_bits(bits).to_f32();
+        let from_f16 = |bits: u16| f16::from_bits(bits).to_f32();
         match (self.element_type(), self.raw()?) {
             (DataType::Float, Some(raw)) => self.checked(raw.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b))),
             (DataType::Float, None) => self.checked(self.float_data.iter().copied()),
             (DataType::Float16, Some(raw)) => {
-                self.checked(raw.as_chunks().0.iter().map(|b| halves(u16::from_le_bytes(*b))))
+                self.checked(raw.as_chunks().0.iter().map(|b| from_f16(u16::from_le_bytes(*b))))
             }
-            (DataType::Float16, None) => self.checked(self.int32_data.iter().map(|&bits| halves(bits as u16))),
+            (DataType::Float16, None) => self.checked(self.int32_data.iter().map(|&bits| from_f16(bits as u16))),
             _ => Err(self.wrong_type("FLOAT (1) or FLOAT16 (10)")),
         }
     }
@@ -119,7 +119,7 @@ impl TensorProto {
     /// The values of an i64 tensor.
     ///
     /// # Errors
-    /// [`TensorError`] when it holds something else, or too little of it.
+    /// [`TensorError`] if it has another element type, another number of values, or values in another file.
     pub fn to_i64(&self) -> Result<Vec<i64>, TensorError> {
         match (self.element_type(), self.raw()?) {
             (DataType::Int64, Some(raw)) => self.checked(raw.as_chunks().0.iter().map(|b| i64::from_le_bytes(*b))),
@@ -128,7 +128,7 @@ impl TensorProto {
         }
     }
 
-    /// Replaces the values, as f32, keeping name and shape.
+    /// Replaces the values by f32 values. Name and shape stay.
     pub fn set_f32(&mut self, values: &[f32]) {
         self.data_type = Some(DataType::Float.into());
         self.float_data.clear();
@@ -136,14 +136,14 @@ impl TensorProto {
         self.raw_data = Some(values.iter().flat_map(|value| value.to_le_bytes()).collect());
     }
 
-    /// The other file that the values lie in, if they do.
+    /// Name of the other file that has the values, if any.
     #[must_use]
     pub fn external_file(&self) -> Option<&str> {
         let file = self.external_data.iter().find(|entry| entry.key() == "location");
         (self.data_location == Some(1)).then(|| file.map_or("", StringStringEntryProto::value))
     }
 
-    /// The raw bytes, if the values are stored so.
+    /// The raw bytes, if the values are stored as raw bytes.
     fn raw(&self) -> Result<Option<&[u8]>, TensorError> {
         if self.external_file().is_some() {
             return Err(TensorError::External { name: self.name().to_owned() });

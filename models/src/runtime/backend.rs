@@ -46,23 +46,23 @@ pub enum BackendError {
     #[error(
         "provider `{wanted}` not found in this ONNX Runtime; available: {}; set ORT_DYLIB_PATH to a build that has it \
          (Python wheels onnxruntime-openvino, onnxruntime-gpu)",
-        list(there)
+        list(available)
     )]
     Provider {
         /// The requested value.
         wanted: Provider,
         /// The available providers.
-        there: Vec<Provider>,
+        available: Vec<Provider>,
     },
     /// The provider does not support the precision on this machine.
-    #[error("provider `{provider}` does not support {wanted} on this machine; available: {}", list(there))]
+    #[error("provider `{provider}` does not support {wanted} on this machine; available: {}", list(available))]
     Precision {
         /// The provider.
         provider: Provider,
         /// The requested value.
         wanted: Precision,
         /// The available precisions.
-        there: Vec<Precision>,
+        available: Vec<Precision>,
     },
     /// The file has no scales for 8 bits.
     #[error("the model is not an int8 model; convert it with `grasp-train export --precision int8`")]
@@ -72,18 +72,18 @@ pub enum BackendError {
     Int8(Precision),
 }
 
-/// Capabilities of the machine and of the library.
+/// The providers of the library and the precisions of the machine.
 #[derive(Clone, Debug)]
-pub(crate) struct Machine {
+pub(crate) struct AvailableBackends {
     /// Providers in the order in which they are tried, fastest first.
     pub providers: Vec<Provider>,
     /// Whether the CPU has bf16 instructions.
     pub bf16: bool,
 }
 
-impl Machine {
-    /// Detects the capabilities. The library lists the providers it was built with; whether a GPU is present only shows
-    /// when a session is created.
+impl AvailableBackends {
+    /// Detects providers and precisions. The library lists the providers that it was built with. Whether there is a GPU
+    /// is only known when a session is created.
     pub fn here() -> Self {
         let providers = Provider::FASTEST_FIRST.into_iter().filter(|provider| provider.is_available()).collect();
         Self { providers, bf16: has_bf16() }
@@ -104,7 +104,7 @@ impl Machine {
         let providers = match provider {
             None => self.providers.clone(),
             Some(wanted) if self.providers.contains(&wanted) => vec![wanted],
-            Some(wanted) => return Err(BackendError::Provider { wanted, there: self.providers.clone() }),
+            Some(wanted) => return Err(BackendError::Provider { wanted, available: self.providers.clone() }),
         };
         let of = |provider| {
             let precisions = if is_int8 { vec![Precision::Int8] } else { self.precisions(provider) };
@@ -115,7 +115,7 @@ impl Machine {
         let fitting: Vec<Backend> = all.iter().copied().filter(|backend| backend.precision == wanted).collect();
         match (fitting.is_empty(), all.last()) {
             (true, Some(&Backend { provider, .. })) => {
-                Err(BackendError::Precision { provider, wanted, there: self.precisions(provider) })
+                Err(BackendError::Precision { provider, wanted, available: self.precisions(provider) })
             }
             _ => Ok(fitting),
         }
@@ -131,7 +131,7 @@ impl Machine {
     }
 }
 
-/// Without these instructions OpenVINO ignores the bf16 hint and computes in f32. Processors with AMX have them too.
+/// Whether the CPU has AVX-512 BF16, as every CPU with AMX. Without it OpenVINO ignores the bf16 hint and computes in f32.
 fn has_bf16() -> bool {
     #[cfg(target_arch = "x86_64")]
     return std::arch::is_x86_feature_detected!("avx512bf16");
@@ -183,8 +183,8 @@ impl Backend {
     /// ONNX Runtime's CPU kernels in f32: the reference for all other backends.
     pub const REFERENCE: Self = Self { provider: Provider::Cpu, precision: Precision::Fp32 };
 
-    /// The provider to register with a session of `threads` threads. A failed registration is an error; by default ONNX
-    /// Runtime would silently fall back to the CPU.
+    /// The provider to register with a session of `threads` threads. A failed registration is an error; the default
+    /// of ONNX Runtime is to use the CPU without an error.
     pub(crate) fn dispatch(self, threads: usize) -> Option<ExecutionProviderDispatch> {
         let provider = match self.provider {
             Provider::Cpu => return None,
@@ -279,8 +279,8 @@ fn list<T: fmt::Display>(items: &[T]) -> String {
 mod tests {
     use super::*;
 
-    fn machine(providers: &[Provider], bf16: bool) -> Machine {
-        Machine { providers: providers.to_vec(), bf16 }
+    fn machine(providers: &[Provider], bf16: bool) -> AvailableBackends {
+        AvailableBackends { providers: providers.to_vec(), bf16 }
     }
 
     fn names(backends: Result<Vec<Backend>, BackendError>) -> Vec<String> {

@@ -5,8 +5,8 @@ use grasp::gpd::{CHANNELS, IMAGE_SIZE, Image};
 use ort::session::Session;
 use ort::value::{Outlet, Tensor, TensorElementType};
 
-use super::plan::Model;
-use super::{Backend, LoadError, LoadReason, Options, RuntimeError, refusal};
+use super::batch_session::ModelFile;
+use super::{Backend, LoadError, LoadReason, Options, RuntimeError, run_error};
 use crate::Entry;
 use crate::gpd::{INPUT, OUTPUT};
 
@@ -42,9 +42,9 @@ impl Classifier {
         load().map_err(|reason| LoadError { path: entry.path.clone(), reason })
     }
 
-    /// Runs once, so that the first request does not pay for allocations.
+    /// Loads the model and runs it once, so that buffers are allocated before the first request.
     fn open(path: &Path, bytes: &[u8], options: &Options) -> Result<Self, LoadReason> {
-        let session = Model::new(path, bytes, options).open(Backend::REFERENCE, None)?;
+        let session = ModelFile::new(path, bytes, options).open(Backend::REFERENCE, None)?;
         check(session.inputs(), INPUT, &[CHANNELS, IMAGE_SIZE, IMAGE_SIZE])?;
         check(session.outputs(), OUTPUT, &[2])?;
         let mut classifier = Self { session, name: path.display().to_string() };
@@ -60,7 +60,7 @@ impl Classifier {
         let mut scores = Vec::with_capacity(images.len());
         for batch in images.chunks(BATCH) {
             let pixels = batch.iter().flat_map(Image::pixels).map(|&value| f32::from(value) / 255.0).collect();
-            let logits = logits(&mut self.session, pixels).map_err(|error| refusal(&self.name, &error))?;
+            let logits = logits(&mut self.session, pixels).map_err(|error| run_error(&self.name, &error))?;
             scores.extend(logits.chunks_exact(2).map(|pair| pair[1] - pair[0]));
         }
         Ok(scores)

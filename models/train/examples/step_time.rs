@@ -7,7 +7,7 @@ use std::time::Instant;
 use grasp::VoxelOrigin;
 use grasp_data::Trial;
 use grasp_models::build;
-use grasp_train::{Adam, Execution, Executor, Quality, Targets, Weights};
+use grasp_train::{Adam, ExecutionOptions, Executor, LossWeights, QualityTarget, Targets};
 use nalgebra::{Point3, UnitQuaternion};
 use tch::{Device, Kind, Tensor};
 
@@ -31,19 +31,19 @@ fn main() -> anyhow::Result<()> {
             let rotation = UnitQuaternion::identity();
             let success = label % 2 == 0;
             let share = if success { 1.0 } else { 0.0 };
-            let label = Trial { position, rotation, width: 5.0, success, turns: 0, share, clearance: 0.0 };
-            targets.push(index, &label, 40, VoxelOrigin::Corner, Quality::Label);
+            let label = Trial { position, rotation, width: 5.0, success, yaws: 0, share, clearance: 0.0 };
+            targets.push(index, &label, 40, VoxelOrigin::Corner, QualityTarget::Label);
         }
     }
 
     for bf16 in [false, true] {
         for channels_last in [false, true] {
-            let executor = Executor::new(build(network, 0)?, Execution { device, bf16, channels_last })?;
+            let executor = Executor::new(build(network, 0)?, ExecutionOptions { device, bf16, channels_last })?;
             let mut adam = Adam::new(executor.parameters(), 0.0);
             let mut times: Vec<f64> = Vec::new();
             for _ in 0..STEPS {
                 let start = Instant::now();
-                let loss = targets.loss(&executor.forward_at(&volumes, targets.cells())?, &Weights::default())?;
+                let loss = targets.loss(&executor.forward_at(&volumes, targets.voxels())?, &LossWeights::default())?;
                 loss.mean.backward();
                 adam.step(executor.parameters(), 1e-4);
                 times.push(start.elapsed().as_secs_f64());

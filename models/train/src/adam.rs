@@ -31,21 +31,22 @@ impl Adam {
     /// Updates every parameter and clears the gradients.
     pub fn step(&mut self, parameters: &[(String, Tensor)], learning_rate: f64) {
         self.steps += 1;
-        let [first, second] = BETA.map(|beta| 1.0 - beta.powf(self.steps as f64));
+        // Corrections of the bias towards the initial 0 of both moments.
+        let [first_correction, second_correction] = BETA.map(|beta| 1.0 - beta.powf(self.steps as f64));
         no_grad(|| {
-            for ((_, weight), [mean, square]) in parameters.iter().zip(&mut self.moments) {
+            for ((_, weight), [first_moment, second_moment]) in parameters.iter().zip(&mut self.moments) {
                 let mut weight = weight.shallow_clone();
                 let gradient = weight.grad();
                 if !gradient.defined() {
                     continue;
                 }
-                let _ = mean.lerp_(&gradient, 1.0 - BETA[0]);
-                let _ = square.lerp_(&gradient.square(), 1.0 - BETA[1]);
-                let change = &*mean / ((&*square / second).sqrt() + EPSILON);
+                let _ = first_moment.lerp_(&gradient, 1.0 - BETA[0]);
+                let _ = second_moment.lerp_(&gradient.square(), 1.0 - BETA[1]);
+                let update = &*first_moment / ((&*second_moment / second_correction).sqrt() + EPSILON);
                 if self.weight_decay > 0.0 && weight.dim() > 1 {
                     weight *= 1.0 - learning_rate * self.weight_decay;
                 }
-                weight -= change * (learning_rate / first);
+                weight -= update * (learning_rate / first_correction);
                 weight.zero_grad();
             }
         });

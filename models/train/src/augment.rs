@@ -1,19 +1,22 @@
 //! Data augmentation: scenes are rotated, mirrored and shifted together with their grasps.
 //!
-//! The volume's values are sampled at (index + 0.5) voxels and grasps have real positions, so that rotating both about
-//! the axis of the cube is exact. Only the voxel of a grasp depends on the network's convention. (VGN's code rotates
-//! indices about 20 instead, which shifts the volume relative to the grasps by a voxel.)
+//! The value of a voxel belongs to the point (index + 0.5) voxels, and the position of a grasp is not rounded. Rotating
+//! both about the vertical axis of the cube is therefore exact. Which voxel a grasp belongs to depends on the voxel
+//! origin of the network. (VGN's code rotates indices about 20, which shifts the volume by a voxel relative to the
+//! grasps.)
 
-use grasp_data::{TURNS, Trial};
+use grasp_data::{DISTINCT_YAWS, Trial};
 use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
 use rand::{Rng, RngExt};
 use serde::Serialize;
 
-/// Allowed transforms.
+/// The allowed transforms.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Augmentation {
-    /// Quarter turns about z.
-    pub turns: bool,
+    /// Rotations about z by multiples of 90°.
+    // The name in checkpoints and in the metadata of models.
+    #[serde(rename = "turns")]
+    pub rotate: bool,
     /// Mirror images, x reversed.
     pub mirror: bool,
     /// Maximum shift along z, voxels.
@@ -23,8 +26,8 @@ pub struct Augmentation {
 /// A transform: mirrored, then rotated, then shifted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Transform {
-    /// Quarter turns about z, counter-clockwise seen from above.
-    pub turns: u32,
+    /// Rotations by 90° about z, counter-clockwise seen from above.
+    pub quarter_turns: u32,
     /// Whether x is reversed.
     pub mirror: bool,
     /// Shift upwards, voxels.
@@ -36,7 +39,7 @@ impl Augmentation {
     pub fn draw(self, rng: &mut impl Rng) -> Transform {
         let shift = self.shift as i32;
         Transform {
-            turns: if self.turns { rng.random_range(0..4) } else { 0 },
+            quarter_turns: if self.rotate { rng.random_range(0..4) } else { 0 },
             mirror: self.mirror && rng.random(),
             shift: if shift > 0 { rng.random_range(-shift..=shift) } else { 0 },
         }
@@ -44,13 +47,14 @@ impl Augmentation {
 }
 
 impl Transform {
-    /// Writes the values of the transformed volume `[N, N, N]` to `out`. Voxels shifted in are unobserved.
+    /// Writes the transformed volume to `out`. Both are `[N, N, N]`: `volume` is quantised, `out` is in [0, 1]. Voxels
+    /// that are shifted in from outside are unobserved: 0.
     pub fn volume(self, volume: &[u8], n: usize, out: &mut [f32]) {
         for x in 0..n {
             for y in 0..n {
-                // The source of this column of voxels, by the inverse transform.
+                // The column of the original volume that this column comes from, by the inverse transform.
                 let (mut from_x, mut from_y) = (x, y);
-                for _ in 0..self.turns {
+                for _ in 0..self.quarter_turns {
                     (from_x, from_y) = (from_y, n - 1 - from_x);
                 }
                 if self.mirror {
@@ -65,11 +69,11 @@ impl Transform {
         }
     }
 
-    /// The grasp in the transformed scene of N³ voxels.
+    /// The trial in the transformed scene. `n` is N, the voxels along an edge of the volume.
     #[must_use]
     pub fn trial(self, trial: &Trial, n: usize) -> Trial {
         let edge = n as f64;
-        let Trial { mut position, mut rotation, mut turns, .. } = *trial;
+        let Trial { mut position, mut rotation, mut yaws, .. } = *trial;
         if self.mirror {
             position.x = edge - position.x;
             // The mirror image of a rotation about an axis is the inverse rotation about the mirrored axis. The hand is
@@ -77,14 +81,14 @@ impl Transform {
             // (y) are the mirrored axes.
             let [x, y, z, w]: [f64; 4] = rotation.coords.into();
             rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, x, -y, -z));
-            // Mirroring reverses the direction of the turns.
-            turns = (1..TURNS).fold(0, |mirrored, k| mirrored | (turns >> k & 1) << (TURNS - k));
+            // Mirroring reverses the direction of the yaws.
+            yaws = (1..DISTINCT_YAWS).fold(0, |mirrored, k| mirrored | (yaws >> k & 1) << (DISTINCT_YAWS - k));
         }
-        for _ in 0..self.turns {
+        for _ in 0..self.quarter_turns {
             position = Point3::new(edge - position.y, position.x, position.z);
             rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2) * rotation;
         }
         position.z += f64::from(self.shift);
-        Trial { position, rotation, turns, ..*trial }
+        Trial { position, rotation, yaws, ..*trial }
     }
 }

@@ -8,13 +8,13 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::augment::Transform;
 use crate::loss::Targets;
-use crate::settings::Quality;
 use crate::teacher::{Teacher, TeacherError};
+use crate::training_settings::QualityTarget;
 
-/// Number of batches that are read ahead.
-const AHEAD: usize = 2;
+/// Number of batches that the background thread reads in advance.
+const READ_AHEAD: usize = 2;
 
-/// A scene as an input of a training step.
+/// A scene as an input of a training step, with its augmentation.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Example {
     pub scene: usize,
@@ -22,7 +22,7 @@ pub(crate) struct Example {
     pub volume: usize,
     pub transform: Transform,
     /// Seed of the voxels for which the teacher's output is used.
-    pub voxels: u64,
+    pub voxel_seed: u64,
 }
 
 /// Inputs and targets of a forward pass.
@@ -32,8 +32,8 @@ pub(crate) struct Batch {
     /// `[len, N, N, N]`.
     pub volumes: Vec<f32>,
     pub targets: Targets,
-    /// The teacher's outputs; empty without a teacher.
-    pub answers: Targets,
+    /// The teacher's outputs as targets; empty without a teacher.
+    pub teacher_targets: Targets,
 }
 
 impl Batch {
@@ -41,45 +41,45 @@ impl Batch {
         dataset: &Dataset,
         examples: &[Example],
         origin: VoxelOrigin,
-        quality: Quality,
+        quality: QualityTarget,
         mut teacher: Option<&mut Teacher>,
     ) -> Result<Self, TeacherError> {
         let n = dataset.resolution();
         let mut volumes = vec![0.0; examples.len() * n.pow(3)];
-        let (mut targets, mut answers) = (Targets::default(), Targets::default());
+        let (mut targets, mut teacher_targets) = (Targets::default(), Targets::default());
         for (index, (example, out)) in examples.iter().zip(volumes.chunks_exact_mut(n.pow(3))).enumerate() {
-            let &Example { scene, volume, transform, voxels } = example;
+            let &Example { scene, volume, transform, voxel_seed } = example;
             transform.volume(dataset.volume(scene, volume), n, out);
             for trial in dataset.trials(scene) {
                 targets.push(index, &transform.trial(&trial, n), n, origin, quality);
             }
             if let Some(teacher) = teacher.as_deref_mut() {
-                teacher.answer(index, out, &mut ChaCha8Rng::seed_from_u64(voxels), &mut answers)?;
+                teacher.add_targets(index, out, &mut ChaCha8Rng::seed_from_u64(voxel_seed), &mut teacher_targets)?;
             }
         }
-        Ok(Self { len: examples.len(), volumes, targets, answers })
+        Ok(Self { len: examples.len(), volumes, targets, teacher_targets })
     }
 }
 
-/// Passes the batches of a plan to `take`. A background thread reads them.
+/// Calls `consume` with the batches of a plan, which a background thread reads.
 pub(crate) fn read_ahead<R>(
     dataset: &Dataset,
     plan: &[&[Example]],
     origin: VoxelOrigin,
-    quality: Quality,
+    quality: QualityTarget,
     mut teacher: Option<&mut Teacher>,
-    take: impl FnOnce(mpsc::IntoIter<Result<Batch, TeacherError>>) -> R,
+    consume: impl FnOnce(mpsc::IntoIter<Result<Batch, TeacherError>>) -> R,
 ) -> R {
     thread::scope(|scope| {
-        let (sender, batches) = mpsc::sync_channel(AHEAD);
+        let (sender, batches) = mpsc::sync_channel(READ_AHEAD);
         scope.spawn(move || {
             for examples in plan {
-                // Sending fails when training was stopped.
+                // Sending fails when `consume` has returned early.
                 if sender.send(Batch::read(dataset, examples, origin, quality, teacher.as_deref_mut())).is_err() {
                     break;
                 }
             }
         });
-        take(batches.into_iter())
+        consume(batches.into_iter())
     })
 }

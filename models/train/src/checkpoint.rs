@@ -1,4 +1,4 @@
-//! The state of a training run, from which it continues as if it had not been interrupted.
+//! The state of a training run. A run that is resumed from it gives the same result as an uninterrupted run.
 //!
 //! On the CPU with the same number of threads the result is bit-identical. With another number of threads, or on a GPU,
 //! libtorch adds in another order and the results differ in the last digits.
@@ -12,12 +12,12 @@ use tch::{Tensor, no_grad};
 use thiserror::Error;
 
 use crate::adam::Adam;
-use crate::average::Average;
-use crate::execute::{Executor, tensor_of, values_of};
-use crate::loss::Sums;
+use crate::executor::{Executor, tensor_of, values_of};
+use crate::loss::LossSums;
+use crate::weight_average::WeightAverage;
 
 /// The state of a run that the network's file does not contain. Shuffling and augmentation are functions of the seed
-/// and the epoch, so that no state of a random generator is needed.
+/// and the epoch, so the state of a random generator is not part of it.
 #[derive(Clone, PartialEq, Message)]
 pub struct Checkpoint {
     /// The settings of the run as JSON, and a fingerprint of its data. Only a run with the same value can be resumed.
@@ -29,13 +29,14 @@ pub struct Checkpoint {
     /// Completed batches of the current epoch.
     #[prost(uint64, tag = "3")]
     pub batch: u64,
-    /// Their losses, in the order of [`Sums`].
+    /// Sums over these batches, in the order of [`LossSums`].
     #[prost(double, repeated, tag = "4")]
     pub sums: Vec<f64>,
     /// Adam's steps.
     #[prost(uint64, tag = "5")]
     pub steps: u64,
-    /// Smallest cost so far, by which the best weights are chosen: the validation loss, or the failures in simulation.
+    /// Smallest cost so far, by which the best weights are selected: the validation loss, or the mean of 1 − GSR and
+    /// 1 − DR of --evaluate.
     #[prost(double, optional, tag = "6")]
     pub best: Option<f64>,
     /// The last weights. The network's file may contain the best instead.
@@ -52,7 +53,7 @@ pub struct Checkpoint {
     pub average: Vec<TensorProto>,
     /// Consecutive results that were not better than the best.
     #[prost(uint64, tag = "11")]
-    pub worse: u64,
+    pub results_since_best: u64,
 }
 
 /// Why a run cannot be resumed from a checkpoint.
@@ -76,7 +77,7 @@ pub enum CheckpointError {
     },
     /// The checkpoint belongs to a run with other settings or data.
     #[error(
-        "the checkpoint was made with {theirs}, this run has {ours}; give the same options and data, or start without \
+        "the checkpoint has the settings {theirs}, this run has {ours}; give the same options and data, or start without \
          --resume"
     )]
     Settings {
@@ -118,21 +119,21 @@ impl Checkpoint {
             .map_err(|source| CheckpointError::Io { path: path.to_owned(), source })
     }
 
-    /// Stores the weights and the state of the optimizer.
-    pub(crate) fn keep(&mut self, executor: &Executor, adam: &Adam, average: Option<&Average>) {
-        let store = |name: &str, tensor: &Tensor| TensorProto::from_f32(name, &tensor.size(), &values_of(tensor));
-        self.weights = executor.parameters().iter().map(|(name, weight)| store(name, weight)).collect();
-        self.moments = adam.moments.iter().flatten().map(|moment| store("", moment)).collect();
-        self.average = average.iter().flat_map(|average| &average.weights).map(|weight| store("", weight)).collect();
+    /// Copies the weights and the state of the optimizer into the checkpoint.
+    pub(crate) fn store(&mut self, executor: &Executor, adam: &Adam, average: Option<&WeightAverage>) {
+        let proto = |name: &str, tensor: &Tensor| TensorProto::from_f32(name, &tensor.size(), &values_of(tensor));
+        self.weights = executor.parameters().iter().map(|(name, weight)| proto(name, weight)).collect();
+        self.moments = adam.moments.iter().flatten().map(|moment| proto("", moment)).collect();
+        self.average = average.iter().flat_map(|average| &average.weights).map(|weight| proto("", weight)).collect();
         self.steps = adam.steps;
     }
 
-    /// Restores the weights and the state of the optimizer.
+    /// Copies the weights and the state of the optimizer from the checkpoint.
     pub(crate) fn restore(
         &self,
         executor: &Executor,
         adam: &mut Adam,
-        average: Option<&Average>,
+        average: Option<&WeightAverage>,
     ) -> Result<(), CheckpointError> {
         let parameters = executor.parameters();
         if self.weights.len() != parameters.len() || self.moments.len() != 2 * parameters.len() {
@@ -171,7 +172,7 @@ fn copy(stored: &TensorProto, tensor: &Tensor) -> Result<(), CheckpointError> {
     Ok(())
 }
 
-impl Sums {
+impl LossSums {
     /// The sums as a list, for a checkpoint.
     pub(crate) fn to_list(self) -> Vec<f64> {
         let Self { voxels, quality, rotation, width, angle, true_positives, false_positives, false_negatives } = self;

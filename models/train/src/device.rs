@@ -7,7 +7,7 @@ use tch::{Cuda, Device};
 
 /// The value of `--device`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) enum Choice {
+pub(crate) enum DeviceChoice {
     /// The first GPU, or the CPU if there is none.
     #[default]
     Auto,
@@ -16,7 +16,7 @@ pub(crate) enum Choice {
     Cuda(usize),
 }
 
-impl FromStr for Choice {
+impl FromStr for DeviceChoice {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -31,7 +31,7 @@ impl FromStr for Choice {
     }
 }
 
-impl Choice {
+impl DeviceChoice {
     /// The device, if this machine and this libtorch have it.
     pub fn device(self) -> Result<Device> {
         let gpus = if Cuda::is_available() { Cuda::device_count() } else { 0 };
@@ -69,7 +69,7 @@ mod tests {
 
     #[test]
     fn a_missing_device_is_an_error() {
-        let choice = |text: &str| text.parse::<Choice>().unwrap();
+        let choice = |text: &str| text.parse::<DeviceChoice>().unwrap();
         assert_eq!(choice("auto").among(0).unwrap(), Device::Cpu);
         assert_eq!(choice("auto").among(2).unwrap(), Device::Cuda(0));
         assert_eq!(choice("cpu").among(2).unwrap(), Device::Cpu);
@@ -78,7 +78,7 @@ mod tests {
         let error = choice("cuda:2").among(2).unwrap_err().to_string();
         assert!(error.contains("cuda:2") && error.contains("2 CUDA devices"), "{error}");
         for wrong in ["", "gpu", "cuda:", "cuda:x", "CUDA"] {
-            assert!(wrong.parse::<Choice>().is_err(), "{wrong}");
+            assert!(wrong.parse::<DeviceChoice>().is_err(), "{wrong}");
         }
         assert_eq!([Device::Cpu, Device::Cuda(1)].map(name), ["cpu", "cuda:1"]);
     }

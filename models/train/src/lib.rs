@@ -1,35 +1,35 @@
 //! Training of grasp networks.
 //!
-//! A [`Trainer`] reads scenes of a [`Dataset`](grasp_data::Dataset), [augments](Augmentation) them and runs them
-//! through an [`Executor`]: the ONNX graph that is served, in libtorch with autograd. [`Adam`] minimises
-//! [`Targets::loss`]. A [`Teacher`] adds targets at voxels without labels. A [`Checkpoint`] stores the state of a run.
-//! A [`Learner`] trains the classifier of grasp candidates on [`Examples`].
+//! A [`Trainer`] reads scenes of a [`Dataset`](grasp_data::Dataset) and [augments](Augmentation) them. An [`Executor`]
+//! executes the ONNX graph that is served in libtorch with autograd. [`Adam`] minimises [`Targets::loss`]. A [`Teacher`]
+//! adds targets at voxels without labels. A [`Checkpoint`] stores the state of a run.
+//! A [`ClassifierTrainer`] trains the classifier of grasp candidates on a [`CandidateDataset`].
 
 mod adam;
 mod augment;
-mod average;
 mod batch;
+mod candidate_dataset;
 mod checkpoint;
-mod classifier;
-pub mod curves;
-mod examples;
-mod execute;
-mod heads;
+mod classifier_trainer;
+mod epoch_record;
+mod executor;
+pub mod learning_curves;
 mod loss;
 mod operators;
-mod record;
-mod settings;
+mod pointwise;
 mod teacher;
 mod trainer;
+mod training_settings;
+mod weight_average;
 
 pub use adam::Adam;
 pub use augment::{Augmentation, Transform};
+pub use candidate_dataset::CandidateDataset;
 pub use checkpoint::{Checkpoint, CheckpointError};
-pub use classifier::{ClassifierSettings, Learner, Tally};
-pub use examples::Examples;
-pub use execute::{ExecuteError, Execution, Executor, Outputs};
-pub use loss::{Loss, LossError, Sums, Targets, Weights};
-pub use record::{Record, Success, Validation};
-pub use settings::{Quality, Settings};
+pub use classifier_trainer::{ClassifierMetrics, ClassifierSettings, ClassifierTrainer};
+pub use epoch_record::{BenchmarkRates, EpochRecord, Validation};
+pub use executor::{ExecuteError, ExecutionOptions, Executor, NetworkOutputs};
+pub use loss::{Loss, LossError, LossSums, LossWeights, Targets};
 pub use teacher::{Teacher, TeacherError};
-pub use trainer::{Epoch, TrainError, Trainer};
+pub use trainer::{EpochOutcome, TrainError, Trainer};
+pub use training_settings::{QualityTarget, TrainingSettings};

@@ -1,43 +1,43 @@
-//! The training loss (the paper, section "Training"; the weight of the width and the symmetry of the gripper are those
-//! of VGN's code, on which the paper builds).
+//! The training loss: the paper, section "Training". The weight of the width and the symmetry of the gripper are those
+//! of VGN's code, on which the paper builds.
 
 use grasp::VoxelOrigin;
-use grasp_data::{TURNS, Trial};
+use grasp_data::{DISTINCT_YAWS, Trial};
 use nalgebra::UnitQuaternion;
 use tch::{Kind, Reduction, TchError, Tensor};
 use thiserror::Error;
 
-use crate::execute::Outputs;
-use crate::settings::Quality;
+use crate::executor::NetworkOutputs;
+use crate::training_settings::QualityTarget;
 
 /// Weight of the width's squared error, voxels², relative to the other two parts. The paper's equation omits it.
 const WIDTH_WEIGHT: f64 = 0.01;
 
-/// The labelled voxels of a batch.
+/// The labelled voxels of a batch with their targets. The fields have one element per voxel.
 #[derive(Debug, Default)]
 pub struct Targets {
     /// Flat index into `[batch, N, N, N]`.
-    cells: Vec<i64>,
-    /// 1 for a success, 0 for a failure; the quality for a teacher's output.
+    voxels: Vec<i64>,
+    /// 1 for a success, 0 for a failure; for a teacher's output its quality.
     labels: Vec<f32>,
     /// Target of the quality: the label, or the success rate of the repetitions.
     qualities: Vec<f32>,
-    /// The valid rotations x y z w, each also rotated by 180° about its z; padded with the first.
-    rotations: Vec<[[[f32; 4]; 2]; TURNS]>,
+    /// The valid rotations, quaternions x y z w, each also rotated by 180° about its z; padded with the first.
+    rotations: Vec<[[[f32; 4]; 2]; DISTINCT_YAWS]>,
     /// Widths, voxels.
     widths: Vec<f32>,
 }
 
-/// Weights of the parts of the loss.
+/// Weights of the classes and of the rotation in the loss.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Weights {
+pub struct LossWeights {
     /// Weights of failures and of successes.
     pub classes: [f64; 2],
     /// Weight of the rotation.
     pub rotation: f64,
 }
 
-impl Default for Weights {
+impl Default for LossWeights {
     /// All weights are 1, as in the paper.
     fn default() -> Self {
         Self { classes: [1.0; 2], rotation: 1.0 }
@@ -49,12 +49,12 @@ pub struct Loss {
     /// The mean over the labelled voxels, to be minimised.
     pub mean: Tensor,
     /// Sums of its parts.
-    pub sums: Sums,
+    pub sums: LossSums,
 }
 
-/// Sums over labelled voxels, which can be added over batches.
+/// Sums over the labelled voxels of one or several batches.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Sums {
+pub struct LossSums {
     /// Labelled voxels.
     pub voxels: f64,
     /// Binary cross-entropy of the quality.
@@ -85,53 +85,53 @@ pub enum LossError {
 }
 
 impl Targets {
-    /// Adds a grasp in volume number `index` of the batch. A grasp outside the volume is ignored.
-    pub fn push(&mut self, index: usize, trial: &Trial, n: usize, origin: VoxelOrigin, quality: Quality) {
-        let Some(cell) = voxel_of(trial, n, origin) else { return };
-        self.cells.push((index * n.pow(3) + cell) as i64);
+    /// Adds a trial in volume `index` of the batch. `n` is N. A trial outside the volume is ignored.
+    pub fn push(&mut self, index: usize, trial: &Trial, n: usize, origin: VoxelOrigin, quality: QualityTarget) {
+        let Some(voxel) = voxel_of(trial, n, origin) else { return };
+        self.voxels.push((index * n.pow(3) + voxel) as i64);
         self.labels.push(f32::from(u8::from(trial.success)));
         self.qualities.push(quality.of(trial));
-        let both = |rotation: &UnitQuaternion<f64>| both_ways(rotation.coords.map(|c| c as f32).into());
-        let mut rotations = [both(&trial.rotation); TURNS];
-        trial.rotations().zip(&mut rotations).for_each(|(rotation, place)| *place = both(&rotation));
+        let symmetric = |rotation: &UnitQuaternion<f64>| symmetric_rotations(rotation.coords.map(|c| c as f32).into());
+        let mut rotations = [symmetric(&trial.rotation); DISTINCT_YAWS];
+        trial.rotations().zip(&mut rotations).for_each(|(rotation, place)| *place = symmetric(&rotation));
         self.rotations.push(rotations);
         self.widths.push(trial.width as f32);
     }
 
     /// Adds a teacher's output at a voxel: a quality in [0, 1], a quaternion x y z w, a width in voxels.
-    pub(crate) fn push_answer(&mut self, cell: usize, quality: f32, rotation: [f32; 4], width: f32) {
-        self.cells.push(cell as i64);
+    pub(crate) fn push_teacher_output(&mut self, voxel: usize, quality: f32, rotation: [f32; 4], width: f32) {
+        self.voxels.push(voxel as i64);
         self.labels.push(quality);
         self.qualities.push(quality);
-        self.rotations.push([both_ways(rotation); TURNS]);
+        self.rotations.push([symmetric_rotations(rotation); DISTINCT_YAWS]);
         self.widths.push(width);
     }
 
     /// Number of labelled voxels.
     #[must_use]
     pub fn len(&self) -> usize {
-        self.cells.len()
+        self.voxels.len()
     }
 
     /// The labelled voxels: flat indices into `[batch, N, N, N]`.
     #[must_use]
-    pub fn cells(&self) -> &[i64] {
-        &self.cells
+    pub fn voxels(&self) -> &[i64] {
+        &self.voxels
     }
 
     /// Whether there is no labelled voxel.
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        self.cells.is_empty()
+        self.voxels.is_empty()
     }
 
-    /// The loss of a network's outputs at [these voxels](Self::cells): L = c·(BCE(q, q*) + s·(ρ·(1 − max |r·r*|) +
+    /// The loss of a network's outputs at [these voxels](Self::voxels): L = c·(BCE(q, q*) + s·(ρ·(1 − max |r·r*|) +
     /// 0.01·(w − w*)²)), averaged over them. s is 1 for a success and 0 for a failure, c the weight of the class and ρ
-    /// that of the rotation. In the paper q* is s; see [`Quality`] for the alternative.
+    /// that of the rotation. In the paper q* is s; see [`QualityTarget`] for the alternative.
     ///
     /// # Errors
     /// [`LossError`] when outputs are NaN or of other voxels.
-    pub fn loss(&self, outputs: &Outputs, weights: &Weights) -> Result<Loss, LossError> {
+    pub fn loss(&self, outputs: &NetworkOutputs, weights: &LossWeights) -> Result<Loss, LossError> {
         let device = outputs.quality.device();
         let labels = Tensor::f_from_slice(&self.labels)?.to_device(device);
 
@@ -140,14 +140,14 @@ impl Targets {
             return Err(LossError::NotANumber);
         }
         let [failure, success] = weights.classes;
-        let of_voxels = &labels * (success - failure) + failure;
+        let voxel_weights = &labels * (success - failure) + failure;
         let expected = Tensor::f_from_slice(&self.qualities)?.to_device(device);
-        let quality_loss = quality.f_binary_cross_entropy(&expected, Some(&of_voxels), Reduction::Sum)?;
+        let quality_loss = quality.f_binary_cross_entropy(&expected, Some(&voxel_weights), Reduction::Sum)?;
 
-        let hold = self.rotations.as_flattened().as_flattened().as_flattened();
-        let hold = Tensor::f_from_slice(hold)?.to_device(device).f_reshape([-1, 2 * TURNS as i64, 4])?;
+        let valid = self.rotations.as_flattened().as_flattened().as_flattened();
+        let valid = Tensor::f_from_slice(valid)?.to_device(device).f_reshape([-1, 2 * DISTINCT_YAWS as i64, 4])?;
         let rotation = outputs.rotation.f_reshape([-1, 1, 4])?;
-        let cosines = rotation.f_mul(&hold)?.sum_dim_intlist(-1, false, None).abs();
+        let cosines = rotation.f_mul(&valid)?.sum_dim_intlist(-1, false, None).abs();
         let nearest = cosines.amax([1], false);
         let rotation_loss: Tensor = &labels * (1.0 - &nearest);
         let rotation_loss = rotation_loss.sum(None) * (success * weights.rotation);
@@ -160,7 +160,7 @@ impl Targets {
         let positive = quality.gt(0.5).to_kind(Kind::Float);
         let count = |tensor: Tensor| tensor.sum(None).double_value(&[]);
         let true_positives = count(&positive * &labels);
-        let sums = Sums {
+        let sums = LossSums {
             voxels: self.len() as f64,
             quality: quality_loss.double_value(&[]),
             rotation: rotation_loss.double_value(&[]),
@@ -174,12 +174,13 @@ impl Targets {
     }
 }
 
-/// A rotation x y z w, and the same rotated by 180° about its own z, q · (0, 0, 1, 0): the hand is symmetric.
-fn both_ways([x, y, z, w]: [f32; 4]) -> [[f32; 4]; 2] {
+/// A quaternion x y z w, and the same rotated by 180° about its own z, q · (0, 0, 1, 0): the hand is symmetric.
+fn symmetric_rotations([x, y, z, w]: [f32; 4]) -> [[f32; 4]; 2] {
     [[x, y, z, w], [y, -x, w, -z]]
 }
 
-/// The voxel of a grasp: the nearest index (VGN), or the voxel that contains it.
+/// The flat index of the voxel of a trial: the nearest index (VGN), or the voxel that contains the position. `None`
+/// outside the volume.
 fn voxel_of(trial: &Trial, n: usize, origin: VoxelOrigin) -> Option<usize> {
     let index = match origin {
         VoxelOrigin::Corner => trial.position.coords.map(f64::round),
@@ -189,7 +190,7 @@ fn voxel_of(trial: &Trial, n: usize, origin: VoxelOrigin) -> Option<usize> {
     inside.then(|| (index.x as usize * n + index.y as usize) * n + index.z as usize)
 }
 
-impl Sums {
+impl LossSums {
     /// Adds the sums of another batch.
     pub fn add(&mut self, other: &Self) {
         self.voxels += other.voxels;

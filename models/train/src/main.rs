@@ -1,19 +1,19 @@
 //! `grasp-train`: trains and exports networks.
 
-mod calibrate;
-mod classify;
+mod activation_ranges;
+mod classify_command;
 mod device;
-mod evaluate;
-mod export;
-mod run;
-mod time;
+mod eager_latency;
+mod external_evaluation;
+mod onnx_export;
+mod train_command;
 
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use grasp::RESOLUTION;
 use grasp_models::{Architecture, Orientation, gpd};
-use grasp_train::Quality;
+use grasp_train::QualityTarget;
 
 /// Train the networks of graspd in libtorch. Training executes the same ONNX graph that is served.
 #[derive(Parser)]
@@ -31,8 +31,8 @@ enum Command {
         #[arg(long)]
         network: String,
         /// Representation of the orientation that a grasp network regresses.
-        #[arg(long, value_enum, default_value_t = Regressed::Quaternion)]
-        orientation: Regressed,
+        #[arg(long, value_enum, default_value_t = OrientationArg::Quaternion)]
+        orientation: OrientationArg,
         /// Seed of the weights.
         #[arg(long, default_value_t = 0)]
         seed: u64,
@@ -41,25 +41,25 @@ enum Command {
         out: PathBuf,
     },
     /// Train a grasp network on data sets.
-    Train(Box<Training>),
+    Train(Box<TrainArgs>),
     /// Train GPD's classifier on labelled candidates.
-    Classify(classify::Classify),
+    Classify(classify_command::Classify),
     /// Convert a network to another precision.
-    Export(export::Export),
-    /// Measure the latency of a network in libtorch's eager mode, the usual way to run published networks.
-    Time(time::Time),
+    Export(onnx_export::Export),
+    /// Measure the latency of a network in libtorch's eager mode.
+    Time(eager_latency::EagerLatency),
 }
 
-/// Options of the training. Where VGN's training and the paper's differ, the default depends on the network.
+/// Options of the training. Some defaults depend on the network: those of VGN's code, or those of the paper.
 #[derive(Args)]
-struct Training {
+struct TrainArgs {
     /// Network to train from random weights: vgn, transformer or transformer-small.
     #[arg(long, required_unless_present = "from")]
     network: Option<String>,
-    /// Representation of the orientation that --network regresses: a quaternion, as published, or approach and closing
-    /// axes, which are continuous.
-    #[arg(long, value_enum, default_value_t = Regressed::Quaternion, conflicts_with = "from")]
-    orientation: Regressed,
+    /// Representation of the orientation that --network regresses: a quaternion, as published, or the approach and
+    /// closing axes, which are continuous.
+    #[arg(long, value_enum, default_value_t = OrientationArg::Quaternion, conflicts_with = "from")]
+    orientation: OrientationArg,
     /// Start from the weights of this model (fine-tuning).
     #[arg(long, conflicts_with = "network")]
     from: Option<PathBuf>,
@@ -110,10 +110,10 @@ struct Training {
     /// Share of the scenes used for validation.
     #[arg(long, default_value_t = 0.1)]
     val: f64,
-    /// Weights of the written model: the last, as in the paper, or the best by --evaluate, otherwise by the validation
-    /// loss.
-    #[arg(long, value_enum, default_value_t = Keep::Last)]
-    keep: Keep,
+    /// Weights of the written model: the last, as in the paper, or the best. The best are selected by --evaluate if it
+    /// is given, otherwise by the validation loss.
+    #[arg(long, value_enum, default_value_t = KeptWeights::Last)]
+    keep: KeptWeights,
     /// Evaluate the model with this command. {} is replaced by the model's file. The command must print JSON objects
     /// with `gsr` and `dr`, such as `grasp-sim bench --planner {} --rounds 40`.
     #[arg(long, value_name = "COMMAND")]
@@ -121,27 +121,27 @@ struct Training {
     /// Interval of --evaluate, epochs. The last epoch is always evaluated.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     evaluate_every: u64,
-    /// Stop after this many consecutive results that are not better than the best, by --evaluate, otherwise by the
-    /// validation loss.
+    /// Stop after this many consecutive results that are not better than the best. Results are those of --evaluate if it
+    /// is given, otherwise the validation loss.
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     patience: Option<u64>,
-    /// Point of a voxel that a grasp refers to: corner, as in VGN, or center, with which rotated and mirrored scenes
-    /// are exact [default: center, or that of the model of --from].
+    /// Position of a grasp in its voxel: corner, as in VGN, or center, with which rotated and mirrored scenes are exact
+    /// [default: center, or that of the model of --from].
     #[arg(long, value_enum)]
-    voxel_origin: Option<Origin>,
-    /// Data augmentation, comma-separated: turns about z, mirror images, shifts along z.
+    voxel_origin: Option<VoxelOriginArg>,
+    /// Data augmentation, comma-separated: rotations about z by multiples of 90°, mirror images, shifts along z.
     #[arg(long, value_enum, value_delimiter = ',')]
-    augment: Vec<Change>,
+    augment: Vec<AugmentArg>,
     /// Largest shift along z, voxels.
     #[arg(long, default_value_t = 2)]
     max_shift: u32,
     /// Give failures and successes the same total weight in the loss.
     #[arg(long)]
     balance: bool,
-    /// Target of the quality: label (success or failure), or share (the success rate of repetitions with small pose
-    /// errors). Both are the same for data without repetitions. Rotation and width do not depend on it.
-    #[arg(long, value_enum, default_value_t = Target::Label)]
-    quality: Target,
+    /// Target of the quality: label (1 for a success, 0 for a failure), or share (the success rate of repetitions with
+    /// small pose errors). Both are the same for data without repetitions. Rotation and width do not depend on it.
+    #[arg(long, value_enum, default_value_t = QualityTargetArg::Label)]
+    quality: QualityTargetArg,
     /// Weight of the rotation in the loss, relative to quality and width.
     #[arg(long, default_value_t = 1.0)]
     rotation_weight: f64,
@@ -156,7 +156,7 @@ struct Training {
     bf16: bool,
     /// Device: cpu, cuda, cuda:N, or auto (the first GPU if there is one).
     #[arg(long, default_value = "auto")]
-    device: device::Choice,
+    device: device::DeviceChoice,
     /// Name of the model in its metadata [default: the file's name].
     #[arg(long)]
     name: Option<String>,
@@ -169,52 +169,55 @@ struct Training {
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Keep {
+enum KeptWeights {
     Last,
     Best,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
-enum Regressed {
+enum OrientationArg {
     Quaternion,
     Axes,
 }
 
-impl From<Regressed> for Orientation {
-    fn from(regressed: Regressed) -> Self {
+impl From<OrientationArg> for Orientation {
+    fn from(regressed: OrientationArg) -> Self {
         match regressed {
-            Regressed::Quaternion => Self::Quaternion,
-            Regressed::Axes => Self::Axes,
+            OrientationArg::Quaternion => Self::Quaternion,
+            OrientationArg::Axes => Self::Axes,
         }
     }
 }
 
 #[derive(Clone, Copy, ValueEnum)]
-enum Target {
+enum QualityTargetArg {
     Label,
     Share,
 }
 
-impl From<Target> for Quality {
-    fn from(target: Target) -> Self {
+impl From<QualityTargetArg> for QualityTarget {
+    fn from(target: QualityTargetArg) -> Self {
         match target {
-            Target::Label => Self::Label,
-            Target::Share => Self::Share,
+            QualityTargetArg::Label => Self::Label,
+            QualityTargetArg::Share => Self::Share,
         }
     }
 }
 
 #[derive(Clone, Copy, ValueEnum)]
-enum Origin {
+enum VoxelOriginArg {
     Corner,
     Center,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Change {
-    Turns,
+enum AugmentArg {
+    Rotate,
     Mirror,
     Shift,
+    /// The former name of `rotate`.
+    #[value(hide = true)]
+    Turns,
 }
 
 fn main() -> anyhow::Result<()> {
@@ -224,7 +227,7 @@ fn main() -> anyhow::Result<()> {
             let model = network.parse::<Architecture>()?.build_with(RESOLUTION, orientation.into(), seed)?;
             Ok(model.write(&out)?)
         }
-        Command::Train(training) => run::train(&training),
+        Command::Train(training) => train_command::train(&training),
         Command::Classify(command) => command.run(),
         Command::Export(command) => command.run(),
         Command::Time(command) => command.run(),

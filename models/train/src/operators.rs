@@ -4,8 +4,8 @@ use grasp_models::onnx::{AttributeProto, NodeProto};
 use grasp_models::upsampled_taps;
 use tch::{Device, Kind, TchError, Tensor};
 
-use crate::execute::{ExecuteError, Execution, values_of};
-use crate::heads::cubes;
+use crate::executor::{ExecuteError, ExecutionOptions, values_of};
+use crate::pointwise::cubes;
 
 /// Supported operators with their supported attributes.
 const OPERATORS: &[(&str, &[&str])] = &[
@@ -44,32 +44,32 @@ pub(crate) fn supported() -> String {
 }
 
 /// Checks that the operator and its attributes are supported. Ignoring one of them would train a different network.
-pub(crate) fn check(node: &NodeProto) -> Result<(), ExecuteError> {
+pub(crate) fn check_supported(node: &NodeProto) -> Result<(), ExecuteError> {
     let (name, op) = (node.name().to_owned(), node.op_type().to_owned());
     let known = OPERATORS.iter().find(|(known, _)| *known == op && node.domain().is_empty());
-    let Some((_, settings)) = known else { return Err(ExecuteError::Operator { node: name, op }) };
-    match node.attribute.iter().find(|attribute| !settings.contains(&attribute.name())) {
+    let Some((_, attributes)) = known else { return Err(ExecuteError::Operator { node: name, op }) };
+    match node.attribute.iter().find(|attribute| !attributes.contains(&attribute.name())) {
         Some(unknown) => {
-            Err(ExecuteError::Setting { node: name, op, what: format!("the attribute `{}`", unknown.name()) })
+            Err(ExecuteError::Unsupported { node: name, op, what: format!("the attribute `{}`", unknown.name()) })
         }
         None => Ok(()),
     }
 }
 
 /// One node with its input values.
-pub(crate) struct Step<'a> {
+pub(crate) struct NodeCall<'a> {
     pub node: &'a NodeProto,
     pub inputs: Vec<Option<&'a Tensor>>,
-    pub execution: Execution,
+    pub execution: ExecutionOptions,
 }
 
-impl Step<'_> {
+impl NodeCall<'_> {
     /// Computes the outputs of the node.
     pub fn run(&self) -> Result<Vec<Tensor>, ExecuteError> {
-        let one = |result: Result<Tensor, TchError>| Ok(vec![result.map_err(|source| self.torch(source))?]);
+        let one = |result: Result<Tensor, TchError>| Ok(vec![result.map_err(|source| self.torch_error(source))?]);
         match self.node.op_type() {
             "Add" => one(self.input(0)?.f_add(self.input(1)?)),
-            "Clip" => one(self.input(0)?.f_clamp_tensor(self.optional(1), self.optional(2))),
+            "Clip" => one(self.input(0)?.f_clamp_tensor(self.optional_input(1), self.optional_input(2))),
             "Concat" => {
                 let values: Vec<&Tensor> = self.inputs.iter().copied().flatten().collect();
                 one(Tensor::f_cat(&values, self.int("axis", 0)))
@@ -78,7 +78,7 @@ impl Step<'_> {
             "ConvTranspose" => self.convolution(true),
             "Div" => one(self.input(0)?.f_div(self.input(1)?)),
             "Erf" => one(self.input(0)?.f_erf()),
-            "Expand" => one(self.input(0)?.f_broadcast_to(self.whole(1)?)),
+            "Expand" => one(self.input(0)?.f_broadcast_to(self.input_integers(1)?)),
             "Flatten" => {
                 let x = self.input(0)?;
                 let size = x.size();
@@ -91,7 +91,7 @@ impl Step<'_> {
                 one(x.f_instance_norm(Some(scale), Some(bias), None, None, true, 0.0, epsilon, false))
             }
             "LayerNormalization" => {
-                let [x, scale, bias] = [self.full(0)?, self.full(1)?, self.full(2)?];
+                let [x, scale, bias] = [self.input_f32(0)?, self.input_f32(1)?, self.input_f32(2)?];
                 let size = x.size();
                 let axis = self.axis("axis", -1, size.len())?;
                 one(x.f_layer_norm(&size[axis..], Some(scale), Some(bias), self.float("epsilon", 1e-5), false))
@@ -105,28 +105,29 @@ impl Step<'_> {
                     one(x.f_prelu(&Tensor::from(slope).to_kind(x.kind()).to_device(x.device())))
                 }
             }
-            "MatMul" => one(self.reduced(0)?.f_matmul(&self.reduced(1)?)),
+            "MatMul" => one(self.input_reduced(0)?.f_matmul(&self.input_reduced(1)?)),
             "MaxPool" => self.max_pool(),
             "Mul" => one(self.input(0)?.f_mul(self.input(1)?)),
             "ReduceL2" => {
                 // The axes are an attribute until opset 17 and an input since opset 18.
-                let axes = if self.optional(1).is_some() { self.whole(1)? } else { self.ints("axes", &[]) };
+                let axes =
+                    if self.optional_input(1).is_some() { self.input_integers(1)? } else { self.ints("axes", &[]) };
                 if axes.is_empty() && self.int("noop_with_empty_axes", 0) != 0 {
-                    return Err(self.setting("`noop_with_empty_axes`".to_owned()));
+                    return Err(self.unsupported("`noop_with_empty_axes`".to_owned()));
                 }
-                one(self.full(0)?.f_norm_scalaropt_dim(2, axes, self.int("keepdims", 1) != 0))
+                one(self.input_f32(0)?.f_norm_scalaropt_dim(2, axes, self.int("keepdims", 1) != 0))
             }
             "Relu" => one(self.input(0)?.f_relu()),
-            "Reshape" => one(self.input(0)?.f_reshape(self.new_shape()?)),
-            "Resize" => one(self.nearest()?),
+            "Reshape" => one(self.input(0)?.f_reshape(self.reshape_dims()?)),
+            "Resize" => one(self.resize_nearest()?),
             "Shape" => one(Tensor::f_from_slice(&self.input(0)?.size())),
-            "Sigmoid" => one(self.full(0)?.f_sigmoid()),
+            "Sigmoid" => one(self.input_f32(0)?.f_sigmoid()),
             "Slice" => self.slice(),
-            "Softmax" => one(self.full(0)?.f_softmax(self.int("axis", -1), Kind::Float)),
+            "Softmax" => one(self.input_f32(0)?.f_softmax(self.int("axis", -1), Kind::Float)),
             "Split" => {
-                let sizes = self.whole(1)?;
+                let sizes = self.input_integers(1)?;
                 let split = self.input(0)?.f_split_with_sizes(sizes, self.int("axis", 0));
-                split.map_err(|source| self.torch(source))
+                split.map_err(|source| self.torch_error(source))
             }
             "Sub" => one(self.input(0)?.f_sub(self.input(1)?)),
             "Transpose" => {
@@ -142,17 +143,21 @@ impl Step<'_> {
         // oneDNN's bf16 weight gradient reads uninitialized memory when a volume is narrower than the kernel.
         let narrow =
             self.input(0)?.size().iter().zip(self.input(1)?.size()).skip(2).any(|(size, kernel)| *size < kernel);
-        let [x, weight] = if narrow { [self.full(0)?, self.full(1)?] } else { [self.reduced(0)?, self.reduced(1)?] };
-        let bias = self.optional(2).map(|bias| bias.to_kind(x.kind()));
+        let [x, weight] = if narrow {
+            [self.input_f32(0)?, self.input_f32(1)?]
+        } else {
+            [self.input_reduced(0)?, self.input_reduced(1)?]
+        };
+        let bias = self.optional_input(2).map(|bias| bias.to_kind(x.kind()));
         let axes = weight.dim().saturating_sub(2);
         let (ones, zeros) = (vec![1; axes], vec![0; axes]);
         let pads = self.ints("pads", &[0].repeat(2 * axes));
         let (begin, end) = pads.split_at(axes);
         if begin != end {
-            return Err(self.setting(format!("a padding of {begin:?} before and {end:?} after")));
+            return Err(self.unsupported(format!("a padding of {begin:?} before and {end:?} after")));
         }
-        if !transposed && let Some(y) = self.patches(&x, &weight, bias.as_ref()) {
-            return Ok(vec![y.map_err(|source| self.torch(source))?]);
+        if !transposed && let Some(y) = self.patch_convolution(&x, &weight, bias.as_ref()) {
+            return Ok(vec![y.map_err(|source| self.torch_error(source))?]);
         }
         let y = x.f_convolution(
             &weight,
@@ -164,13 +169,18 @@ impl Step<'_> {
             &zeros,
             self.int("group", 1),
         );
-        Ok(vec![y.map_err(|source| self.torch(source))?])
+        Ok(vec![y.map_err(|source| self.torch_error(source))?])
     }
 
-    /// A convolution of one channel with adjacent, non-overlapping windows, computed as a matrix product. oneDNN's
-    /// convolution with 8³ windows took a fifth of the time of the transformer's convolutions. `None` for other
+    /// A convolution of one channel whose stride equals its kernel, computed as a matrix product. With oneDNN's
+    /// convolution, this patch embedding took a fifth of the time of the transformer's convolutions. `None` for other
     /// convolutions.
-    fn patches(&self, x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> Option<Result<Tensor, TchError>> {
+    fn patch_convolution(
+        &self,
+        x: &Tensor,
+        weight: &Tensor,
+        bias: Option<&Tensor>,
+    ) -> Option<Result<Tensor, TchError>> {
         let (&[batch, 1, size, height, width], &[channels, 1, edge, ..]) =
             (x.size().as_slice(), weight.size().as_slice())
         else {
@@ -194,7 +204,7 @@ impl Step<'_> {
     /// A convolution of the input after upsampling by 2, computed on the input before upsampling
     /// ([`grasp_models::upsampled_convolutions`]).
     pub fn convolution_before_upsampling(&self) -> Result<Tensor, ExecuteError> {
-        let (x, weight) = (self.reduced(0)?, self.input(1)?);
+        let (x, weight) = (self.input_reduced(0)?, self.input(1)?);
         let compute = || {
             let (channels, inputs, kernel, ..) = weight.size5()?;
             let (taps, small) = upsampled_taps(kernel as usize);
@@ -215,13 +225,13 @@ impl Step<'_> {
             let weight = weight.f_permute([2, 4, 6, 0, 1, 3, 5, 7])?;
             let weight = weight.f_reshape([8 * channels, inputs, small, small, small])?;
             let weight = self.execution.arrange(&weight).f_to_kind(x.kind())?;
-            let bias = self.optional(2).map(|bias| bias.f_repeat([8])?.f_to_kind(x.kind())).transpose()?;
+            let bias = self.optional_input(2).map(|bias| bias.f_repeat([8])?.f_to_kind(x.kind())).transpose()?;
             let y = x.f_conv3d(&weight, bias.as_ref(), [1; 3], [small / 2; 3], [1; 3], 1)?;
             let (batch, _, edge, ..) = y.size5()?;
-            let apart = y.f_reshape([batch, 2, 2, 2, channels, edge, edge, edge])?;
-            apart.f_permute([0, 4, 5, 1, 6, 2, 7, 3])?.f_reshape([batch, channels, 2 * edge, 2 * edge, 2 * edge])
+            let parts = y.f_reshape([batch, 2, 2, 2, channels, edge, edge, edge])?;
+            parts.f_permute([0, 4, 5, 1, 6, 2, 7, 3])?.f_reshape([batch, channels, 2 * edge, 2 * edge, 2 * edge])
         };
-        compute().map_err(|source| self.torch(source))
+        compute().map_err(|source| self.torch_error(source))
     }
 
     /// The maximum over windows of images.
@@ -229,98 +239,100 @@ impl Step<'_> {
         let x = self.input(0)?;
         let kernel = self.ints("kernel_shape", &[]);
         if x.dim() != 4 || kernel.len() != 2 {
-            return Err(self.setting(format!("a window of {kernel:?} over {:?}", x.size())));
+            return Err(self.unsupported(format!("a window of {kernel:?} over {:?}", x.size())));
         }
         let pads = self.ints("pads", &[0; 4]);
         let (begin, end) = pads.split_at(2);
         if begin != end {
-            return Err(self.setting(format!("a padding of {begin:?} before and {end:?} after")));
+            return Err(self.unsupported(format!("a padding of {begin:?} before and {end:?} after")));
         }
         let (strides, dilations) = (self.ints("strides", &[1; 2]), self.ints("dilations", &[1; 2]));
         let y = x.f_max_pool2d(kernel, strides, begin, dilations, self.int("ceil_mode", 0) != 0);
-        Ok(vec![y.map_err(|source| self.torch(source))?])
+        Ok(vec![y.map_err(|source| self.torch_error(source))?])
     }
 
-    /// A size-preserving convolution at some voxels: `[voxels, channels, 1, 1, 1]`. It is computed in f32.
-    pub fn convolution_at(&self, cells: &[i64]) -> Result<Tensor, ExecuteError> {
+    /// A convolution that preserves the size, only at `voxels`, which are flat indices into `[batch, N, N, N]`. Returns
+    /// `[voxels.len(), channels, 1, 1, 1]`, computed in f32.
+    pub fn convolution_at(&self, voxels: &[i64]) -> Result<Tensor, ExecuteError> {
         let (x, weight) = (self.input(0)?, self.input(1)?);
         let edge = weight.size().last().copied().unwrap_or(1);
         // Channels are the fastest axis, as in `cubes`.
         let compute = || {
             let weight = weight.f_permute([0, 2, 3, 4, 1])?.f_reshape([weight.size()[0], -1])?;
-            let y = cubes(x, cells, edge)?.f_linear(&weight, self.optional(2))?;
-            y.f_reshape([cells.len() as i64, -1, 1, 1, 1])
+            let y = cubes(x, voxels, edge)?.f_linear(&weight, self.optional_input(2))?;
+            y.f_reshape([voxels.len() as i64, -1, 1, 1, 1])
         };
-        compute().map_err(|source| self.torch(source))
+        compute().map_err(|source| self.torch_error(source))
     }
 
     /// Nearest-neighbour upsampling: the modes of `Resize` that libtorch's `nearest` supports.
-    fn nearest(&self) -> Result<Result<Tensor, TchError>, ExecuteError> {
+    fn resize_nearest(&self) -> Result<Result<Tensor, TchError>, ExecuteError> {
         for (name, expected) in
             [("mode", "nearest"), ("coordinate_transformation_mode", "asymmetric"), ("nearest_mode", "floor")]
         {
             let got = self.node.attribute(name).map(AttributeProto::s).unwrap_or_default();
             if got != expected.as_bytes() {
                 let got = String::from_utf8_lossy(got);
-                return Err(self.setting(format!("{name} `{got}` (only `{expected}`)")));
+                return Err(self.unsupported(format!("{name} `{got}` (only `{expected}`)")));
             }
         }
         let x = self.input(0)?;
-        let size = match (self.optional(2).filter(|scales| scales.numel() > 0), self.optional(3)) {
+        let size = match (self.optional_input(2).filter(|scales| scales.numel() > 0), self.optional_input(3)) {
             (Some(scales), _) => {
                 let scales = values_of(scales);
                 x.size().iter().zip(scales).map(|(&size, scale)| (size as f32 * scale).floor() as i64).collect()
             }
-            (None, Some(_)) => self.whole(3)?,
-            (None, None) => return Err(self.setting("neither scales nor sizes".to_owned())),
+            (None, Some(_)) => self.input_integers(3)?,
+            (None, None) => return Err(self.unsupported("neither scales nor sizes".to_owned())),
         };
         if x.dim() != 5 || size.len() != 5 || size[..2] != x.size()[..2] {
-            return Err(self.setting(format!("resizing {:?} to {size:?}", x.size())));
+            return Err(self.unsupported(format!("resizing {:?} to {size:?}", x.size())));
         }
         Ok(x.f_upsample_nearest3d(&size[2..], None, None, None))
     }
 
     fn slice(&self) -> Result<Vec<Tensor>, ExecuteError> {
         let mut x = self.input(0)?.shallow_clone();
-        let [starts, ends] = [self.whole(1)?, self.whole(2)?];
-        let axes = if self.optional(3).is_some() { self.whole(3)? } else { (0..starts.len() as i64).collect() };
-        let steps = if self.optional(4).is_some() { self.whole(4)? } else { vec![1; starts.len()] };
+        let [starts, ends] = [self.input_integers(1)?, self.input_integers(2)?];
+        let axes =
+            if self.optional_input(3).is_some() { self.input_integers(3)? } else { (0..starts.len() as i64).collect() };
+        let steps = if self.optional_input(4).is_some() { self.input_integers(4)? } else { vec![1; starts.len()] };
         for (((axis, start), end), step) in axes.into_iter().zip(starts).zip(ends).zip(steps) {
-            x = x.f_slice(axis, start, end, step).map_err(|source| self.torch(source))?;
+            x = x.f_slice(axis, start, end, step).map_err(|source| self.torch_error(source))?;
         }
         Ok(vec![x])
     }
 
     /// The target shape of a `Reshape`; 0 keeps the size of the input.
-    fn new_shape(&self) -> Result<Vec<i64>, ExecuteError> {
+    fn reshape_dims(&self) -> Result<Vec<i64>, ExecuteError> {
         let size = self.input(0)?.size();
-        let shape = self.whole(1)?.into_iter().enumerate();
+        let shape = self.input_integers(1)?.into_iter().enumerate();
         Ok(shape.map(|(axis, dim)| if dim == 0 { size.get(axis).copied().unwrap_or(0) } else { dim }).collect())
     }
 
-    fn optional(&self, index: usize) -> Option<&Tensor> {
+    fn optional_input(&self, index: usize) -> Option<&Tensor> {
         self.inputs.get(index).copied().flatten()
     }
 
     fn input(&self, index: usize) -> Result<&Tensor, ExecuteError> {
-        self.optional(index).ok_or_else(|| self.setting(format!("omitting input {index}")))
+        self.optional_input(index).ok_or_else(|| self.unsupported(format!("omitting input {index}")))
     }
 
     /// An input in f32, for operators that lose accuracy in bf16.
-    fn full(&self, index: usize) -> Result<Tensor, ExecuteError> {
+    fn input_f32(&self, index: usize) -> Result<Tensor, ExecuteError> {
         Ok(self.input(index)?.to_kind(Kind::Float))
     }
 
     /// An input in the precision of convolutions and matrix products.
-    fn reduced(&self, index: usize) -> Result<Tensor, ExecuteError> {
+    fn input_reduced(&self, index: usize) -> Result<Tensor, ExecuteError> {
         let kind = if self.execution.bf16 { Kind::BFloat16 } else { Kind::Float };
         Ok(self.input(index)?.to_kind(kind))
     }
 
     /// An input of integers.
-    fn whole(&self, index: usize) -> Result<Vec<i64>, ExecuteError> {
+    fn input_integers(&self, index: usize) -> Result<Vec<i64>, ExecuteError> {
         let tensor = self.input(index)?;
-        Vec::<i64>::try_from(tensor.to_device(Device::Cpu)).map_err(|source| self.torch(source))
+        Vec::<i64>::try_from(tensor.to_device(Device::Cpu)).map_err(|source| self.torch_error(source))
     }
 
     fn int(&self, name: &str, default: i64) -> i64 {
@@ -339,14 +351,17 @@ impl Step<'_> {
     fn axis(&self, name: &str, default: i64, dims: usize) -> Result<usize, ExecuteError> {
         let axis = self.int(name, default);
         let from_start = if axis < 0 { axis + dims as i64 } else { axis };
-        usize::try_from(from_start).ok().filter(|&axis| axis < dims).ok_or_else(|| self.setting(format!("axis {axis}")))
+        usize::try_from(from_start)
+            .ok()
+            .filter(|&axis| axis < dims)
+            .ok_or_else(|| self.unsupported(format!("axis {axis}")))
     }
 
-    fn setting(&self, what: String) -> ExecuteError {
-        ExecuteError::Setting { node: self.node.name().to_owned(), op: self.node.op_type().to_owned(), what }
+    fn unsupported(&self, what: String) -> ExecuteError {
+        ExecuteError::Unsupported { node: self.node.name().to_owned(), op: self.node.op_type().to_owned(), what }
     }
 
-    fn torch(&self, source: TchError) -> ExecuteError {
+    fn torch_error(&self, source: TchError) -> ExecuteError {
         ExecuteError::Torch { node: self.node.name().to_owned(), op: self.node.op_type().to_owned(), source }
     }
 }

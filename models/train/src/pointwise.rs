@@ -1,8 +1,8 @@
 //! Finds the part of a graph that can be computed at single voxels.
 //!
-//! Only labelled voxels, a few dozen of 64,000, enter the loss. After its last convolutions, the heads, a grasp network
-//! is pointwise. Therefore training computes the heads only at labelled voxels. The result is the same. For VGN the
-//! heads at all voxels would take most of the time of a step.
+//! Only labelled voxels, a few dozen of 64,000, enter the loss. A grasp network is pointwise after its last convolutions,
+//! the heads. Training therefore computes the heads only at labelled voxels, with the same result. In VGN the heads at
+//! all voxels would take most of the time of a step.
 
 use std::collections::HashSet;
 
@@ -10,26 +10,26 @@ use grasp_models::onnx::{GraphProto, NodeProto};
 use tch::{Kind, TchError, Tensor};
 
 /// Indices of the convolutions after which the graph is pointwise; empty if the graph has no such structure.
-pub(crate) fn heads(graph: &GraphProto) -> HashSet<usize> {
-    // Backwards from the outputs: values that a node reads at more voxels than the one it computes.
-    let mut whole: HashSet<&str> = HashSet::new();
-    let (mut heads, mut behind) = (HashSet::new(), HashSet::new());
+pub(crate) fn head_convolutions(graph: &GraphProto) -> HashSet<usize> {
+    // Backwards from the outputs: values that are needed at more voxels than the computed one.
+    let mut neighborhood: HashSet<&str> = HashSet::new();
+    let (mut heads, mut pointwise) = (HashSet::new(), HashSet::new());
     for (index, node) in graph.node.iter().enumerate().rev() {
-        let single = !node.output.iter().any(|output| whole.contains(output.as_str()));
+        let single = !node.output.iter().any(|output| neighborhood.contains(output.as_str()));
         if single && is_pointwise(graph, node) {
-            behind.insert(index);
+            pointwise.insert(index);
             continue;
         }
         if single && is_head(node) {
             heads.insert(index);
         }
-        whole.extend(node.input.iter().map(String::as_str));
+        neighborhood.extend(node.input.iter().map(String::as_str));
     }
     // All nodes after the heads, and all outputs, must depend only on the heads and on constants.
     let mut known: HashSet<&str> = graph.initializer.iter().map(|tensor| tensor.name()).collect();
     for (index, node) in graph.node.iter().enumerate() {
-        let fits = !behind.contains(&index) || node.input.iter().all(|input| known.contains(input.as_str()));
-        if fits && (behind.contains(&index) || heads.contains(&index) || node.op_type() == "Constant") {
+        let fits = !pointwise.contains(&index) || node.input.iter().all(|input| known.contains(input.as_str()));
+        if fits && (pointwise.contains(&index) || heads.contains(&index) || node.op_type() == "Constant") {
             known.extend(node.output.iter().map(String::as_str));
         }
     }
@@ -49,7 +49,7 @@ fn constant(graph: &GraphProto, name: &str) -> Option<Vec<i64>> {
     value.to_i64().ok()
 }
 
-/// Whether the node is a size-preserving convolution with stride 1.
+/// Whether the node is a convolution with stride 1 that preserves the size.
 fn is_head(node: &NodeProto) -> bool {
     let kernel = ints(node, "kernel_shape");
     node.op_type() == "Conv"
@@ -73,28 +73,30 @@ fn is_pointwise(graph: &GraphProto, node: &NodeProto) -> bool {
     }
 }
 
-/// The cubes of `edge`³ voxels around some voxels of `x` `[batch, channels, N, N, N]`, padded with zeros:
-/// `[voxels, edge³ · channels]`, channels fastest. `cells` are flat indices into `[batch, N, N, N]`.
-pub(crate) fn cubes(x: &Tensor, cells: &[i64], edge: i64) -> Result<Tensor, TchError> {
+/// The cubes of `edge`³ voxels around `voxels` of `x` `[batch, channels, N, N, N]`, padded with zeros: `[voxels.len(),
+/// edge³ · channels]`, channels fastest. `voxels` are flat indices into `[batch, N, N, N]`.
+pub(crate) fn cubes(x: &Tensor, voxels: &[i64], edge: i64) -> Result<Tensor, TchError> {
     let (_, channels, depth, height, width) = x.size5()?;
     let reach = edge / 2;
-    let size = cells.len() * edge.pow(3) as usize;
+    let size = voxels.len() * edge.pow(3) as usize;
     let (mut rows, mut inside) = (Vec::with_capacity(size), Vec::with_capacity(size));
-    for &cell in cells {
-        let (volume, [cx, cy, cz]) =
-            (cell / (depth * height * width), [cell / (height * width) % depth, cell / width % height, cell % width]);
+    for &voxel in voxels {
+        let (volume, [cx, cy, cz]) = (
+            voxel / (depth * height * width),
+            [voxel / (height * width) % depth, voxel / width % height, voxel % width],
+        );
         for x in cx - reach..=cx + reach {
             for y in cy - reach..=cy + reach {
                 for z in cz - reach..=cz + reach {
-                    let there = (0..depth).contains(&x) && (0..height).contains(&y) && (0..width).contains(&z);
-                    rows.push(if there { ((volume * depth + x) * height + y) * width + z } else { 0 });
-                    inside.push(there);
+                    let is_inside = (0..depth).contains(&x) && (0..height).contains(&y) && (0..width).contains(&z);
+                    rows.push(if is_inside { ((volume * depth + x) * height + y) * width + z } else { 0 });
+                    inside.push(is_inside);
                 }
             }
         }
     }
     let rows = Tensor::f_from_slice(&rows)?.f_to_device(x.device())?;
     let inside = Tensor::f_from_slice(&inside)?.f_to_device(x.device())?.to_kind(Kind::Float).f_unsqueeze(1)?;
-    let voxels = x.f_permute([0, 2, 3, 4, 1])?.f_reshape([-1, channels])?;
-    (voxels.f_index_select(0, &rows)? * inside).f_reshape([cells.len() as i64, -1])
+    let features = x.f_permute([0, 2, 3, 4, 1])?.f_reshape([-1, channels])?;
+    (features.f_index_select(0, &rows)? * inside).f_reshape([voxels.len() as i64, -1])
 }

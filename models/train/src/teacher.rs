@@ -1,7 +1,8 @@
 //! Distillation of a trained network (Hinton et al., "Distilling the Knowledge in a Neural Network").
 //!
 //! Trials label a few dozen voxels of a scene; a trained network has an output at every voxel. With random rotations
-//! and mirror images the student learns the mean of the teacher's outputs, which is better than a single output.
+//! and mirror images of the scenes, the student is trained on the mean of the teacher's outputs, which is more accurate
+//! than a single output.
 
 use grasp::{Volume, VolumeError, WORKSPACE_SIZE};
 use grasp_models::{Metadata, Network, RuntimeError};
@@ -11,12 +12,12 @@ use thiserror::Error;
 
 use crate::loss::Targets;
 
-/// Mean number of voxels of a volume that are used. They are drawn again in every step, because the heads at all voxels
-/// would take most of the time.
+/// Mean number of voxels of a volume whose outputs are used. They are drawn again in every step. Computing the student's
+/// heads at all voxels would take most of the time of a step.
 const VOXELS: f64 = 400.0;
 
-/// Relative probability to draw a voxel with quality 0, against 1 + this for quality 1.
-const FLOOR: f64 = 0.05;
+/// A voxel of quality q is drawn with a probability proportional to q + this.
+const QUALITY_OFFSET: f64 = 0.05;
 
 /// Why a teacher failed.
 #[derive(Debug, Error)]
@@ -29,7 +30,8 @@ pub enum TeacherError {
     Runtime(#[from] RuntimeError),
 }
 
-/// A trained network whose outputs are targets at voxels without trials. It runs in ONNX Runtime.
+/// A trained network whose outputs are targets at voxels without trials. It runs in ONNX Runtime, on the thread that
+/// reads the batches.
 pub struct Teacher {
     network: Network,
     weight: f64,
@@ -53,32 +55,33 @@ impl Teacher {
         format!("taught by {name} {version} ({}) at {}", self.network.backend(), self.weight)
     }
 
-    /// Adds the teacher's outputs at voxels drawn in front of the surfaces of a volume `[N, N, N]`. `index` is its
-    /// index in the batch.
-    pub(crate) fn answer(
+    /// Adds the teacher's outputs at random voxels in front of the surfaces of a volume `[N, N, N]`. `index` is the index
+    /// of the volume in the batch.
+    pub(crate) fn add_targets(
         &mut self,
         index: usize,
         values: &[f32],
         rng: &mut impl Rng,
-        answers: &mut Targets,
+        targets: &mut Targets,
     ) -> Result<(), TeacherError> {
-        // Voxels in front of surfaces, where grasps are tried. The teacher was not trained on the inside of objects,
-        // and 0 means unobserved or not near a surface.
-        let near = || (0..values.len()).filter(|&cell| values[cell] > 0.5);
-        if near().next().is_none() {
+        // Grasps are tried in front of surfaces, where values are above 0.5. The teacher was not trained on the inside
+        // of objects. 0 is unobserved or further than the truncation distance from a surface.
+        let candidates = || (0..values.len()).filter(|&voxel| values[voxel] > 0.5);
+        if candidates().next().is_none() {
             return Ok(());
         }
         let resolution = self.network.metadata().resolution;
-        // Size and pose are arbitrary, because the network's output is in voxels.
+        // Voxel size and pose have no effect, because the network's output is in voxels.
         let voxel_size = WORKSPACE_SIZE / resolution as f64;
         let volume = Volume::new(resolution, voxel_size, Isometry3::identity(), values.to_vec())?;
         let output = self.network.infer(&[&volume])?;
         let maps = output.maps(0);
-        let chance = |cell: usize| FLOOR + f64::from(maps.quality[cell]);
-        let all: f64 = near().map(chance).sum();
-        for cell in near().filter(|&cell| rng.random_bool((VOXELS * chance(cell) / all).clamp(0.0, 1.0))) {
-            let rotation = std::array::from_fn(|axis| maps.rotation[axis * values.len() + cell]);
-            answers.push_answer(index * values.len() + cell, maps.quality[cell], rotation, maps.width[cell]);
+        let probability = |voxel: usize| QUALITY_OFFSET + f64::from(maps.quality[voxel]);
+        let sum: f64 = candidates().map(probability).sum();
+        for voxel in candidates().filter(|&voxel| rng.random_bool((VOXELS * probability(voxel) / sum).clamp(0.0, 1.0)))
+        {
+            let rotation = std::array::from_fn(|axis| maps.rotation[axis * values.len() + voxel]);
+            targets.push_teacher_output(index * values.len() + voxel, maps.quality[voxel], rotation, maps.width[voxel]);
         }
         Ok(())
     }

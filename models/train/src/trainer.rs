@@ -10,14 +10,14 @@ use tch::{TchError, Tensor, no_grad};
 use thiserror::Error;
 
 use crate::adam::Adam;
-use crate::average::Average;
 use crate::batch::{Batch, Example, read_ahead};
 use crate::checkpoint::{Checkpoint, CheckpointError};
-use crate::execute::{ExecuteError, Execution, Executor};
-use crate::loss::{Loss, LossError, Sums, Weights};
-use crate::record::{Record, Validation};
-use crate::settings::Settings;
+use crate::epoch_record::{EpochRecord, Validation};
+use crate::executor::{ExecuteError, ExecutionOptions, Executor};
+use crate::loss::{Loss, LossError, LossSums, LossWeights};
 use crate::teacher::{Teacher, TeacherError};
+use crate::training_settings::TrainingSettings;
+use crate::weight_average::WeightAverage;
 
 /// Why training stopped.
 #[derive(Debug, Error)]
@@ -53,32 +53,32 @@ pub enum TrainError {
 
 /// How [`Trainer::epoch`] ended.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Epoch {
-    /// Complete.
-    Done(Record),
+pub enum EpochOutcome {
+    /// All scenes were used.
+    Completed(EpochRecord),
     /// Stopped after a step; the next call continues.
     Interrupted,
 }
 
 /// A training run: network, optimizer, data and progress.
 pub struct Trainer {
-    settings: Settings,
+    settings: TrainingSettings,
     dataset: Dataset,
     training: Vec<usize>,
     validation: Vec<usize>,
-    weights: Weights,
-    /// Must be the same for a run to be resumed.
+    weights: LossWeights,
+    /// A run can only be resumed with the same text.
     fingerprint: String,
     executor: Executor,
     teacher: Option<Teacher>,
     /// Weight of the teacher's outputs in the loss.
-    teaching: f64,
+    teacher_weight: f64,
     adam: Adam,
-    average: Option<Average>,
+    average: Option<WeightAverage>,
     /// Completed epochs, completed batches of the current epoch, and their losses.
     epoch: u64,
     batch: u64,
-    sums: Sums,
+    sums: LossSums,
 }
 
 impl Trainer {
@@ -89,27 +89,27 @@ impl Trainer {
     pub fn new(
         model: ModelProto,
         dataset: Dataset,
-        settings: Settings,
-        execution: Execution,
+        settings: TrainingSettings,
+        execution: ExecutionOptions,
     ) -> Result<Self, TrainError> {
         let executor = Executor::new(model, execution)?;
         let adam = Adam::new(executor.parameters(), settings.weight_decay);
-        let average = settings.average.map(|decay| Average::new(decay, executor.parameters()));
+        let average = settings.average.map(|decay| WeightAverage::new(decay, executor.parameters()));
         let mut trainer = Self {
             settings,
             dataset,
             training: Vec::new(),
             validation: Vec::new(),
-            weights: Weights::default(),
+            weights: LossWeights::default(),
             fingerprint: String::new(),
             executor,
             teacher: None,
-            teaching: 0.0,
+            teacher_weight: 0.0,
             adam,
             average,
             epoch: 0,
             batch: 0,
-            sums: Sums::default(),
+            sums: LossSums::default(),
         };
         trainer.update_scenes()?;
         Ok(trainer)
@@ -117,12 +117,12 @@ impl Trainer {
 
     /// Adds a teacher to the run.
     #[must_use]
-    pub fn taught_by(self, teacher: Teacher) -> Self {
+    pub fn with_teacher(self, teacher: Teacher) -> Self {
         let fingerprint = format!("{}, {}", self.fingerprint, teacher.fingerprint());
-        Self { teaching: teacher.weight(), teacher: Some(teacher), fingerprint, ..self }
+        Self { teacher_weight: teacher.weight(), teacher: Some(teacher), fingerprint, ..self }
     }
 
-    /// Reads scenes that were added to the data and returns their number. Has no effect within an epoch.
+    /// Reads scenes that were added to the data since and returns their number. Within an epoch it does nothing.
     ///
     /// # Errors
     /// [`TrainError::Data`] when a file is damaged.
@@ -140,7 +140,7 @@ impl Trainer {
     /// Updates everything that depends on the scenes.
     fn update_scenes(&mut self) -> Result<(), TrainError> {
         let (training, validation) = self.dataset.split(self.settings.validation);
-        let Settings { batch, accumulate, .. } = self.settings;
+        let TrainingSettings { batch, accumulate, .. } = self.settings;
         if training.is_empty() || batch == 0 || accumulate == 0 {
             let (scenes, held_out) = (self.dataset.len(), validation.len());
             let reason = format!(
@@ -150,7 +150,7 @@ impl Trainer {
             return Err(TrainError::Settings(reason));
         }
         let classes = if self.settings.balance { class_weights(&self.dataset, &training)? } else { [1.0; 2] };
-        self.weights = Weights { classes, rotation: self.settings.rotation_weight };
+        self.weights = LossWeights { classes, rotation: self.settings.rotation_weight };
         self.fingerprint = self.settings.fingerprint(&self.dataset, training.len(), validation.len());
         if let Some(teacher) = &self.teacher {
             self.fingerprint += &format!(", {}", teacher.fingerprint());
@@ -186,18 +186,18 @@ impl Trainer {
     /// Steps in an epoch.
     #[must_use]
     pub fn steps_per_epoch(&self) -> u64 {
-        let Settings { batch, accumulate, .. } = self.settings;
+        let TrainingSettings { batch, accumulate, .. } = self.settings;
         self.training.len().div_ceil(batch).div_ceil(accumulate) as u64
     }
 
     /// The current network, with the average of the weights if there is one.
     #[must_use]
     pub fn model(&mut self) -> ModelProto {
-        self.averaged(|trainer| trainer.executor.to_model())
+        self.with_average(|trainer| trainer.executor.to_model())
     }
 
-    /// Calls `work` with the average of the weights, if there is one.
-    fn averaged<R>(&mut self, work: impl FnOnce(&Self) -> R) -> R {
+    /// Calls `work` while the network has the average of the weights, if there is one.
+    fn with_average<R>(&mut self, work: impl FnOnce(&Self) -> R) -> R {
         if let Some(average) = &mut self.average {
             average.swap(self.executor.parameters());
         }
@@ -219,7 +219,7 @@ impl Trainer {
             scenes: self.dataset.sizes().into_iter().map(|size| size as u64).collect(),
             ..Checkpoint::default()
         };
-        checkpoint.keep(&self.executor, &self.adam, self.average.as_ref());
+        checkpoint.store(&self.executor, &self.adam, self.average.as_ref());
         checkpoint
     }
 
@@ -228,16 +228,16 @@ impl Trainer {
     /// # Errors
     /// [`TrainError::Checkpoint`] when the checkpoint belongs to another run or is incomplete.
     pub fn resume(&mut self, checkpoint: &Checkpoint) -> Result<(), TrainError> {
-        let known: Vec<usize> = checkpoint.scenes.iter().map(|&size| size as usize).collect();
-        if known.len() == self.dataset.sizes().len() && known != self.dataset.sizes() {
-            self.dataset.limit(&known);
+        let sizes: Vec<usize> = checkpoint.scenes.iter().map(|&size| size as usize).collect();
+        if sizes.len() == self.dataset.sizes().len() && sizes != self.dataset.sizes() {
+            self.dataset.limit(&sizes);
             self.update_scenes()?;
         }
         if checkpoint.settings != self.fingerprint {
             let (theirs, ours) = (checkpoint.settings.clone(), self.fingerprint.clone());
             return Err(CheckpointError::Settings { theirs, ours }.into());
         }
-        let sums = Sums::from_list(&checkpoint.sums).ok_or(CheckpointError::Sums(checkpoint.sums.len()))?;
+        let sums = LossSums::from_list(&checkpoint.sums).ok_or(CheckpointError::Sums(checkpoint.sums.len()))?;
         checkpoint.restore(&self.executor, &mut self.adam, self.average.as_ref())?;
         self.epoch = checkpoint.epoch;
         self.batch = checkpoint.batch;
@@ -245,46 +245,47 @@ impl Trainer {
         Ok(())
     }
 
-    /// Trains for the rest of an epoch, or until `stop` is set. After every step it calls `report` with the number of
-    /// steps of the epoch and its mean loss.
+    /// Trains until the end of the epoch, or until `stop` is set. After every step it calls `report` with the number of
+    /// completed steps of the epoch and their mean loss.
     ///
     /// # Errors
     /// [`TrainError`] when the network or the loss fails.
-    pub fn epoch(&mut self, stop: &AtomicBool, mut report: impl FnMut(u64, f64)) -> Result<Epoch, TrainError> {
+    pub fn epoch(&mut self, stop: &AtomicBool, mut report: impl FnMut(u64, f64)) -> Result<EpochOutcome, TrainError> {
         let start = Instant::now();
         let plan = self.plan();
-        let Settings { batch, accumulate, voxel_origin: origin, quality, .. } = self.settings;
+        let TrainingSettings { batch, accumulate, voxel_origin: origin, quality, .. } = self.settings;
         let plan: Vec<&[Example]> = plan.chunks(batch).skip(self.batch as usize).collect();
         let mut volumes = 0;
         let mut learning_rate = 0.0;
-        // Moved out of `self`, because the steps borrow `self` mutably. Restored below.
-        let dataset = std::mem::replace(&mut self.dataset, Dataset::none());
+        // Moved out of `self`, because the steps borrow `self` mutably, and moved back below.
+        let dataset = std::mem::replace(&mut self.dataset, Dataset::empty());
         let mut teacher = self.teacher.take();
-        let answers = teacher.as_mut();
-        let done: Result<bool, TrainError> = read_ahead(&dataset, &plan, origin, quality, answers, |mut batches| {
-            let mut left = plan.len();
-            while left > 0 {
-                if stop.load(Ordering::Relaxed) {
-                    return Ok(false);
+        let batch_teacher = teacher.as_mut();
+        let done: Result<bool, TrainError> =
+            read_ahead(&dataset, &plan, origin, quality, batch_teacher, |mut batches| {
+                let mut remaining = plan.len();
+                while remaining > 0 {
+                    if stop.load(Ordering::Relaxed) {
+                        return Ok(false);
+                    }
+                    let passes = accumulate.min(remaining);
+                    learning_rate = self.settings.learning_rate_at(self.steps(), self.steps_per_epoch());
+                    volumes += self.step(batches.by_ref().take(passes), passes, learning_rate)?;
+                    remaining -= passes;
+                    self.batch += passes as u64;
+                    report(self.batch.div_ceil(accumulate as u64), self.sums.loss());
                 }
-                let passes = accumulate.min(left);
-                learning_rate = self.settings.learning_rate_at(self.steps(), self.steps_per_epoch());
-                volumes += self.step(batches.by_ref().take(passes), passes, learning_rate)?;
-                left -= passes;
-                self.batch += passes as u64;
-                report(self.batch.div_ceil(accumulate as u64), self.sums.loss());
-            }
-            Ok(true)
-        });
+                Ok(true)
+            });
         (self.dataset, self.teacher) = (dataset, teacher);
         if !done? {
-            return Ok(Epoch::Interrupted);
+            return Ok(EpochOutcome::Interrupted);
         }
         let seconds = start.elapsed().as_secs_f64();
         let sums = std::mem::take(&mut self.sums);
         self.epoch += 1;
         self.batch = 0;
-        Ok(Epoch::Done(Record {
+        Ok(EpochOutcome::Completed(EpochRecord {
             epoch: self.epoch,
             steps: self.steps(),
             learning_rate,
@@ -292,8 +293,8 @@ impl Trainer {
             loss_quality: sums.quality / sums.voxels,
             loss_rotation: sums.rotation / sums.voxels,
             loss_width: sums.width / sums.voxels,
-            validation: self.averaged(Self::validate)?,
-            success: None,
+            validation: self.with_average(Self::validate)?,
+            benchmark: None,
             seconds,
             volumes_per_second: volumes as f64 / seconds,
         }))
@@ -330,41 +331,41 @@ impl Trainer {
     /// The results on the validation scenes, without augmentation; `None` if there are none.
     fn validate(&self) -> Result<Option<Validation>, TrainError> {
         let scenes: Vec<_> = self.validation.iter().map(|&scene| Example { scene, ..Example::default() }).collect();
-        let Settings { batch, voxel_origin, quality, .. } = self.settings;
+        let TrainingSettings { batch, voxel_origin, quality, .. } = self.settings;
         let plan: Vec<&[Example]> = scenes.chunks(batch).collect();
         read_ahead(&self.dataset, &plan, voxel_origin, quality, None, |batches| {
-            let mut sums = Sums::default();
+            let mut sums = LossSums::default();
             for batch in batches {
                 if let Some(loss) = no_grad(|| self.loss(&batch?))? {
                     sums.add(&loss.sums);
                 }
             }
-            Ok(Validation::of(&sums))
+            Ok(Validation::from_sums(&sums))
         })
     }
 
-    /// The order of an epoch's scenes and their augmentation: a function of the seed and the epoch.
+    /// The scenes of an epoch in their order, with their augmentation: a function of the seed and the epoch.
     fn plan(&self) -> Vec<Example> {
         let stream = |number| {
             let mut rng = ChaCha8Rng::seed_from_u64(self.settings.seed);
             rng.set_stream(number);
             rng
         };
-        // The teacher's voxels use a separate stream, so that a teacher does not change the rest.
-        let (mut rng, mut voxels) = (stream(self.epoch), stream(!self.epoch));
+        // The teacher's voxels use a separate stream, so that order and augmentation are the same with a teacher.
+        let (mut rng, mut voxel_rng) = (stream(self.epoch), stream(!self.epoch));
         let mut scenes = self.training.clone();
         scenes.shuffle(&mut rng);
         let mut example = |scene| Example {
             scene,
             volume: rng.random_range(0..self.dataset.volumes(scene)),
             transform: self.settings.augmentation.draw(&mut rng),
-            voxels: voxels.random(),
+            voxel_seed: voxel_rng.random(),
         };
         scenes.into_iter().map(&mut example).collect()
     }
 
-    /// One forward pass; `None` if no grasp of the scenes lies inside its volume. The teacher's outputs enter the mean;
-    /// the sums contain only trials.
+    /// The loss of one forward pass; `None` if no trial of the scenes is inside its volume. The mean includes the
+    /// teacher's outputs; the sums contain only trials.
     fn loss(&self, batch: &Batch) -> Result<Option<Loss>, TrainError> {
         if batch.targets.is_empty() {
             return Ok(None);
@@ -372,15 +373,16 @@ impl Trainer {
         let edge = (batch.volumes.len() as f64 / batch.len as f64).cbrt().round() as i64;
         let volumes = Tensor::f_from_slice(&batch.volumes)?.f_reshape([batch.len as i64, 1, edge, edge, edge])?;
         let volumes = volumes.to_device(self.executor.device());
-        let (tried, answered) = (batch.targets.len(), batch.answers.len());
-        let cells = [batch.targets.cells(), batch.answers.cells()].concat();
-        let outputs = self.executor.forward_at(&volumes, &cells)?;
-        let Loss { mut mean, sums } = self.checked(batch.targets.loss(&outputs.narrow(0, tried), &self.weights))?;
-        if answered > 0 {
-            // No class weights: the teacher's training has already balanced its qualities.
-            let weights = Weights { rotation: self.settings.rotation_weight, ..Weights::default() };
-            let answers = self.checked(batch.answers.loss(&outputs.narrow(tried, answered), &weights))?;
-            mean += answers.mean * self.teaching;
+        let (trials, teacher_outputs) = (batch.targets.len(), batch.teacher_targets.len());
+        let voxels = [batch.targets.voxels(), batch.teacher_targets.voxels()].concat();
+        let outputs = self.executor.forward_at(&volumes, &voxels)?;
+        let Loss { mut mean, sums } = self.checked(batch.targets.loss(&outputs.narrow(0, trials), &self.weights))?;
+        if teacher_outputs > 0 {
+            // Without class weights: the teacher was trained with its own.
+            let weights = LossWeights { rotation: self.settings.rotation_weight, ..LossWeights::default() };
+            let teacher_loss =
+                self.checked(batch.teacher_targets.loss(&outputs.narrow(trials, teacher_outputs), &weights))?;
+            mean += teacher_loss.mean * self.teacher_weight;
         }
         Ok(Some(Loss { mean, sums }))
     }

@@ -6,7 +6,7 @@ use grasp::gpd::{CHANNELS, Candidate, Cloud, IMAGE_SIZE, Image};
 use grasp::{Maps, SurfacePoint, Volume};
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Architecture, Classifier, Network, Options, Orientation, gpd};
-use grasp_train::{Execution, Executor};
+use grasp_train::{ExecutionOptions, Executor};
 use nalgebra::{Isometry3, Point3, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -19,7 +19,7 @@ fn volume(seed: u64) -> Volume {
 }
 
 /// The largest difference of any output over a batch of two volumes.
-fn difference(path: &Path, execution: Execution) -> f32 {
+fn difference(path: &Path, execution: ExecutionOptions) -> f32 {
     assert!(std::env::var_os("ORT_DYLIB_PATH").is_some(), "ORT_DYLIB_PATH is not set: run the tests by `make test`");
     let volumes = [volume(0), volume(1)];
     let executor = Executor::new(ModelProto::read(path).unwrap(), execution).unwrap();
@@ -49,7 +49,7 @@ fn every_network_agrees_with_onnx_runtime() {
         let path = folder.path().join(format!("{architecture}-{}.onnx", orientation.name()));
         architecture.build_with(40, orientation, 1).unwrap().write(&path).unwrap();
         for channels_last in [false, true] {
-            let execution = Execution { device: Device::Cpu, bf16: false, channels_last };
+            let execution = ExecutionOptions { device: Device::Cpu, bf16: false, channels_last };
             let worst = difference(&path, execution);
             println!("{architecture}, channels last {channels_last}: |libtorch − ONNX Runtime| ≤ {worst:.1e}");
             assert!(worst <= 1e-4, "{architecture} differs by {worst}");
@@ -76,7 +76,7 @@ fn the_classifier_agrees_with_onnx_runtime() {
     let images: Vec<Image> = (0..3).map(|_| image()).collect();
     let pixels: Vec<f32> = images.iter().flat_map(Image::pixels).map(|&value| f32::from(value) / 255.0).collect();
 
-    let execution = Execution { device: Device::Cpu, bf16: false, channels_last: false };
+    let execution = ExecutionOptions { device: Device::Cpu, bf16: false, channels_last: false };
     let executor = Executor::new(ModelProto::read(&path).unwrap(), execution).unwrap();
     let input = Tensor::from_slice(&pixels).reshape([3, CHANNELS as i64, IMAGE_SIZE as i64, IMAGE_SIZE as i64]);
     let torch = no_grad(|| executor.output(&input, gpd::OUTPUT)).unwrap();
@@ -93,7 +93,7 @@ fn the_classifier_agrees_with_onnx_runtime() {
 #[ignore = "needs an external model: set GRASPD_REFERENCE_ONNX to its file"]
 fn an_external_model_agrees_with_onnx_runtime() {
     let path = std::env::var_os("GRASPD_REFERENCE_ONNX").expect("GRASPD_REFERENCE_ONNX is not set");
-    let execution = Execution { device: Device::Cpu, bf16: false, channels_last: false };
+    let execution = ExecutionOptions { device: Device::Cpu, bf16: false, channels_last: false };
     let worst = difference(Path::new(&path), execution);
     println!("{}: |libtorch − ONNX Runtime| ≤ {worst:.1e}", Path::new(&path).display());
     assert!(worst <= 1e-4, "differs by {worst}");

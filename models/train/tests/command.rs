@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use grasp::VoxelOrigin;
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Architecture, Metadata, Orientation, Store};
-use grasp_train::{Checkpoint, Record};
+use grasp_train::{Checkpoint, EpochRecord};
 
 const N: usize = 16;
 
@@ -31,11 +31,11 @@ fn command(folder: &Path, arguments: &str) -> Command {
 }
 
 fn train(folder: &Path, arguments: &str) -> Output {
-    let fixed = "train --from start.onnx --data data --batch 4 --threads 1 --augment turns,mirror,shift";
+    let fixed = "train --from start.onnx --data data --batch 4 --threads 1 --augment rotate,mirror,shift";
     command(folder, &format!("{fixed} {arguments}")).output().unwrap()
 }
 
-fn said(output: &Output) -> String {
+fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
@@ -44,7 +44,7 @@ fn a_run_writes_a_model_that_can_be_served() {
     let folder = prepare();
     let arguments = "--out models/pile.onnx --epochs 2 --val 0.3 --voxel-origin center --model-version 2.0 --seed 3";
     let output = train(folder.path(), arguments);
-    assert!(output.status.success(), "{}", said(&output));
+    assert!(output.status.success(), "{}", stderr(&output));
     let models = folder.path().join("models");
     let store = Store::open(&models).unwrap();
     let metadata = &store.get("pile", Some("2.0")).unwrap().metadata;
@@ -63,7 +63,7 @@ fn a_run_writes_a_model_that_can_be_served() {
     }
     let log = fs::read_to_string(models.join("pile.jsonl")).unwrap();
     assert_eq!(log, String::from_utf8(output.stdout).unwrap(), "the log equals the output");
-    let records: Vec<Record> = log.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let records: Vec<EpochRecord> = log.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     assert_eq!(records.iter().map(|record| record.epoch).collect::<Vec<_>>(), [1, 2]);
     assert!(records.iter().all(|record| record.validation.is_some() && record.volumes_per_second > 0.0));
     assert_eq!(&fs::read(models.join("pile.png")).unwrap()[1..4], b"PNG");
@@ -77,7 +77,7 @@ fn fine_tuning_uses_the_defaults_of_the_initial_network() {
     for (from, batch, learning_rate) in [("start", 32, 3e-4), ("small", 64, 1e-4)] {
         let arguments = format!("train --from {from}.onnx --data data --threads 1 --epochs 1 --out out.onnx");
         let output = command(folder.path(), &arguments).output().unwrap();
-        assert!(output.status.success(), "{}", said(&output));
+        assert!(output.status.success(), "{}", stderr(&output));
         let path = folder.path().join("out.onnx");
         let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
         let settings: serde_json::Value = serde_json::from_str(&metadata.provenance["settings"]).unwrap();
@@ -92,27 +92,27 @@ fn a_run_can_be_resumed() {
     assert!(train(folder.path(), "--out whole.onnx --epochs 3 --name x").status.success());
     assert!(train(folder.path(), "--out parts.onnx --epochs 1 --name x --save-every 1000").status.success());
     let output = train(folder.path(), "--out parts.onnx --epochs 3 --name x --resume");
-    assert!(output.status.success(), "{}", said(&output));
+    assert!(output.status.success(), "{}", stderr(&output));
     let weights = |name: &str| ModelProto::read(&folder.path().join(name)).unwrap().graph.unwrap().initializer;
     assert_eq!(weights("whole.onnx"), weights("parts.onnx"));
     let lines = |name: &str| fs::read_to_string(folder.path().join(name)).unwrap().lines().count();
     assert_eq!((lines("whole.jsonl"), lines("parts.jsonl")), (3, 3));
     let other = train(folder.path(), "--out parts.onnx --epochs 4 --name x --resume --quality share");
-    let said = said(&other);
-    assert!(!other.status.success() && said.contains("give the same options"), "{said}");
-    assert!(said.contains(r#""quality":"label""#) && said.contains(r#""quality":"share""#), "{said}");
+    let stderr = stderr(&other);
+    assert!(!other.status.success() && stderr.contains("give the same options"), "{stderr}");
+    assert!(stderr.contains(r#""quality":"label""#) && stderr.contains(r#""quality":"share""#), "{stderr}");
 }
 
 #[test]
 fn a_teacher_is_recorded_and_another_voxel_origin_is_an_error() {
     let folder = prepare();
     let output = train(folder.path(), "--out out.onnx --epochs 1 --teacher start.onnx --teacher-weight 2");
-    assert!(output.status.success(), "{}", said(&output));
+    assert!(output.status.success(), "{}", stderr(&output));
     let path = folder.path().join("out.onnx");
     let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
     assert_eq!(metadata.provenance["teacher"], "vgn 1 at 2");
     let output = train(folder.path(), "--out out.onnx --epochs 1 --teacher start.onnx --voxel-origin center");
-    assert!(!output.status.success() && said(&output).contains("give --voxel-origin"), "{}", said(&output));
+    assert!(!output.status.success() && stderr(&output).contains("give --voxel-origin"), "{}", stderr(&output));
 }
 
 #[test]
@@ -124,10 +124,10 @@ fn a_run_ends_after_the_patience_of_the_evaluation() {
     let arguments =
         "train --from start.onnx --data data --threads 1 --epochs 9 --keep best --patience 2 --out out.onnx";
     let output = command(folder.path(), arguments).args(["--evaluate", script]).output().unwrap();
-    assert!(output.status.success(), "{}", said(&output));
+    assert!(output.status.success(), "{}", stderr(&output));
     let lines = String::from_utf8(output.stdout).unwrap();
-    let records: Vec<Record> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-    let rates: Vec<f64> = records.iter().map(|record| record.success.unwrap().gsr).collect();
+    let records: Vec<EpochRecord> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let rates: Vec<f64> = records.iter().map(|record| record.benchmark.unwrap().gsr).collect();
     assert_eq!(rates, [0.9, 0.8, 0.7], "two consecutive results were not better");
     let path = folder.path().join("out.onnx");
     let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
@@ -162,7 +162,7 @@ fn ctrl_c_writes_a_checkpoint() {
 fn a_network_is_written_with_random_weights() {
     let folder = tempfile::tempdir().unwrap();
     let output = command(folder.path(), "init --network vgn --seed 4 --out vgn.onnx").output().unwrap();
-    assert!(output.status.success(), "{}", said(&output));
+    assert!(output.status.success(), "{}", stderr(&output));
     let written = ModelProto::read(&folder.path().join("vgn.onnx")).unwrap();
     assert_eq!(written, Architecture::Vgn.build(40, 4).unwrap());
 }
@@ -172,7 +172,7 @@ fn an_fp16_export_halves_the_file_and_computes_the_same() {
     let folder = prepare();
     let arguments = "export --from start.onnx --precision fp16 --out half.onnx --data data --volumes 5";
     let output = command(folder.path(), arguments).output().unwrap();
-    assert!(output.status.success(), "{}", said(&output));
+    assert!(output.status.success(), "{}", stderr(&output));
     let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let number = |pointer: &str| report.pointer(pointer).and_then(serde_json::Value::as_f64).unwrap();
     assert!(number("/out_bytes") < 0.55 * number("/from_bytes"), "{report}");
@@ -188,7 +188,7 @@ fn an_fp16_export_halves_the_file_and_computes_the_same() {
         "export --from half.onnx --precision fp32 --out full.onnx",
     ] {
         let output = command(folder.path(), arguments).output().unwrap();
-        assert!(output.status.success(), "{arguments}: {}", said(&output));
+        assert!(output.status.success(), "{arguments}: {}", stderr(&output));
     }
     let size = |name: &str| fs::metadata(folder.path().join(name)).unwrap().len();
     // The weights are the same; the metadata have an additional entry.
@@ -200,7 +200,7 @@ fn an_int8_export_is_a_third_of_the_file_and_computes_nearly_the_same() {
     let folder = prepare();
     let arguments = "export --from start.onnx --precision int8 --out int8.onnx --data data --calibrate 4";
     let output = command(folder.path(), arguments).output().unwrap();
-    assert!(output.status.success(), "{}", said(&output));
+    assert!(output.status.success(), "{}", stderr(&output));
     let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let number = |pointer: &str| report.pointer(pointer).and_then(serde_json::Value::as_f64).unwrap();
     assert!(number("/out_bytes") < 0.35 * number("/from_bytes"), "{report}");
@@ -212,7 +212,7 @@ fn an_int8_export_is_a_third_of_the_file_and_computes_nearly_the_same() {
     // An int8 network cannot be trained.
     let arguments = "train --from int8.onnx --data data --epochs 1 --out trained.onnx";
     let output = command(folder.path(), arguments).output().unwrap();
-    assert!(said(&output).contains("the operator `QuantizeLinear` cannot be trained"), "{}", said(&output));
+    assert!(stderr(&output).contains("the operator `QuantizeLinear` cannot be trained"), "{}", stderr(&output));
 }
 
 #[test]
@@ -226,7 +226,7 @@ fn rotation_averaging_is_exported_in_every_precision() {
             "export --from axes.onnx --precision {precision} --average-rotations --data data --out zoo/{precision}.onnx"
         );
         let output = command(folder.path(), &arguments).output().unwrap();
-        assert!(output.status.success(), "{}", said(&output));
+        assert!(output.status.success(), "{}", stderr(&output));
         let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
         let largest = report.pointer("/compared/quality/largest").and_then(serde_json::Value::as_f64).unwrap();
         assert!(largest > 1e-5, "the average differs from its parts: {report}");
@@ -234,12 +234,16 @@ fn rotation_averaging_is_exported_in_every_precision() {
     let store = Store::open(&folder.path().join("zoo")).unwrap();
     let metadata = &store.get("fp16", None).unwrap().metadata;
     assert_eq!(metadata.provenance["precision"], "fp16");
-    assert_eq!(metadata.provenance["averaged_over_turns"], "4");
+    assert_eq!(metadata.provenance["averaged_over_rotations"], "4");
 
     let output = command(folder.path(), "export --from start.onnx --precision fp32 --average-rotations --out x.onnx")
         .output()
         .unwrap();
-    assert!(said(&output).contains("start.onnx") && said(&output).contains("--orientation axes"), "{}", said(&output));
+    assert!(
+        stderr(&output).contains("start.onnx") && stderr(&output).contains("--orientation axes"),
+        "{}",
+        stderr(&output)
+    );
 }
 
 #[test]
@@ -261,12 +265,13 @@ fn errors_name_the_flag_or_the_file() {
         ("train --data data --out x.onnx", "--network"),
         ("train --from start.onnx --data data --out x.onnx --device cuda:99", "--device is cuda:99"),
         ("train --from start.onnx --data data --out x.onnx --device gpu", "cuda:N"),
+        ("train --network vgn --data data --out x.onnx --augment turns", "`--augment turns` is now `--augment rotate`"),
         ("export --from start.onnx --precision fp16 --turns --out x.onnx", "`--turns` is now `--average-rotations`"),
         ("export --from start.onnx --precision int8 --out x.onnx", "add --data"),
     ] {
         let output = command(folder.path(), arguments).output().unwrap();
         assert!(!output.status.success());
-        assert!(said(&output).contains(expected), "{arguments}: {}", said(&output));
+        assert!(stderr(&output).contains(expected), "{arguments}: {}", stderr(&output));
     }
 }
 

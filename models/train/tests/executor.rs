@@ -2,17 +2,17 @@
 
 use grasp_models::onnx::{AttributeProto, GraphProto, ModelProto, NodeProto, OperatorSetIdProto, TensorProto};
 use grasp_models::{Architecture, Orientation, gpd};
-use grasp_train::{Adam, ExecuteError, Execution, Executor, Outputs};
+use grasp_train::{Adam, ExecuteError, ExecutionOptions, Executor, NetworkOutputs};
 use tch::{Device, Kind, Tensor, no_grad};
 
 const N: usize = 16;
-const EXECUTION: Execution = Execution { device: Device::Cpu, bf16: false, channels_last: false };
+const EXECUTION: ExecutionOptions = ExecutionOptions { device: Device::Cpu, bf16: false, channels_last: false };
 
 fn vgn() -> ModelProto {
     Architecture::Vgn.build(N, 0).unwrap()
 }
 
-fn run(model: ModelProto, execution: Execution) -> Result<Outputs, ExecuteError> {
+fn run(model: ModelProto, execution: ExecutionOptions) -> Result<NetworkOutputs, ExecuteError> {
     let edge = N as i64;
     // Deterministic values. libtorch's generator is shared with tests that run in parallel.
     let volumes = (Tensor::arange(2 * edge.pow(3), (Kind::Float, Device::Cpu)) * 0.7).sin() * 0.5 + 0.5;
@@ -21,7 +21,7 @@ fn run(model: ModelProto, execution: Execution) -> Result<Outputs, ExecuteError>
     no_grad(|| executor.forward(&volumes))
 }
 
-fn difference(a: &Outputs, b: &Outputs) -> f64 {
+fn difference(a: &NetworkOutputs, b: &NetworkOutputs) -> f64 {
     let pairs = [(&a.quality, &b.quality), (&a.rotation, &b.rotation), (&a.width, &b.width)];
     pairs.iter().map(|(a, b)| (*a - *b).abs().max().double_value(&[])).fold(0.0, f64::max)
 }
@@ -172,7 +172,7 @@ fn unsupported_opsets_are_errors() {
 }
 
 #[test]
-fn a_graph_in_pytorchs_style_is_the_same_network() {
+fn a_graph_in_the_style_of_pytorchs_export_gives_the_same_outputs() {
     let exported = as_exported(vgn());
     let parameters = |model: &ModelProto| -> usize {
         model.graph.as_ref().unwrap().initializer.iter().map(TensorProto::elements).sum()
@@ -184,12 +184,12 @@ fn a_graph_in_pytorchs_style_is_the_same_network() {
 }
 
 #[test]
-fn single_voxels_equal_those_of_the_whole_maps() {
+fn outputs_at_single_voxels_equal_those_of_the_whole_maps() {
     let edge = N as i64;
     let volumes = Tensor::rand([2, 1, edge, edge, edge], (Kind::Float, Device::Cpu));
     // Corners, edges, faces and the inside, of both volumes.
-    let cells: Vec<i64> = (0..2 * edge.pow(3)).step_by(37).chain([0, edge.pow(3) - 1, 2 * edge.pow(3) - 1]).collect();
-    let index = Tensor::from_slice(&cells);
+    let voxels: Vec<i64> = (0..2 * edge.pow(3)).step_by(37).chain([0, edge.pow(3) - 1, 2 * edge.pow(3) - 1]).collect();
+    let index = Tensor::from_slice(&voxels);
     // A network whose width has no head is computed at all voxels.
     let mut whole = vgn();
     let graph = whole.graph.as_mut().unwrap();
@@ -206,12 +206,12 @@ fn single_voxels_equal_those_of_the_whole_maps() {
         whole,
     ] {
         for channels_last in [false, true] {
-            let executor = Executor::new(model.clone(), Execution { channels_last, ..EXECUTION }).unwrap();
+            let executor = Executor::new(model.clone(), ExecutionOptions { channels_last, ..EXECUTION }).unwrap();
             let maps = executor.forward(&volumes).unwrap();
-            let at = executor.forward_at(&volumes, &cells).unwrap();
+            let at = executor.forward_at(&volumes, &voxels).unwrap();
             let same = |map: &Tensor, at: &Tensor| {
                 let expected = map.permute([0, 2, 3, 4, 1]).reshape([-1, map.size()[1]]).index_select(0, &index);
-                let difference = (expected - at.reshape([cells.len() as i64, -1])).abs().max().double_value(&[]);
+                let difference = (expected - at.reshape([voxels.len() as i64, -1])).abs().max().double_value(&[]);
                 assert!(difference < 1e-5, "differs by {difference}");
             };
             same(&maps.quality, &at.quality);
@@ -226,7 +226,7 @@ fn bf16_changes_the_outputs_little() {
     for architecture in [Architecture::Vgn, Architecture::TransformerSmall] {
         let model = || architecture.build(N, 0).unwrap();
         let full = run(model(), EXECUTION).unwrap();
-        let half = run(model(), Execution { bf16: true, channels_last: true, ..EXECUTION }).unwrap();
+        let half = run(model(), ExecutionOptions { bf16: true, channels_last: true, ..EXECUTION }).unwrap();
         let worst = (&full.quality - &half.quality).abs().max().double_value(&[]);
         println!("{architecture}: bf16 moves the quality by {worst:.4}");
         assert!(worst > 0.0 && worst < 0.03, "{architecture}: by {worst}");
@@ -240,7 +240,7 @@ fn gradients_in_bf16_are_reproducible() {
     let volumes = Tensor::ones([8, 1, edge, edge, edge], (Kind::Float, Device::Cpu));
     for architecture in [Architecture::Vgn, Architecture::TransformerSmall] {
         let model = architecture.build(N, 0).unwrap();
-        let executor = Executor::new(model, Execution { bf16: true, channels_last: true, ..EXECUTION }).unwrap();
+        let executor = Executor::new(model, ExecutionOptions { bf16: true, channels_last: true, ..EXECUTION }).unwrap();
         let gradients = || {
             drop([1_000, 20_000, 300_000].map(|size| Tensor::full([size], f64::NAN, (Kind::Float, Device::Cpu))));
             let outputs = executor.forward(&volumes).unwrap();
@@ -260,19 +260,18 @@ fn gradients_in_bf16_are_reproducible() {
     }
 }
 
-/// Convolutions after upsampling are computed before it; outputs and gradients are the same.
 #[test]
 fn convolutions_before_upsampling_give_the_same_maps_and_gradients() {
     let edge = N as i64;
     let volumes = (Tensor::arange(2 * edge.pow(3), (Kind::Float, Device::Cpu)) * 0.7).sin() * 0.5 + 0.5;
     let volumes = volumes.view([2, 1, edge, edge, edge]);
     for channels_last in [false, true] {
-        let execution = Execution { channels_last, ..EXECUTION };
-        for cells in [None, Some([5, 700, 4100, 8191])] {
+        let execution = ExecutionOptions { channels_last, ..EXECUTION };
+        for voxels in [None, Some([5, 700, 4100, 8191])] {
             let run = |executor: Executor| {
-                let outputs = match cells {
+                let outputs = match voxels {
                     None => executor.forward(&volumes).unwrap(),
-                    Some(cells) => executor.forward_at(&volumes, &cells).unwrap(),
+                    Some(voxels) => executor.forward_at(&volumes, &voxels).unwrap(),
                 };
                 let loss = outputs.quality.square().sum(Kind::Float) + outputs.width.square().sum(Kind::Float);
                 (loss + outputs.rotation.get(0).sum(Kind::Float)).backward();
@@ -280,11 +279,11 @@ fn convolutions_before_upsampling_give_the_same_maps_and_gradients() {
                 gradients.collect::<Vec<_>>()
             };
             let folded = run(Executor::new(vgn(), execution).unwrap());
-            let written = run(Executor::new(vgn(), execution).unwrap().as_written());
+            let written = run(Executor::new(vgn(), execution).unwrap().without_optimizations());
             for (folded, written) in folded.iter().zip(&written) {
                 let scale = written.abs().max().double_value(&[]).max(1e-3);
                 let apart = (folded - written).abs().max().double_value(&[]) / scale;
-                assert!(apart < 1e-3, "{apart} of {scale}, cells {cells:?}, channels last {channels_last}");
+                assert!(apart < 1e-3, "{apart} of {scale}, voxels {voxels:?}, channels last {channels_last}");
             }
         }
     }
@@ -293,7 +292,7 @@ fn convolutions_before_upsampling_give_the_same_maps_and_gradients() {
 #[test]
 fn an_untrained_model_is_returned_unchanged() {
     for channels_last in [false, true] {
-        let executor = Executor::new(vgn(), Execution { channels_last, ..EXECUTION }).unwrap();
+        let executor = Executor::new(vgn(), ExecutionOptions { channels_last, ..EXECUTION }).unwrap();
         assert_eq!(executor.to_model(), vgn());
     }
 }

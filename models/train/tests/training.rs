@@ -9,17 +9,17 @@ use grasp_data::{Dataset, Setup, Trial, packed};
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Architecture, Metadata, Network, Options, Orientation};
 use grasp_train::{
-    Augmentation, Checkpoint, CheckpointError, Epoch, Execution, Executor, Outputs, Quality, Record, Settings, Targets,
-    Teacher, TrainError, Trainer, Weights,
+    Augmentation, Checkpoint, CheckpointError, EpochOutcome, EpochRecord, ExecutionOptions, Executor, LossWeights,
+    NetworkOutputs, QualityTarget, Targets, Teacher, TrainError, Trainer, TrainingSettings,
 };
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use tch::{Device, Kind, Tensor};
 
 const N: usize = 16;
-const EXECUTION: Execution = Execution { device: Device::Cpu, bf16: false, channels_last: true };
+const EXECUTION: ExecutionOptions = ExecutionOptions { device: Device::Cpu, bf16: false, channels_last: true };
 
-fn settings() -> Settings {
-    Settings {
+fn settings() -> TrainingSettings {
+    TrainingSettings {
         epochs: 3,
         batch: 3,
         accumulate: 1,
@@ -32,24 +32,24 @@ fn settings() -> Settings {
         validation: 0.0,
         augmentation: Augmentation::default(),
         balance: false,
-        quality: Quality::Label,
+        quality: QualityTarget::Label,
         rotation_weight: 1.0,
         voxel_origin: VoxelOrigin::Center,
         bf16: false,
     }
 }
 
-fn trainer(dataset: Dataset, settings: &Settings, execution: Execution) -> Trainer {
+fn trainer(dataset: Dataset, settings: &TrainingSettings, execution: ExecutionOptions) -> Trainer {
     // More threads are no faster on volumes this small.
     tch::set_num_threads(1);
     let model = Architecture::Vgn.build(N, 0).unwrap();
     Trainer::new(model, dataset, settings.clone(), execution).unwrap()
 }
 
-fn epoch(trainer: &mut Trainer) -> Record {
+fn epoch(trainer: &mut Trainer) -> EpochRecord {
     match trainer.epoch(&AtomicBool::new(false), |_, _| {}).unwrap() {
-        Epoch::Done(record) => record,
-        Epoch::Interrupted => panic!("the epoch was interrupted"),
+        EpochOutcome::Completed(record) => record,
+        EpochOutcome::Interrupted => panic!("the epoch was interrupted"),
     }
 }
 
@@ -63,10 +63,10 @@ fn eight_scenes_are_memorized() {
         (Architecture::TransformerSmall, Axes, 1e-3, 80, true),
         (Architecture::Transformer, Quaternion, 2e-4, 40, true),
     ] {
-        let settings = Settings { batch: 8, learning_rate, warmup: 10, bf16, ..settings() };
+        let settings = TrainingSettings { batch: 8, learning_rate, warmup: 10, bf16, ..settings() };
         tch::set_num_threads(1);
         let model = network.build_with(N, orientation, 0).unwrap();
-        let execution = Execution { bf16, ..EXECUTION };
+        let execution = ExecutionOptions { bf16, ..EXECUTION };
         let mut trainer = Trainer::new(model, support::dataset(8, N), settings, execution).unwrap();
         let first = epoch(&mut trainer);
         let last = (0..epochs).map(|_| epoch(&mut trainer)).last().unwrap();
@@ -76,7 +76,7 @@ fn eight_scenes_are_memorized() {
     }
 }
 
-/// The greatest difference between two networks' weights.
+/// The largest difference between two networks' weights.
 fn difference(a: &ModelProto, b: &ModelProto) -> f32 {
     let weights = |model: &ModelProto| model.graph.as_ref().unwrap().initializer.clone();
     let pairs = weights(a).into_iter().zip(weights(b));
@@ -87,7 +87,7 @@ fn difference(a: &ModelProto, b: &ModelProto) -> f32 {
 #[test]
 fn two_accumulated_batches_equal_one_of_twice_the_size() {
     let run = |batch: usize, accumulate: usize| {
-        let settings = Settings { batch, accumulate, learning_rate: 1e-3, ..settings() };
+        let settings = TrainingSettings { batch, accumulate, learning_rate: 1e-3, ..settings() };
         // All scenes have the same number of grasps, so that the mean of means is the mean.
         let mut trainer = trainer(support::dataset(8, N), &settings, EXECUTION);
         epoch(&mut trainer);
@@ -101,9 +101,9 @@ fn two_accumulated_batches_equal_one_of_twice_the_size() {
 }
 
 #[test]
-fn the_average_of_the_weights_lags_behind_them() {
+fn the_weight_average_changes_more_slowly_than_the_weights() {
     let run = |average: Option<f64>| {
-        let mut trainer = trainer(support::dataset(8, N), &Settings { average, ..settings() }, EXECUTION);
+        let mut trainer = trainer(support::dataset(8, N), &TrainingSettings { average, ..settings() }, EXECUTION);
         for _ in 0..2 {
             epoch(&mut trainer);
         }
@@ -117,9 +117,9 @@ fn the_average_of_the_weights_lags_behind_them() {
 }
 
 #[test]
-fn weights_decay() {
+fn weight_decay_reduces_the_weights() {
     let norm = |weight_decay: f64| {
-        let mut trainer = trainer(support::dataset(8, N), &Settings { weight_decay, ..settings() }, EXECUTION);
+        let mut trainer = trainer(support::dataset(8, N), &TrainingSettings { weight_decay, ..settings() }, EXECUTION);
         for _ in 0..3 {
             epoch(&mut trainer);
         }
@@ -131,10 +131,10 @@ fn weights_decay() {
 }
 
 #[test]
-fn a_resumed_run_is_the_uninterrupted_run() {
+fn a_resumed_run_gives_the_same_result_as_an_uninterrupted_run() {
     let dataset = || support::dataset(8, N);
-    let augmentation = Augmentation { turns: true, mirror: true, shift: 1 };
-    let settings = Settings {
+    let augmentation = Augmentation { rotate: true, mirror: true, shift: 1 };
+    let settings = TrainingSettings {
         augmentation,
         validation: 0.5,
         cosine: true,
@@ -149,15 +149,17 @@ fn a_resumed_run_is_the_uninterrupted_run() {
     assert!(whole.scenes().1 > 0, "there are validation scenes");
     let records: Vec<_> = (0..3).map(|_| epoch(&mut whole)).collect();
 
-    // Interrupted after the first batch of the second epoch; the checkpoint is written to a file.
+    // A run that is interrupted after the first step of the second epoch. Its checkpoint is written to a file.
     let mut part = trainer(dataset(), &settings, EXECUTION);
     epoch(&mut part);
     let stop = AtomicBool::new(false);
     let ended = part.epoch(&stop, |_, _| stop.store(true, Ordering::Relaxed)).unwrap();
-    assert_eq!(ended, Epoch::Interrupted);
+    assert_eq!(ended, EpochOutcome::Interrupted);
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run.state");
     part.checkpoint().write(&path).unwrap();
+    let stored = Checkpoint::read(&path).unwrap().settings;
+    assert!(stored.contains(r#""augmentation":{"turns":true,"#), "the name in earlier checkpoints: {stored}");
     drop(part);
 
     let mut resumed = trainer(dataset(), &settings, EXECUTION);
@@ -165,39 +167,39 @@ fn a_resumed_run_is_the_uninterrupted_run() {
     assert_eq!((resumed.epochs(), resumed.steps()), (1, whole.steps_per_epoch() + 1));
     for expected in &records[1..] {
         let got = epoch(&mut resumed);
-        let comparable = |record: &Record| Record { seconds: 0.0, volumes_per_second: 0.0, ..record.clone() };
+        let comparable = |record: &EpochRecord| EpochRecord { seconds: 0.0, volumes_per_second: 0.0, ..record.clone() };
         assert_eq!(comparable(&got), comparable(expected));
     }
     assert_eq!(resumed.model(), whole.model(), "bit-identical");
 }
 
 #[test]
-fn a_student_learns_from_the_teacher_where_there_are_no_trials() {
+fn a_student_matches_its_teacher_where_there_are_no_trials() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("teacher.onnx");
-    let learnt = Settings { batch: 8, learning_rate: 1e-3, ..settings() };
-    let mut taught = trainer(support::dataset(8, N), &learnt, EXECUTION);
+    let settings = TrainingSettings { batch: 8, learning_rate: 1e-3, ..settings() };
+    let mut teacher_run = trainer(support::dataset(8, N), &settings, EXECUTION);
     for _ in 0..60 {
-        epoch(&mut taught);
+        epoch(&mut teacher_run);
     }
-    let teacher_model = taught.model();
+    let teacher_model = teacher_run.model();
     let mut metadata = Metadata::of(&teacher_model, &path).unwrap();
     metadata.voxel_origin = VoxelOrigin::Center;
     let mut file = teacher_model.clone();
     metadata.write_to(&mut file);
     file.write(&path).unwrap();
 
-    // The student's scenes are not in the teacher's data, and most of their surfaces have no trials nearby.
+    // The student's scenes are not in the teacher's data. Most voxels near their surfaces have no trial.
     let scenes = || Dataset::of((100..108).map(|seed| support::scene(seed, N)).collect()).unwrap();
     let teacher = || Teacher::new(Network::load(&path, &Options::default()).unwrap(), 10.0);
     let start = || {
         let model = Architecture::Vgn.build(N, 1).unwrap();
-        Trainer::new(model, scenes(), learnt.clone(), EXECUTION).unwrap()
+        Trainer::new(model, scenes(), settings.clone(), EXECUTION).unwrap()
     };
-    let (mut alone, mut pupil) = (start(), start().taught_by(teacher()));
+    let (mut without_teacher, mut student) = (start(), start().with_teacher(teacher()));
     for _ in 0..150 {
-        epoch(&mut alone);
-        epoch(&mut pupil);
+        epoch(&mut without_teacher);
+        epoch(&mut student);
     }
 
     let qualities = |model: &ModelProto| {
@@ -207,19 +209,20 @@ fn a_student_learns_from_the_teacher_where_there_are_no_trials() {
         let executor = Executor::new(model.clone(), EXECUTION).unwrap();
         tch::no_grad(|| executor.forward(&volumes).unwrap().quality)
     };
-    let answers = qualities(&teacher_model);
-    let distance = |model: &ModelProto| (qualities(model) - &answers).abs().mean(Kind::Float).double_value(&[]);
-    let (without, with) = (distance(&alone.model()), distance(&pupil.model()));
+    let teacher_qualities = qualities(&teacher_model);
+    let distance =
+        |model: &ModelProto| (qualities(model) - &teacher_qualities).abs().mean(Kind::Float).double_value(&[]);
+    let (without, with) = (distance(&without_teacher.model()), distance(&student.model()));
     println!("mean difference of quality to the teacher's: {without:.3} without its outputs, {with:.3} with them");
     assert!(with < without / 2.0, "{with} and {without}");
 
-    // Voxels are drawn again in every step; a resumed run draws the same ones.
-    let mut resumed = start().taught_by(teacher());
-    resumed.resume(&pupil.checkpoint()).unwrap();
+    // Voxels are drawn again in every step. A resumed run draws the same voxels.
+    let mut resumed = start().with_teacher(teacher());
+    resumed.resume(&student.checkpoint()).unwrap();
     epoch(&mut resumed);
-    epoch(&mut pupil);
-    assert_eq!(resumed.model(), pupil.model(), "bit-identical");
-    let refused = start().resume(&pupil.checkpoint());
+    epoch(&mut student);
+    assert_eq!(resumed.model(), student.model(), "bit-identical");
+    let refused = start().resume(&student.checkpoint());
     assert!(matches!(refused, Err(TrainError::Checkpoint(CheckpointError::Settings { .. }))), "the teacher is missing");
 }
 
@@ -265,9 +268,9 @@ fn a_checkpoint_of_another_run_is_refused() {
     let dataset = || Dataset::of(scenes()).unwrap();
     let checkpoint = trainer(dataset(), &settings(), EXECUTION).checkpoint();
     let refused = |error| matches!(error, Err(TrainError::Checkpoint(CheckpointError::Settings { .. })));
-    let mut other = trainer(dataset(), &Settings { seed: 6, ..settings() }, EXECUTION);
+    let mut other = trainer(dataset(), &TrainingSettings { seed: 6, ..settings() }, EXECUTION);
     assert!(refused(other.resume(&checkpoint)));
-    let mut other = trainer(dataset(), &Settings { quality: Quality::Share, ..settings() }, EXECUTION);
+    let mut other = trainer(dataset(), &TrainingSettings { quality: QualityTarget::Share, ..settings() }, EXECUTION);
     assert!(refused(other.resume(&checkpoint)));
     let (mut relabelled, mut shared, mut renamed) = (scenes(), scenes(), scenes());
     relabelled[3].trials[0].width += 0.5;
@@ -280,7 +283,7 @@ fn a_checkpoint_of_another_run_is_refused() {
     let short = Checkpoint { sums: vec![0.0; 3], ..checkpoint.clone() };
     let cut = trainer(dataset(), &settings(), EXECUTION).resume(&short);
     assert!(matches!(cut, Err(TrainError::Checkpoint(CheckpointError::Sums(3)))));
-    let mut longer = trainer(dataset(), &Settings { epochs: 9, ..settings() }, EXECUTION);
+    let mut longer = trainer(dataset(), &TrainingSettings { epochs: 9, ..settings() }, EXECUTION);
     assert!(longer.resume(&checkpoint).is_ok(), "a run with a constant learning rate can be extended");
     let model = Architecture::TransformerSmall.build(N, 0).unwrap();
     let mut other = Trainer::new(model, dataset(), settings(), EXECUTION).unwrap();
@@ -297,15 +300,16 @@ fn a_run_without_scenes_is_refused() {
 
 #[test]
 fn divergence_is_an_error() {
-    let mut trainer = trainer(support::dataset(8, N), &Settings { learning_rate: 1e30, ..settings() }, EXECUTION);
+    let mut trainer =
+        trainer(support::dataset(8, N), &TrainingSettings { learning_rate: 1e30, ..settings() }, EXECUTION);
     let error = (0..5).find_map(|_| trainer.epoch(&AtomicBool::new(false), |_, _| {}).err()).unwrap();
     assert!(error.to_string().contains("smaller learning rate"), "{error}");
 }
 
 /// The same outputs at two voxels.
-fn outputs(quality: f32, rotation: [f32; 4], width: f32) -> Outputs {
+fn outputs(quality: f32, rotation: [f32; 4], width: f32) -> NetworkOutputs {
     let fill = |values: &[f32]| Tensor::from_slice(values).reshape([1, -1, 1, 1, 1]).repeat([2, 1, 1, 1, 1]);
-    Outputs { quality: fill(&[quality]), rotation: fill(&rotation), width: fill(&[width]) }
+    NetworkOutputs { quality: fill(&[quality]), rotation: fill(&rotation), width: fill(&[width]) }
 }
 
 #[test]
@@ -316,13 +320,13 @@ fn the_loss_follows_the_papers_equation() {
         rotation: UnitQuaternion::from_euler_angles(0.3, -0.8, 1.1),
         width: 4.0,
         success: true,
-        turns: 0,
+        yaws: 0,
         share: 1.0,
         clearance: 0.0,
     };
     let mut targets = Targets::default();
-    targets.push(1, &label, n, VoxelOrigin::Center, Quality::Label);
-    targets.push(0, &Trial { success: false, ..label }, n, VoxelOrigin::Center, Quality::Label);
+    targets.push(1, &label, n, VoxelOrigin::Center, QualityTarget::Label);
+    targets.push(0, &Trial { success: false, ..label }, n, VoxelOrigin::Center, QualityTarget::Label);
     assert_eq!(targets.len(), 2);
 
     // A rotation by 180° about the approach, and the sign of the quaternion, do not change the loss.
@@ -330,7 +334,7 @@ fn the_loss_follows_the_papers_equation() {
     for rotation in [label.rotation, label.rotation * half_turn] {
         for sign in [1.0, -1.0] {
             let rotation: [f32; 4] = (rotation.coords * sign).map(|c| c as f32).into();
-            let loss = targets.loss(&outputs(0.8, rotation, 6.0), &Weights::default()).unwrap();
+            let loss = targets.loss(&outputs(0.8, rotation, 6.0), &LossWeights::default()).unwrap();
             // −ln 0.8 for the success, −ln 0.2 for the failure; 0.01 · 2² for the width.
             let expected = (-(0.8_f64.ln()) - 0.2_f64.ln() + 0.01 * 4.0) / 2.0;
             assert!((loss.mean.double_value(&[]) - expected).abs() < 1e-5);
@@ -338,28 +342,28 @@ fn the_loss_follows_the_papers_equation() {
             assert_eq!((loss.sums.accuracy(), loss.sums.precision(), loss.sums.recall()), (0.5, 0.5, 1.0));
         }
     }
-    // Other valid turns have the same loss.
-    let turns = |k: u8| {
+    // Other valid yaws have the same loss.
+    let with_yaw = |k: u8| {
         let mut targets = Targets::default();
-        targets.push(0, &Trial { turns: 1 << k, ..label }, n, VoxelOrigin::Center, Quality::Label);
+        targets.push(0, &Trial { yaws: 1 << k, ..label }, n, VoxelOrigin::Center, QualityTarget::Label);
         targets
     };
-    let turned = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), 2.0 * std::f64::consts::PI / 5.0);
-    let rotation: [f32; 4] = (label.rotation * turned).coords.map(|c| c as f32).into();
+    let yaw = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), 2.0 * std::f64::consts::PI / 5.0);
+    let rotation: [f32; 4] = (label.rotation * yaw).coords.map(|c| c as f32).into();
     let rotation_loss = |targets: &Targets| {
-        let Outputs { quality, rotation, width } = outputs(0.8, rotation, 4.0);
+        let NetworkOutputs { quality, rotation, width } = outputs(0.8, rotation, 4.0);
         let first = |map: Tensor| map.narrow(0, 0, 1);
-        let outputs = Outputs { quality: first(quality), rotation: first(rotation), width: first(width) };
-        targets.loss(&outputs, &Weights::default()).unwrap().sums.rotation
+        let outputs = NetworkOutputs { quality: first(quality), rotation: first(rotation), width: first(width) };
+        targets.loss(&outputs, &LossWeights::default()).unwrap().sums.rotation
     };
-    assert!(rotation_loss(&turns(2)).abs() < 1e-5);
+    assert!(rotation_loss(&with_yaw(2)).abs() < 1e-5);
     let off_by_a_step = 1.0 - (std::f64::consts::PI / 10.0).cos();
-    assert!((rotation_loss(&turns(1)) - off_by_a_step).abs() < 1e-5);
+    assert!((rotation_loss(&with_yaw(1)) - off_by_a_step).abs() < 1e-5);
     let quarter = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
     let rotation: [f32; 4] = (label.rotation * quarter).coords.map(|c| c as f32).into();
-    let loss = targets.loss(&outputs(0.8, rotation, 4.0), &Weights { classes: [1.0, 3.0], rotation: 2.0 }).unwrap();
+    let loss = targets.loss(&outputs(0.8, rotation, 4.0), &LossWeights { classes: [1.0, 3.0], rotation: 2.0 }).unwrap();
     let worst = 1.0 - 0.5_f64.sqrt();
-    assert!((loss.sums.rotation - 3.0 * 2.0 * worst).abs() < 1e-5, "a quarter turn is the worst about z");
+    assert!((loss.sums.rotation - 3.0 * 2.0 * worst).abs() < 1e-5, "90° about z has the largest loss");
     assert!((loss.sums.angle() - 90.0).abs() < 1e-3, "{}", loss.sums.angle());
     assert!((loss.sums.quality - (-3.0 * 0.8_f64.ln() - 0.2_f64.ln())).abs() < 1e-5, "classes are weighted");
 }
@@ -371,43 +375,47 @@ fn the_target_of_the_quality_is_the_label_or_the_share() {
         rotation: UnitQuaternion::identity(),
         width: 4.0,
         success: true,
-        turns: 0,
+        yaws: 0,
         share: 0.5,
         clearance: 0.0,
     };
-    let sums = |choice: Quality, quality: f32| {
+    let sums = |choice: QualityTarget, quality: f32| {
         let mut targets = Targets::default();
         for trial in [label, Trial { position: Point3::new(1.5, 0.5, 0.5), ..label }] {
             targets.push(0, &trial, 2, VoxelOrigin::Center, choice);
         }
-        let weights = Weights { classes: [1.0, 3.0], rotation: 2.0 };
+        let weights = LossWeights { classes: [1.0, 3.0], rotation: 2.0 };
         targets.loss(&outputs(quality, [1.0, 0.0, 0.0, 0.0], 6.0), &weights).unwrap().sums
     };
-    let least = |choice: Quality| {
+    let least = |choice: QualityTarget| {
         let loss = |percent: &i32| sums(choice, *percent as f32 / 100.0).loss();
         (1..100).min_by(|a, b| loss(a).total_cmp(&loss(b))).unwrap()
     };
-    assert_eq!((least(Quality::Share), least(Quality::Label)), (50, 99));
+    assert_eq!((least(QualityTarget::Share), least(QualityTarget::Label)), (50, 99));
 
-    let (share, whole) = (sums(Quality::Share, 0.8), sums(Quality::Label, 0.8));
+    let (share, whole) = (sums(QualityTarget::Share, 0.8), sums(QualityTarget::Label, 0.8));
     // Both voxels have the weight of successes.
     let expected = -3.0 * (0.8_f64.ln() + 0.2_f64.ln());
     assert!((share.quality - expected).abs() < 1e-5, "{}", share.quality);
     assert!(share.rotation > 1.0 && share.width > 0.1);
-    assert_eq!((share.rotation, share.width), (whole.rotation, whole.width), "a success counts for one");
-    assert_eq!((share.accuracy(), share.recall()), (1.0, 1.0), "the label decides what is a success");
+    assert_eq!(
+        (share.rotation, share.width),
+        (whole.rotation, whole.width),
+        "rotation and width do not depend on the share"
+    );
+    assert_eq!((share.accuracy(), share.recall()), (1.0, 1.0), "successes are those of the label");
 }
 
 #[test]
-fn a_run_learns_the_share() {
+fn the_quality_converges_to_the_share() {
     let mut scenes: Vec<_> = (0..8).map(|seed| support::scene(seed, N)).collect();
     scenes.iter_mut().for_each(|scene| scene.trials[0].share = 0.5);
-    let last_loss = |quality: Quality| {
-        let settings = Settings { quality, batch: 8, learning_rate: 1e-3, warmup: 10, ..settings() };
+    let last_loss = |quality: QualityTarget| {
+        let settings = TrainingSettings { quality, batch: 8, learning_rate: 1e-3, warmup: 10, ..settings() };
         let mut trainer = trainer(Dataset::of(scenes.clone()).unwrap(), &settings, EXECUTION);
         (0..80).map(|_| epoch(&mut trainer)).last().unwrap().loss_quality
     };
-    let (label, share) = (last_loss(Quality::Label), last_loss(Quality::Share));
+    let (label, share) = (last_loss(QualityTarget::Label), last_loss(QualityTarget::Share));
     // Half of the voxels are successes; their smallest possible loss is ln 2.
     let least = 0.5 * std::f64::consts::LN_2;
     assert!(label < 0.05 && (least - 1e-4..least + 0.05).contains(&share), "{label}, {share}");
@@ -420,19 +428,19 @@ fn the_voxel_of_a_grasp_depends_on_the_voxel_origin() {
         rotation: UnitQuaternion::identity(),
         width: 4.0,
         success: true,
-        turns: 0,
+        yaws: 0,
         share: 1.0,
         clearance: 0.0,
     };
-    let cell = |x: i64, y: i64, z: i64| (x * 4 + y) * 4 + z;
-    let cells = |label: &Trial, origin| {
+    let voxel = |x: i64, y: i64, z: i64| (x * 4 + y) * 4 + z;
+    let voxels = |label: &Trial, origin| {
         let mut targets = Targets::default();
-        targets.push(2, label, 4, origin, Quality::Label);
-        targets.cells().iter().map(|cell| cell - 2 * 64).collect::<Vec<_>>()
+        targets.push(2, label, 4, origin, QualityTarget::Label);
+        targets.voxels().iter().map(|voxel| voxel - 2 * 64).collect::<Vec<_>>()
     };
-    assert_eq!(cells(&at(1.2, 0.7, 3.4), VoxelOrigin::Center), [cell(1, 0, 3)]);
-    assert_eq!(cells(&at(1.2, 0.7, 3.4), VoxelOrigin::Corner), [cell(1, 1, 3)]);
-    assert_eq!(cells(&at(1.2, 0.7, 3.6), VoxelOrigin::Center), [cell(1, 0, 3)]);
-    assert!(cells(&at(1.2, 0.7, 3.6), VoxelOrigin::Corner).is_empty(), "the nearest index is outside");
-    assert!(cells(&at(1.2, -0.7, 3.6), VoxelOrigin::Center).is_empty());
+    assert_eq!(voxels(&at(1.2, 0.7, 3.4), VoxelOrigin::Center), [voxel(1, 0, 3)]);
+    assert_eq!(voxels(&at(1.2, 0.7, 3.4), VoxelOrigin::Corner), [voxel(1, 1, 3)]);
+    assert_eq!(voxels(&at(1.2, 0.7, 3.6), VoxelOrigin::Center), [voxel(1, 0, 3)]);
+    assert!(voxels(&at(1.2, 0.7, 3.6), VoxelOrigin::Corner).is_empty(), "the nearest index is outside");
+    assert!(voxels(&at(1.2, -0.7, 3.6), VoxelOrigin::Center).is_empty());
 }

@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use anyhow::{Context, bail};
 use clap::Args;
 use grasp::{DepthImage, Fusion, RESOLUTION};
-use grasp_data::{Dataset, Form, Setup, Trial, packed, processed, raw};
+use grasp_data::{DataFormat, Dataset, Setup, Trial, packed, processed, raw};
 use grasp_sim::ordered;
 use indicatif::ProgressBar;
 use nalgebra::Isometry3;
@@ -38,9 +38,9 @@ impl Convert {
         anyhow::ensure!(self.from != self.out, "--from and --out are the same folder; use another --out");
         let setup = Setup::read(&self.from)?;
         let mut writer = Writer::open(&self, &setup)?;
-        match Form::of(&self.from)? {
-            Form::Raw => self.fuse(&setup, &mut writer),
-            Form::Processed | Form::Packed => self.copy(&mut writer),
+        match DataFormat::of(&self.from)? {
+            DataFormat::Raw => self.fuse(&setup, &mut writer),
+            DataFormat::Processed | DataFormat::Packed => self.copy(&mut writer),
         }
     }
 

@@ -20,7 +20,7 @@ pub fn scene(seed: u64, n: usize) -> Scene {
     let at = |fraction: f64| Point3::from(std::array::from_fn(|axis| low[axis] as f64 + fraction * size[axis] as f64));
     let width = size[0].min(size[1]) as f64;
     let (position, rotation) = (at(-0.3), yaw);
-    let failure = Trial { position, rotation, width: 10.0, success: false, turns: 0, share: 0.0, clearance: 0.0 };
+    let failure = Trial { position, rotation, width: 10.0, success: false, yaws: 0, share: 0.0, clearance: 0.0 };
     Scene {
         id: format!("{seed:06x}"),
         volumes: vec![(0..n.pow(3)).map(value).collect()],

@@ -1,9 +1,11 @@
-//! Round trips of the three formats, with interruptions and damaged files.
+//! The three formats: round trips, interrupted runs and damaged files.
 
 use std::fs;
 use std::path::Path;
 
-use grasp_data::{DataError, Dataset, Form, MAX_CLEARANCE, Provenance, Scene, Setup, Trial, packed, processed, raw};
+use grasp_data::{
+    DataError, DataFormat, Dataset, MAX_CLEARANCE, Provenance, Scene, Setup, Trial, packed, processed, raw,
+};
 use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 
 const N: usize = 8;
@@ -24,12 +26,12 @@ fn setup() -> Setup {
 
 fn trials(number: u64) -> Vec<Trial> {
     let rotation = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 0.1 * number as f64);
-    let trial = |success, turns, share, clearance| Trial {
+    let trial = |success, yaws, share, clearance| Trial {
         position: Point3::new(1.5, 2.0, number as f64),
         rotation,
         width: 3.25,
         success,
-        turns,
+        yaws,
         share,
         clearance,
     };
@@ -66,13 +68,13 @@ fn pack(folder: &Path, numbers: impl IntoIterator<Item = u64>) {
 fn packed_scenes_round_trip() {
     let folder = tempfile::tempdir().unwrap();
     pack(folder.path(), [0, 1, 3]);
-    assert_eq!(Form::of(folder.path()).unwrap(), Form::Packed);
+    assert_eq!(DataFormat::of(folder.path()).unwrap(), DataFormat::Packed);
     let dataset = Dataset::open(&[folder.path().to_owned()]).unwrap();
     assert_eq!((dataset.len(), dataset.resolution()), (3, N));
     for (index, number) in [0, 1, 3].into_iter().enumerate() {
         assert_eq!(dataset.id(index), format!("{number:08}"));
         assert_same(&dataset.trials(index), &trials(number));
-        assert_eq!(dataset.trials(index)[0].turns, 0b1_0010, "only the packed format stores yaws");
+        assert_eq!(dataset.trials(index)[0].yaws, 0b1_0010, "only the packed format stores yaws");
         assert_eq!(dataset.volumes(index), 2);
         for (observation, volume) in volumes(number).iter().enumerate() {
             let read: Vec<f32> =
@@ -97,9 +99,9 @@ fn of_version(version: u8, bytes: &[u8], trials: usize) -> Vec<u8> {
 
 #[test]
 fn earlier_versions_of_the_packed_format_are_read() {
-    for (version, turns) in [(1, 0), (2, 0b1_0010)] {
+    for (version, yaws) in [(1, 0), (2, 0b1_0010)] {
         let folder = tempfile::tempdir().unwrap();
-        let written: Vec<Trial> = trials(0).into_iter().map(|trial| Trial { turns, ..trial }).collect();
+        let written: Vec<Trial> = trials(0).into_iter().map(|trial| Trial { yaws, ..trial }).collect();
         packed::Writer::open(folder.path(), &setup()).unwrap().append(0, &volumes(0), &written).unwrap();
         let path = folder.path().join("scenes-00000.pack");
         let bytes = fs::read(&path).unwrap();
@@ -110,7 +112,7 @@ fn earlier_versions_of_the_packed_format_are_read() {
         let share = |success| if success { 1.0 } else { 0.0 };
         let known = written.iter().map(|trial| Trial { share: share(trial.success), clearance: 0.0, ..*trial });
         assert_same(&dataset.trials(0), &known.collect::<Vec<_>>());
-        assert_eq!(dataset.trials(0)[0].turns, turns, "version {version}");
+        assert_eq!(dataset.trials(0)[0].yaws, yaws, "version {version}");
         assert_eq!(dataset.volume(0, 1), grasp_data::quantise(&volumes(0)[1]));
         assert_same(&dataset.trials(1), &trials(1));
         assert_eq!(dataset.volume(1, 0), grasp_data::quantise(&volumes(1)[0]));
@@ -118,7 +120,7 @@ fn earlier_versions_of_the_packed_format_are_read() {
 }
 
 #[test]
-fn the_fingerprint_covers_shares_and_clearances() {
+fn the_fingerprint_depends_on_shares_and_clearances() {
     let fingerprint = |change: fn(&mut Trial)| {
         let mut trials = trials(0);
         change(&mut trials[0]);
@@ -137,7 +139,7 @@ fn an_interrupted_packed_run_continues_without_lost_or_duplicate_scenes() {
     let bytes = fs::read(whole.path().join("scenes-00000.pack")).unwrap();
     for length in (0..bytes.len()).step_by(61) {
         let folder = tempfile::tempdir().unwrap();
-        setup().claim(folder.path()).unwrap();
+        setup().write_or_compare(folder.path()).unwrap();
         fs::write(folder.path().join("scenes-00000.pack"), &bytes[..length]).unwrap();
         pack(folder.path(), [0, 1, 3]);
         let reader = packed::Reader::open(folder.path()).unwrap();
@@ -177,7 +179,7 @@ fn scenes_are_read_while_they_are_written() {
 }
 
 #[test]
-fn a_damaged_file_is_named() {
+fn errors_name_the_damaged_file() {
     let folder = tempfile::tempdir().unwrap();
     pack(folder.path(), [0, 1]);
     let path = folder.path().join("scenes-00000.pack");
@@ -204,7 +206,7 @@ fn ranges_of_scenes_are_merged() {
 
     let again = folder.path().join("again");
     let error = packed::merge(&[a.clone(), b.clone(), a.clone()], &again).unwrap_err();
-    assert!(matches!(&error, DataError::Twice { id, .. } if id == "00000000"), "{error}");
+    assert!(matches!(&error, DataError::DuplicateScene { id, .. } if id == "00000000"), "{error}");
     assert!(!again.exists(), "nothing is written before all folders are checked");
 
     let mut other = setup();
@@ -259,7 +261,7 @@ fn raw_scenes_round_trip() {
     assert_eq!(raw::Writer::open(folder.path(), &setup).unwrap().next(), Some(7), "the last scene is written again");
     raw::Writer::open(folder.path(), &setup).unwrap().append("00000007", &views, &trials(7)).unwrap();
 
-    assert_eq!(Form::of(folder.path()).unwrap(), Form::Raw);
+    assert_eq!(DataFormat::of(folder.path()).unwrap(), DataFormat::Raw);
     let reader = raw::Reader::open(folder.path()).unwrap();
     let (id, read) = reader.trials().next().unwrap();
     assert_eq!(id, "00000007");
@@ -276,7 +278,7 @@ fn raw_scenes_round_trip() {
 #[test]
 fn a_folder_with_another_setup_is_refused() {
     let folder = tempfile::tempdir().unwrap();
-    setup().claim(folder.path()).unwrap();
+    setup().write_or_compare(folder.path()).unwrap();
     let mut other = setup();
     other.provenance.as_mut().unwrap().seed = 2;
     assert!(matches!(processed::Writer::open(folder.path(), &other), Err(DataError::OtherSetup { .. })));
@@ -284,7 +286,7 @@ fn a_folder_with_another_setup_is_refused() {
 }
 
 #[test]
-fn invalid_files_and_lines_are_named() {
+fn errors_name_the_invalid_file_and_line() {
     let folder = tempfile::tempdir().unwrap();
     let error = || Dataset::open(&[folder.path().to_owned()]).err().unwrap().to_string();
     assert!(error().contains("holds no grasps"), "{}", error());
@@ -348,7 +350,7 @@ fn columns_are_found_by_name_and_share_and_clearance_are_optional() {
 }
 
 #[test]
-fn scenes_keep_their_side_of_the_split() {
+fn added_scenes_do_not_change_the_split() {
     let folders: Vec<_> = (0..2).map(|_| tempfile::tempdir().unwrap()).collect();
     pack(folders[0].path(), 0..200);
     pack(folders[1].path(), 0..400);

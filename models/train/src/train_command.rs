@@ -1,4 +1,4 @@
-//! The command `train`: a run with its files, progress bar and Ctrl-C.
+//! The command `train`: runs the training, writes its files, shows its progress and handles Ctrl-C.
 
 use std::fs;
 use std::io::ErrorKind;
@@ -12,16 +12,19 @@ use grasp::{RESOLUTION, VoxelOrigin};
 use grasp_data::Dataset;
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Architecture, Metadata, Network, Options};
-use grasp_train::{Augmentation, Checkpoint, Epoch, Execution, Record, Settings, Success, Teacher, Trainer, curves};
+use grasp_train::{
+    Augmentation, BenchmarkRates, Checkpoint, EpochOutcome, EpochRecord, ExecutionOptions, Teacher, Trainer,
+    TrainingSettings, learning_curves,
+};
 use indicatif::{ProgressBar, ProgressStyle};
 use time::OffsetDateTime;
 
 use crate::device;
-use crate::evaluate::{PLACE, evaluate};
-use crate::{Change, Keep, Origin, Training};
+use crate::external_evaluation::{PLACEHOLDER, evaluate};
+use crate::{AugmentArg, KeptWeights, TrainArgs, VoxelOriginArg};
 
-/// Trains until the last epoch or Ctrl-C.
-pub(crate) fn train(training: &Training) -> Result<()> {
+/// Trains until the last epoch, until the patience is used up, or until Ctrl-C.
+pub(crate) fn train(training: &TrainArgs) -> Result<()> {
     if let Some(threads) = training.threads {
         tch::set_num_threads(i32::try_from(threads).context("--threads is too large")?);
     }
@@ -32,14 +35,15 @@ pub(crate) fn train(training: &Training) -> Result<()> {
     if let Some(decay) = training.ema {
         ensure!((0.0..1.0).contains(&decay), "--ema is {decay}, must be at least 0 and less than 1");
     }
+    ensure!(!training.augment.contains(&AugmentArg::Turns), "`--augment turns` is now `--augment rotate`");
     if let Some(command) = &training.evaluate {
         ensure!(
-            command.contains(PLACE),
-            "--evaluate is `{command}`, must contain {PLACE} in place of the model's file"
+            command.contains(PLACEHOLDER),
+            "--evaluate is `{command}`, must contain {PLACEHOLDER} in place of the model's file"
         );
     }
-    let files = Files::beside(&training.out)?;
-    let (model, mut metadata) = start_from(training)?;
+    let files = RunFiles::beside(&training.out)?;
+    let (model, mut metadata) = initial_network(training)?;
     let settings = settings(training, &metadata);
     let dataset = Dataset::open(&training.data)?;
     ensure!(
@@ -49,23 +53,23 @@ pub(crate) fn train(training: &Training) -> Result<()> {
         metadata.resolution
     );
     let device = training.device.device()?;
-    let execution = Execution { device, bf16: training.bf16, channels_last: true };
+    let execution = ExecutionOptions { device, bf16: training.bf16, channels_last: true };
     let mut trainer = Trainer::new(model, dataset, settings.clone(), execution)?;
     if let Some(path) = &training.teacher {
-        let (teacher, name) = teacher(training, path, &metadata)?;
-        trainer = trainer.taught_by(teacher);
+        let (teacher, name) = load_teacher(training, path, &metadata)?;
+        trainer = trainer.with_teacher(teacher);
         metadata.provenance.insert("teacher".to_owned(), name);
     }
 
     let mut records = Vec::new();
-    let mut progress = Progress::default();
+    let mut best = BestResult::default();
     if training.resume {
         let checkpoint = Checkpoint::read(&files.state)?;
         trainer.resume(&checkpoint)?;
-        progress = Progress { best: checkpoint.best, worse: checkpoint.worse };
+        best = BestResult { cost: checkpoint.best, results_since: checkpoint.results_since_best };
         records = files.read_log(trainer.epochs())?;
     }
-    report(&trainer);
+    print_counts(&trainer);
     eprintln!("device: {}", device::name(device));
 
     let stop = Arc::new(AtomicBool::new(false));
@@ -74,11 +78,12 @@ pub(crate) fn train(training: &Training) -> Result<()> {
         .context("cannot install the handler of Ctrl-C")?;
 
     let mut saved = Instant::now();
-    let continues =
-        |epochs: u64, worse: u64| epochs < settings.epochs && training.patience.is_none_or(|patience| worse < patience);
-    while continues(trainer.epochs(), progress.worse) {
+    let continues = |epochs: u64, results_since: u64| {
+        epochs < settings.epochs && training.patience.is_none_or(|patience| results_since < patience)
+    };
+    while continues(trainer.epochs(), best.results_since) {
         if training.follow && trainer.follow()? > 0 {
-            report(&trainer);
+            print_counts(&trainer);
         }
         let bar = progress_bar(trainer.steps_per_epoch(), trainer.epochs() + 1, settings.epochs);
         let epoch = trainer.epoch(&stop, |batch, loss| {
@@ -86,30 +91,30 @@ pub(crate) fn train(training: &Training) -> Result<()> {
             bar.set_message(format!("{loss:.4}"));
         })?;
         bar.finish_and_clear();
-        let mut better = progress.best.is_none();
-        let interrupted = matches!(epoch, Epoch::Interrupted);
-        if let Epoch::Done(mut record) = epoch {
-            describe(training, &settings, trainer.dataset(), &mut metadata);
+        let mut better = best.cost.is_none();
+        let interrupted = matches!(epoch, EpochOutcome::Interrupted);
+        if let EpochOutcome::Completed(mut record) = epoch {
+            add_provenance(training, &settings, trainer.dataset(), &mut metadata);
             let due = trainer.epochs().is_multiple_of(training.evaluate_every) || trainer.epochs() == settings.epochs;
             if let Some(command) = training.evaluate.as_deref().filter(|_| due) {
-                write_model(&mut trainer, &metadata, Some(&record), &files.tried)?;
-                record.success = Some(evaluate(command, &files.tried)?);
+                write_model(&mut trainer, &metadata, Some(&record), &files.evaluated)?;
+                record.benchmark = Some(evaluate(command, &files.evaluated)?);
             }
             println!("{}", serde_json::to_string(&record)?);
-            better = progress.take(training, &record);
+            better = best.update(training, &record);
             records.push(record);
             files.write_log(&records)?;
-            curves::draw(&files.curves, &records)?;
+            learning_curves::draw(&files.curves, &records)?;
         }
-        let Progress { best, worse } = progress;
-        let ends = interrupted || !continues(trainer.epochs(), worse);
+        let BestResult { cost, results_since } = best;
+        let ends = interrupted || !continues(trainer.epochs(), results_since);
         let due = ends || saved.elapsed().as_secs_f64() >= training.save_every;
-        if better || training.keep == Keep::Last && due {
-            describe(training, &settings, trainer.dataset(), &mut metadata);
+        if better || training.keep == KeptWeights::Last && due {
+            add_provenance(training, &settings, trainer.dataset(), &mut metadata);
             write_model(&mut trainer, &metadata, records.last(), &training.out)?;
         }
         if due {
-            Checkpoint { best, worse, ..trainer.checkpoint() }.write(&files.state)?;
+            Checkpoint { best: cost, results_since_best: results_since, ..trainer.checkpoint() }.write(&files.state)?;
             saved = Instant::now();
         }
         if interrupted {
@@ -122,40 +127,44 @@ pub(crate) fn train(training: &Training) -> Result<()> {
 
 /// The best result so far.
 #[derive(Clone, Copy, Default)]
-struct Progress {
+struct BestResult {
     /// Smallest cost.
-    best: Option<f64>,
-    /// Consecutive epochs without a smaller cost.
-    worse: u64,
+    cost: Option<f64>,
+    /// Consecutive results without a smaller cost.
+    results_since: u64,
 }
 
-impl Progress {
-    /// Adds an epoch and returns whether it is the best so far. Without a cost it is the best if no epoch had one.
-    fn take(&mut self, training: &Training, record: &Record) -> bool {
-        let cost = match (&training.evaluate, record.success) {
+impl BestResult {
+    /// Adds an epoch and returns whether it is the best so far. An epoch without a cost is the best if no epoch had one.
+    fn update(&mut self, training: &TrainArgs, record: &EpochRecord) -> bool {
+        let cost = match (&training.evaluate, record.benchmark) {
             // Failed grasps and objects left on the table have the same weight.
-            (Some(_), success) => success.map(|Success { gsr, dr }| 1.0 - (gsr + dr) / 2.0),
+            (Some(_), rates) => rates.map(|BenchmarkRates { gsr, dr }| 1.0 - (gsr + dr) / 2.0),
             (None, _) => record.validation.map(|validation| validation.loss),
         };
-        let Some(cost) = cost else { return self.best.is_none() };
-        let better = self.best.is_none_or(|best| cost < best);
-        *self = if better { Self { best: Some(cost), worse: 0 } } else { Self { worse: self.worse + 1, ..*self } };
+        let Some(cost) = cost else { return self.cost.is_none() };
+        let better = self.cost.is_none_or(|best| cost < best);
+        *self = if better {
+            Self { cost: Some(cost), results_since: 0 }
+        } else {
+            Self { results_since: self.results_since + 1, ..*self }
+        };
         better
     }
 }
 
-fn report(trainer: &Trainer) {
+fn print_counts(trainer: &Trainer) {
     let (training, held_out) = trainer.scenes();
-    let (grasps, successes) = all_grasps(trainer.dataset());
+    let (grasps, successes) = count_grasps(trainer.dataset());
     eprintln!("{training} training scenes, {held_out} validation scenes, {grasps} grasps, {successes} successes");
 }
 
-fn all_grasps(dataset: &Dataset) -> (usize, usize) {
+fn count_grasps(dataset: &Dataset) -> (usize, usize) {
     dataset.grasps(&(0..dataset.len()).collect::<Vec<_>>())
 }
 
 /// The initial network and its metadata.
-fn start_from(training: &Training) -> Result<(ModelProto, Metadata)> {
+fn initial_network(training: &TrainArgs) -> Result<(ModelProto, Metadata)> {
     let model = match (&training.from, &training.network) {
         (Some(path), _) => ModelProto::read(path)?,
         (None, Some(network)) => {
@@ -170,16 +179,16 @@ fn start_from(training: &Training) -> Result<(ModelProto, Metadata)> {
     metadata.name = training.name.clone().unwrap_or(file_name);
     metadata.version.clone_from(&training.model_version);
     metadata.voxel_origin = match training.voxel_origin {
-        Some(Origin::Corner) => VoxelOrigin::Corner,
-        Some(Origin::Center) => VoxelOrigin::Center,
+        Some(VoxelOriginArg::Corner) => VoxelOrigin::Corner,
+        Some(VoxelOriginArg::Center) => VoxelOrigin::Center,
         None if training.from.is_some() => metadata.voxel_origin,
         None => VoxelOrigin::Center,
     };
     Ok((model, metadata))
 }
 
-/// Loads the teacher; returns it with its name, version and weight. It runs in the thread that reads the scenes.
-fn teacher(training: &Training, path: &Path, student: &Metadata) -> Result<(Teacher, String)> {
+/// Loads the teacher. Returns it with its name, version and weight as a text for the metadata.
+fn load_teacher(training: &TrainArgs, path: &Path, student: &Metadata) -> Result<(Teacher, String)> {
     let weight = training.teacher_weight;
     ensure!(weight >= 0.0, "--teacher-weight is {weight}, must be at least 0");
     let network = Network::load(path, &Options::auto(1))?;
@@ -199,14 +208,14 @@ fn teacher(training: &Training, path: &Path, student: &Metadata) -> Result<(Teac
     Ok((Teacher::new(network, weight), name))
 }
 
-/// Settings of the run. VGN's released code trains with Adam at 3e-4 in batches of 32 for 30 epochs; the paper with
-/// 1e-4, 64 and 21. For fine-tuning the metadata name the architecture; VGN is the default.
-fn settings(training: &Training, metadata: &Metadata) -> Settings {
+/// Settings of the run. The defaults are those of VGN's released code (Adam with 3e-4, batches of 32, 30 epochs) and of
+/// the paper (1e-4, 64, 21), by the architecture. With --from it is read from the metadata, by default VGN.
+fn settings(training: &TrainArgs, metadata: &Metadata) -> TrainingSettings {
     let network = training.network.as_ref().or_else(|| metadata.provenance.get("architecture"));
-    let of_paper = network.is_some_and(|network| network.starts_with("transformer"));
-    let (epochs, batch, learning_rate) = if of_paper { (21, 64, 1e-4) } else { (30, 32, 3e-4) };
+    let is_transformer = network.is_some_and(|network| network.starts_with("transformer"));
+    let (epochs, batch, learning_rate) = if is_transformer { (21, 64, 1e-4) } else { (30, 32, 3e-4) };
     let allows = |change| training.augment.contains(&change);
-    Settings {
+    TrainingSettings {
         epochs: training.epochs.unwrap_or(epochs),
         batch: training.batch.unwrap_or(batch),
         accumulate: training.accumulate,
@@ -218,9 +227,9 @@ fn settings(training: &Training, metadata: &Metadata) -> Settings {
         seed: training.seed,
         validation: training.val,
         augmentation: Augmentation {
-            turns: allows(Change::Turns),
-            mirror: allows(Change::Mirror),
-            shift: if allows(Change::Shift) { training.max_shift } else { 0 },
+            rotate: allows(AugmentArg::Rotate),
+            mirror: allows(AugmentArg::Mirror),
+            shift: if allows(AugmentArg::Shift) { training.max_shift } else { 0 },
         },
         balance: training.balance,
         quality: training.quality.into(),
@@ -230,10 +239,10 @@ fn settings(training: &Training, metadata: &Metadata) -> Settings {
     }
 }
 
-/// Writes the origin of the weights to the metadata.
-fn describe(training: &Training, settings: &Settings, dataset: &Dataset, metadata: &mut Metadata) {
+/// Writes the provenance of the weights to the metadata.
+fn add_provenance(training: &TrainArgs, settings: &TrainingSettings, dataset: &Dataset, metadata: &mut Metadata) {
     let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let (grasps, successes) = all_grasps(dataset);
+    let (grasps, successes) = count_grasps(dataset);
     let mut note = |key: &str, value: String| metadata.provenance.insert(key.to_owned(), value);
     note("data", training.data.iter().map(name).collect::<Vec<_>>().join(" "));
     note("scenes", dataset.len().to_string());
@@ -248,14 +257,14 @@ fn describe(training: &Training, settings: &Settings, dataset: &Dataset, metadat
     }
 }
 
-fn write_model(trainer: &mut Trainer, metadata: &Metadata, last: Option<&Record>, path: &Path) -> Result<()> {
+fn write_model(trainer: &mut Trainer, metadata: &Metadata, last: Option<&EpochRecord>, path: &Path) -> Result<()> {
     let mut metadata = metadata.clone();
     let mut note = |key: &str, value: String| metadata.provenance.insert(key.to_owned(), value);
     note("epochs", trainer.epochs().to_string());
     note("steps", trainer.steps().to_string());
     if let Some(record) = last {
         note("loss", record.loss.to_string());
-        if let Some(Success { gsr, dr }) = record.success {
+        if let Some(BenchmarkRates { gsr, dr }) = record.benchmark {
             note("evaluation", format!("GSR {gsr:.3}, DR {dr:.3}"));
         }
         if let Some(validation) = record.validation {
@@ -278,16 +287,16 @@ fn progress_bar(steps: u64, epoch: u64, epochs: u64) -> ProgressBar {
 }
 
 /// The files beside the model.
-struct Files {
+struct RunFiles {
     state: PathBuf,
     log: PathBuf,
     curves: PathBuf,
-    /// The model for --evaluate.
-    tried: PathBuf,
+    /// The model that --evaluate reads.
+    evaluated: PathBuf,
 }
 
-impl Files {
-    /// Creates their folder at the start, so that the first epoch is not lost.
+impl RunFiles {
+    /// Creates their folder before the first epoch, so that an error does not lose the epoch.
     fn beside(model: &Path) -> Result<Self> {
         let folder = model.parent().unwrap_or(Path::new(""));
         fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
@@ -295,12 +304,12 @@ impl Files {
             state: model.with_extension("state"),
             log: model.with_extension("jsonl"),
             curves: model.with_extension("png"),
-            tried: model.with_extension("tried"),
+            evaluated: model.with_extension("tried"),
         })
     }
 
     /// The first `epochs` lines of the log.
-    fn read_log(&self, epochs: u64) -> Result<Vec<Record>> {
+    fn read_log(&self, epochs: u64) -> Result<Vec<EpochRecord>> {
         let text = match fs::read_to_string(&self.log) {
             Err(error) if error.kind() == ErrorKind::NotFound => String::new(),
             text => text.with_context(|| self.log.display().to_string())?,
@@ -309,7 +318,7 @@ impl Files {
         records.collect::<Result<_, _>>().with_context(|| self.log.display().to_string())
     }
 
-    fn write_log(&self, records: &[Record]) -> Result<()> {
+    fn write_log(&self, records: &[EpochRecord]) -> Result<()> {
         let lines =
             records.iter().map(|record| Ok(serde_json::to_string(record)? + "\n")).collect::<Result<String>>()?;
         fs::write(&self.log, lines).with_context(|| self.log.display().to_string())

@@ -1,10 +1,10 @@
 use serde::{Deserialize, Serialize};
 
-use crate::loss::Sums;
+use crate::loss::LossSums;
 
-/// Log record of an epoch.
+/// Results of an epoch: a line of the log.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Record {
+pub struct EpochRecord {
     /// Number of the epoch, from 1.
     pub epoch: u64,
     /// Steps since the start.
@@ -21,9 +21,9 @@ pub struct Record {
     pub loss_width: f64,
     /// Results on the validation scenes, if there are any.
     pub validation: Option<Validation>,
-    /// Results of the benchmark, if it was run.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub success: Option<Success>,
+    /// Results of --evaluate, if it was run.
+    #[serde(rename = "success", default, skip_serializing_if = "Option::is_none")]
+    pub benchmark: Option<BenchmarkRates>,
     /// Duration of the epoch, without the part before an interruption, seconds.
     pub seconds: f64,
     /// Training speed, volumes per second.
@@ -54,7 +54,7 @@ pub struct Validation {
 
 /// Results of a benchmark in simulation, averaged over its conditions.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Success {
+pub struct BenchmarkRates {
     /// Grasp success rate.
     pub gsr: f64,
     /// Declutter rate.
@@ -62,8 +62,8 @@ pub struct Success {
 }
 
 impl Validation {
-    /// From the sums over the validation scenes; `None` without voxels.
-    pub(crate) fn of(sums: &Sums) -> Option<Self> {
+    /// The results from the sums over the validation scenes; `None` without labelled voxels.
+    pub(crate) fn from_sums(sums: &LossSums) -> Option<Self> {
         (sums.voxels > 0.0).then(|| Self {
             loss: sums.loss(),
             loss_quality: sums.quality / sums.voxels,

@@ -6,16 +6,16 @@ use clap::Args;
 use grasp::RESOLUTION;
 use grasp_models::onnx::ModelProto;
 use grasp_models::{with_full_weights, with_published_heads};
-use grasp_train::{Execution, Executor};
+use grasp_train::{ExecutionOptions, Executor};
 use serde::Serialize;
 use tch::{Device, Kind, Tensor};
 
-/// Volumes before the timed ones.
+/// Untimed volumes before the timed ones.
 const WARM_UP: usize = 3;
 
 /// Median latency of libtorch for one volume in fp32, operator by operator, as in PyTorch's eager mode.
 #[derive(Args)]
-pub(crate) struct Time {
+pub(crate) struct EagerLatency {
     /// Model file.
     #[arg(long)]
     model: PathBuf,
@@ -29,7 +29,7 @@ pub(crate) struct Time {
 
 /// The printed report.
 #[derive(Serialize)]
-struct Report {
+struct LatencyReport {
     calls: u32,
     threads: u16,
     /// Median for the graph of the file.
@@ -38,7 +38,7 @@ struct Report {
     published_p50_ms: f64,
 }
 
-impl Time {
+impl EagerLatency {
     pub fn run(&self) -> Result<()> {
         tch::set_num_threads(self.threads.into());
         let model = ModelProto::read(&self.model)?;
@@ -46,15 +46,15 @@ impl Time {
             with_published_heads(&with_full_weights(&model)?).context("--model must be a network of `grasp-train`")?;
         let published_p50_ms = self.median(published)?;
         let p50_ms = self.median(model)?;
-        let report = Report { calls: self.calls, threads: self.threads, p50_ms, published_p50_ms };
+        let report = LatencyReport { calls: self.calls, threads: self.threads, p50_ms, published_p50_ms };
         println!("{}", serde_json::to_string(&report)?);
         Ok(())
     }
 
     /// Median latency, milliseconds.
     fn median(&self, model: ModelProto) -> Result<f64> {
-        let execution = Execution { device: Device::Cpu, bf16: false, channels_last: false };
-        let executor = Executor::new(model, execution)?.as_written();
+        let execution = ExecutionOptions { device: Device::Cpu, bf16: false, channels_last: false };
+        let executor = Executor::new(model, execution)?.without_optimizations();
         let edge = RESOLUTION as i64;
         let volume = Tensor::rand([1, 1, edge, edge, edge], (Kind::Float, Device::Cpu));
         let mut times = Vec::new();

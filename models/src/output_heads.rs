@@ -47,7 +47,7 @@ impl Orientation {
 }
 
 /// Declares the input of a network and returns it: the volume, `[batch, 1, N, N, N]`.
-pub(crate) fn volume(b: &mut Builder, resolution: usize) -> String {
+pub(crate) fn volume_input(b: &mut Builder, resolution: usize) -> String {
     b.input(INPUT, &[1, resolution, resolution, resolution])
 }
 
@@ -56,10 +56,16 @@ pub(crate) fn volume(b: &mut Builder, resolution: usize) -> String {
 ///
 /// The 5³ convolutions of all three heads read the same features, so they are merged into one convolution. The result
 /// is the same, and it takes half the time of the whole of VGN.
-pub(crate) fn heads(b: &mut Builder, features: &str, channels: usize, resolution: usize, orientation: Orientation) {
+pub(crate) fn output_heads(
+    b: &mut Builder,
+    features: &str,
+    channels: usize,
+    resolution: usize,
+    orientation: Orientation,
+) {
     let outputs = orientation.outputs();
     let all = b.conv(HEADS, features, Conv { inputs: channels, outputs, kernel: 5, stride: 1, bias: true });
-    let sizes = b.whole(&[1, orientation.channels() as i64, 1]);
+    let sizes = b.integers(&[1, orientation.channels() as i64, 1]);
     let [quality, rotation, width] = b.nodes("Split", &[&all, &sizes], vec![AttributeProto::int("axis", 1)]);
     let quality = b.node("Sigmoid", &[&quality], vec![]);
     let rotation = match orientation {
@@ -118,13 +124,13 @@ pub fn with_published_heads(model: &ModelProto) -> Option<ModelProto> {
 /// multiplied by (x + iy)², which is the level direction for a flat approach, represents a level grasp for all azimuths
 /// with one number.
 fn from_axes(b: &mut Builder, axes: &str) -> String {
-    let sizes = b.whole(&[3, 2, 1]);
+    let sizes = b.integers(&[3, 2, 1]);
     let [approach, turn, level] = b.nodes("Split", &[axes, &sizes], vec![AttributeProto::int("axis", 1)]);
 
     // The tilt maps (1, 0, 0) to the approach; its quaternion is 1 + approach, normalised. Multiplied by the half turn
     // about x that points the hand down, it is (a, 0, x, −y).
     let approach = normalize(b, &approach);
-    let tilt = half_way(b, &approach, 3);
+    let tilt = halfway(b, &approach, 3);
     let [a, x, y] = split(b, &tilt);
 
     let direction = level_direction(b, &approach);
@@ -132,8 +138,8 @@ fn from_axes(b: &mut Builder, axes: &str) -> String {
     let turn = b.node("Add", &[&turn, &level], vec![]);
     // The angle is halved twice: the quaternion (0, 0, −s, c) rotates by −ψ.
     let turn = normalize(b, &turn);
-    let turn = half_way(b, &turn, 2);
-    let turn = half_way(b, &turn, 2);
+    let turn = halfway(b, &turn, 2);
+    let turn = halfway(b, &turn, 2);
     let [c, s] = split(b, &turn);
 
     let [ac, r#as, xc, xs, yc, ys] = [[&a, &c], [&a, &s], [&x, &c], [&x, &s], [&y, &c], [&y, &s]]
@@ -154,7 +160,7 @@ fn level_direction(b: &mut Builder, approach: &str) -> String {
 }
 
 /// The unit vector halfway between (1, 0, …) and a unit vector.
-fn half_way(b: &mut Builder, x: &str, channels: usize) -> String {
+fn halfway(b: &mut Builder, x: &str, channels: usize) -> String {
     let mut first = vec![0.0; channels];
     first[0] = 1.0;
     let first = b.tensor(&[1, channels, 1, 1, 1], &first);
@@ -164,7 +170,7 @@ fn half_way(b: &mut Builder, x: &str, channels: usize) -> String {
 
 /// Splits an array into its channels.
 fn split<const N: usize>(b: &mut Builder, x: &str) -> [String; N] {
-    let sizes = b.whole(&[1; N]);
+    let sizes = b.integers(&[1; N]);
     b.nodes("Split", &[x, &sizes], vec![AttributeProto::int("axis", 1)])
 }
 

@@ -18,12 +18,12 @@ pub(crate) const FILE: &str = "grasps.csv";
 
 /// The unit of a table's positions and widths.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Unit {
+pub(crate) enum LengthUnit {
     Metres,
     Voxels,
 }
 
-impl Unit {
+impl LengthUnit {
     /// The header that the writer writes.
     fn header(self) -> &'static str {
         match self {
@@ -71,8 +71,8 @@ pub(crate) struct TableWriter {
 
 impl TableWriter {
     /// Opens a folder's table, which is new or was written by an earlier run. The last scene of that run may be
-    /// incomplete: its rows are removed and its number is returned, as the next scene to write.
-    pub(crate) fn open(folder: &Path, unit: Unit) -> Result<(Self, Option<u64>), DataError> {
+    /// incomplete. Its rows are removed, and its number is returned as the next scene to write.
+    pub(crate) fn open(folder: &Path, unit: LengthUnit) -> Result<(Self, Option<u64>), DataError> {
         let path = folder.join(FILE);
         let mut file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path).at(&path)?;
         let (kept, last) = last_scene(&file).at(&path)?;
@@ -103,14 +103,14 @@ impl TableWriter {
     }
 }
 
-/// Rows of the current version must not follow the shorter rows of an earlier version.
-fn check_columns(path: &Path, unit: Unit) -> Result<(), DataError> {
+/// Checks that the header is that of the current version, because its rows are longer than those of earlier versions.
+fn check_columns(path: &Path, unit: LengthUnit) -> Result<(), DataError> {
     let mut header = String::new();
     BufReader::new(File::open(path).at(path)?).read_line(&mut header).at(path)?;
     if header.trim_end() == unit.header() {
         return Ok(());
     }
-    let reason = format!("the header must be `{}` to append rows: write into another folder", unit.header());
+    let reason = format!("the header must be `{}` to append rows; write into another folder", unit.header());
     Err(DataError::Row { path: path.to_owned(), line: 1, reason, columns: unit.columns() })
 }
 
@@ -120,8 +120,7 @@ fn last_scene(table: &File) -> io::Result<(u64, Option<u64>)> {
     let mut line = String::new();
     let (mut offset, mut start, mut last) = (0, 0, None);
     while reader.read_line(&mut line)? > 0 {
-        // A row without a line end may be cut off anywhere, even in the scene number, so it counts as part of the
-        // previous scene.
+        // A row without a line end may be truncated within the scene number. It is counted with the previous scene.
         if line.ends_with('\n')
             && let Some(number) = line.split(',').next().and_then(|id| id.parse::<u64>().ok())
             && last != Some(number)
@@ -156,13 +155,13 @@ struct Row {
     clearance: Option<f32>,
 }
 
-/// The column may be missing, but not a value in it: an empty value belongs to a row that was cut off.
+/// Parses an optional column. If the column exists, every row must have a value: an empty value is a truncated row.
 fn number<'de, D: Deserializer<'de>>(value: D) -> Result<Option<f32>, D::Error> {
     f32::deserialize(value).map(Some)
 }
 
 /// Reads the trials of each scene from a folder's table, in the unit of the table.
-pub(crate) fn read(folder: &Path, unit: Unit) -> Result<BTreeMap<String, Vec<Trial>>, DataError> {
+pub(crate) fn read(folder: &Path, unit: LengthUnit) -> Result<BTreeMap<String, Vec<Trial>>, DataError> {
     let path = folder.join(FILE);
     let wrong = |line, reason| DataError::Row { path: path.clone(), line, reason, columns: unit.columns() };
     let mut reader = csv::Reader::from_reader(File::open(&path).at(&path)?);
@@ -214,7 +213,7 @@ impl Row {
             rotation: UnitQuaternion::from_quaternion(rotation),
             width,
             success,
-            turns: 0,
+            yaws: 0,
             share,
             clearance,
         })

@@ -6,18 +6,19 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use tch::{Device, Kind, Tensor, no_grad};
 
-use crate::{Adam, Examples, ExecuteError, Execution, Executor};
+use crate::{Adam, CandidateDataset, ExecuteError, ExecutionOptions, Executor};
 
 /// Trains the classifier of grasp candidates with Adam and class-balanced cross-entropy.
-pub struct Learner<'a> {
+pub struct ClassifierTrainer<'a> {
     executor: Executor,
     adam: Adam,
-    examples: &'a Examples,
+    dataset: &'a CandidateDataset,
     /// Indices of the training candidates, shuffled in each epoch.
     training: Vec<i64>,
-    held_out: Vec<i64>,
-    /// Weights of the classes.
-    weight: Tensor,
+    /// Indices of the validation candidates.
+    validation: Vec<i64>,
+    /// Weights of failures and of successes in the loss, n / (2 n_class).
+    class_weights: Tensor,
     settings: ClassifierSettings,
     rng: ChaCha8Rng,
 }
@@ -37,9 +38,9 @@ pub struct ClassifierSettings {
     pub bf16: bool,
 }
 
-/// Metrics of a classifier.
+/// Metrics of a classifier over the training or the validation candidates.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Tally {
+pub struct ClassifierMetrics {
     /// Mean class-balanced loss.
     pub loss: f64,
     /// Share of correctly classified candidates.
@@ -50,27 +51,32 @@ pub struct Tally {
     pub recall: f64,
 }
 
-impl<'a> Learner<'a> {
-    /// Prepares to train `model` on `examples`.
+impl<'a> ClassifierTrainer<'a> {
+    /// Prepares to train `model` on `dataset`.
     ///
     /// # Errors
     /// [`ExecuteError`] names the node that cannot be executed.
-    pub fn new(model: ModelProto, examples: &'a Examples, settings: ClassifierSettings) -> Result<Self, ExecuteError> {
+    pub fn new(
+        model: ModelProto,
+        dataset: &'a CandidateDataset,
+        settings: ClassifierSettings,
+    ) -> Result<Self, ExecuteError> {
         let ClassifierSettings { validation, seed, bf16, .. } = settings;
-        let execution = Execution { device: Device::cuda_if_available(), bf16, channels_last: false };
+        let execution = ExecutionOptions { device: Device::cuda_if_available(), bf16, channels_last: false };
         let executor = Executor::new(model, execution)?;
-        let (training, held_out) = examples.split(validation);
-        let weight = examples.classes(&training).map(|count| training.len() as f32 / (2.0 * count.max(1) as f32));
-        let weight = Tensor::from_slice(&weight).to_device(executor.device());
+        let (training, validation) = dataset.split(validation);
+        let class_weights =
+            dataset.class_counts(&training).map(|count| training.len() as f32 / (2.0 * count.max(1) as f32));
+        let class_weights = Tensor::from_slice(&class_weights).to_device(executor.device());
         let adam = Adam::new(executor.parameters(), 0.0);
         let rng = ChaCha8Rng::seed_from_u64(seed);
-        Ok(Self { executor, adam, examples, training, held_out, weight, settings, rng })
+        Ok(Self { executor, adam, dataset, training, validation, class_weights, settings, rng })
     }
 
     /// Number of training and validation candidates.
     #[must_use]
     pub fn candidates(&self) -> (usize, usize) {
-        (self.training.len(), self.held_out.len())
+        (self.training.len(), self.validation.len())
     }
 
     /// Steps in an epoch.
@@ -83,28 +89,28 @@ impl<'a> Learner<'a> {
     ///
     /// # Errors
     /// [`ExecuteError`] names the node at which it failed.
-    pub fn epoch(&mut self, mut progress: impl FnMut()) -> Result<Tally, ExecuteError> {
+    pub fn epoch(&mut self, mut progress: impl FnMut()) -> Result<ClassifierMetrics, ExecuteError> {
         self.training.shuffle(&mut self.rng);
-        let mut counts = Counts::default();
+        let mut sums = MetricSums::default();
         for indices in self.training.chunks(self.settings.batch) {
-            let loss = counts.add(&self.executor, self.examples, &self.weight, indices)?;
+            let loss = sums.add(&self.executor, self.dataset, &self.class_weights, indices)?;
             loss.backward();
             self.adam.step(self.executor.parameters(), self.settings.learning_rate);
             progress();
         }
-        Ok(counts.tally())
+        Ok(sums.metrics())
     }
 
     /// The metrics on the validation candidates; `None` if there are none.
     ///
     /// # Errors
     /// [`ExecuteError`] names the node at which it failed.
-    pub fn validate(&self) -> Result<Option<Tally>, ExecuteError> {
-        let mut counts = Counts::default();
-        for indices in self.held_out.chunks(self.settings.batch) {
-            let _ = no_grad(|| counts.add(&self.executor, self.examples, &self.weight, indices))?;
+    pub fn validate(&self) -> Result<Option<ClassifierMetrics>, ExecuteError> {
+        let mut sums = MetricSums::default();
+        for indices in self.validation.chunks(self.settings.batch) {
+            let _ = no_grad(|| sums.add(&self.executor, self.dataset, &self.class_weights, indices))?;
         }
-        Ok((!self.held_out.is_empty()).then(|| counts.tally()))
+        Ok((!self.validation.is_empty()).then(|| sums.metrics()))
     }
 
     /// The model with the current weights.
@@ -114,47 +120,47 @@ impl<'a> Learner<'a> {
     }
 }
 
-/// Confusion matrix and loss.
+/// Confusion matrix and weighted sum of the loss, from which the metrics are computed.
 #[derive(Default)]
-struct Counts {
-    /// `[predicted success][success]`.
-    candidates: [[f64; 2]; 2],
+struct MetricSums {
+    /// Number of candidates, `[predicted success][success]`.
+    confusion: [[f64; 2]; 2],
     loss: f64,
     weight: f64,
 }
 
-impl Counts {
-    /// Classifies candidates, counts them and returns the mean loss with its gradient graph.
+impl MetricSums {
+    /// Classifies candidates and adds their results. Returns the mean loss, from which gradients can be computed.
     fn add(
         &mut self,
         executor: &Executor,
-        examples: &Examples,
-        weight: &Tensor,
+        dataset: &CandidateDataset,
+        class_weights: &Tensor,
         indices: &[i64],
     ) -> Result<Tensor, ExecuteError> {
-        let (images, classes) = examples.batch(indices);
+        let (images, classes) = dataset.batch(indices);
         let (images, classes) = (images.to_device(executor.device()), classes.to_device(executor.device()));
         let scores = executor.output(&images, OUTPUT)?;
-        let loss = scores.cross_entropy_loss(&classes, Some(weight), tch::Reduction::Mean, -100, 0.0);
-        let batch_weight = weight.index_select(0, &classes).sum(Kind::Double).double_value(&[]);
+        let loss = scores.cross_entropy_loss(&classes, Some(class_weights), tch::Reduction::Mean, -100, 0.0);
+        let batch_weight = class_weights.index_select(0, &classes).sum(Kind::Double).double_value(&[]);
         self.loss += loss.double_value(&[]) * batch_weight;
         self.weight += batch_weight;
         let predictions = scores.argmax(1, false);
         for [predicted, actual] in [[0, 0], [0, 1], [1, 0], [1, 1]] {
             let both = predictions.eq(predicted).logical_and(&classes.eq(actual));
-            self.candidates[predicted as usize][actual as usize] += both.sum(Kind::Double).double_value(&[]);
+            self.confusion[predicted as usize][actual as usize] += both.sum(Kind::Double).double_value(&[]);
         }
         Ok(loss)
     }
 
-    fn tally(&self) -> Tally {
-        let [[right_failures, missed], [false_alarms, right_successes]] = self.candidates;
+    fn metrics(&self) -> ClassifierMetrics {
+        let [[true_negatives, false_negatives], [false_positives, true_positives]] = self.confusion;
         let share = |part: f64, whole: f64| if whole > 0.0 { part / whole } else { 0.0 };
-        Tally {
+        ClassifierMetrics {
             loss: share(self.loss, self.weight),
-            accuracy: share(right_failures + right_successes, self.candidates.iter().flatten().sum()),
-            precision: share(right_successes, right_successes + false_alarms),
-            recall: share(right_successes, right_successes + missed),
+            accuracy: share(true_negatives + true_positives, self.confusion.iter().flatten().sum()),
+            precision: share(true_positives, true_positives + false_positives),
+            recall: share(true_positives, true_positives + false_negatives),
         }
     }
 }

@@ -17,20 +17,20 @@ fn random_trial(rng: &mut ChaCha8Rng) -> Trial {
         rng.random_range(-1.5..1.5),
         rng.random_range(-3.0..3.0),
     );
-    let turns = rng.random::<u8>() & 0b1_1110;
+    let yaws = rng.random::<u8>() & 0b1_1110;
     let (share, clearance) = (rng.random(), rng.random_range(0.0..MAX_CLEARANCE));
-    Trial { position, rotation, width: 5.0, success: true, turns, share, clearance }
+    Trial { position, rotation, width: 5.0, success: true, yaws, share, clearance }
 }
 
 /// Points that define a grasp up to its symmetry: the finger base and the two fingertips; for the grasp and for each
-/// other valid turn.
+/// other valid yaw.
 fn points(trial: &Trial) -> Vec<[Point3<f64>; 3]> {
-    let hold = |rotation| {
+    let points_of = |rotation| {
         let pose = Isometry3::from_parts(Translation3::from(trial.position), rotation);
         let [left, right] = [-1.0, 1.0].map(|side| pose * Point3::new(0.0, side * trial.width / 2.0, 6.0));
         [trial.position, left, right]
     };
-    trial.rotations().map(hold).collect()
+    trial.rotations().map(points_of).collect()
 }
 
 /// Whether two grasps are the same, with the fingers in either order.
@@ -39,18 +39,18 @@ fn same([base, left, right]: [Point3<f64>; 3], other: [Point3<f64>; 3]) -> bool 
     close([base, left, right]) || close([base, right, left])
 }
 
-/// A point of a scene after the transform.
-type Move<'a> = &'a dyn Fn(Point3<f64>) -> Point3<f64>;
+/// Maps a point of a scene to the transformed scene.
+type PointMap<'a> = &'a dyn Fn(Point3<f64>) -> Point3<f64>;
 
 #[test]
-fn a_transformed_label_is_the_label_of_the_transformed_scene() {
+fn a_trial_is_transformed_like_its_scene() {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let edge = N as f64;
-    let turned = |p: Point3<f64>| Point3::new(edge - p.y, p.x, p.z);
+    let rotated = |p: Point3<f64>| Point3::new(edge - p.y, p.x, p.z);
     let mirrored = |p: Point3<f64>| Point3::new(edge - p.x, p.y, p.z);
     let shifted = |p: Point3<f64>| Point3::new(p.x, p.y, p.z - 2.0);
-    let moves: [(Transform, Move); 3] = [
-        (Transform { turns: 1, ..Transform::default() }, &turned),
+    let moves: [(Transform, PointMap); 3] = [
+        (Transform { quarter_turns: 1, ..Transform::default() }, &rotated),
         (Transform { mirror: true, ..Transform::default() }, &mirrored),
         (Transform { shift: -2, ..Transform::default() }, &shifted),
     ];
@@ -73,10 +73,10 @@ fn a_transformed_label_is_the_label_of_the_transformed_scene() {
 }
 
 #[test]
-fn the_grid_moves_with_the_label() {
+fn a_volume_is_transformed_like_its_trials() {
     // One voxel differs, with the label at its centre. The transform must preserve this.
     let mut rng = ChaCha8Rng::seed_from_u64(2);
-    let all = Augmentation { turns: true, mirror: true, shift: 2 };
+    let all = Augmentation { rotate: true, mirror: true, shift: 2 };
     for _ in 0..50 {
         let cell: [usize; 3] = std::array::from_fn(|_| rng.random_range(2..N - 2));
         let mut grid = vec![0; N.pow(3)];
@@ -93,19 +93,22 @@ fn the_grid_moves_with_the_label() {
 }
 
 #[test]
-fn four_quarter_turns_are_the_identity() {
+fn four_rotations_by_90_degrees_are_the_identity() {
     let scene = support::scene(3, N);
-    let turn = |turns| Transform { turns, ..Transform::default() };
+    let by_quarters = |quarter_turns| Transform { quarter_turns, ..Transform::default() };
     let mut grid = vec![0.0; N.pow(3)];
-    turn(4).volume(&scene.volumes[0], N, &mut grid);
+    by_quarters(4).volume(&scene.volumes[0], N, &mut grid);
     assert!(grid.iter().zip(&scene.volumes[0]).all(|(a, b)| *a == grasp_data::value(*b)));
     let trial = &scene.trials[0];
-    let turned = turn(4).trial(trial, N);
-    assert!((turned.position - trial.position).norm() < 1e-12);
-    assert!(turned.rotation.angle_to(&trial.rotation) < 1e-9);
-    assert!((turn(1).trial(trial, N).position - trial.position).norm() > 1e-3, "one turn is not the identity");
-    let twice = turn(1).trial(&turn(1).trial(trial, N), N);
-    assert!((twice.position - turn(2).trial(trial, N).position).norm() < 1e-12);
+    let rotated = by_quarters(4).trial(trial, N);
+    assert!((rotated.position - trial.position).norm() < 1e-12);
+    assert!(rotated.rotation.angle_to(&trial.rotation) < 1e-9);
+    assert!(
+        (by_quarters(1).trial(trial, N).position - trial.position).norm() > 1e-3,
+        "one rotation by 90° is not the identity"
+    );
+    let twice = by_quarters(1).trial(&by_quarters(1).trial(trial, N), N);
+    assert!((twice.position - by_quarters(2).trial(trial, N).position).norm() < 1e-12);
 }
 
 #[test]
@@ -113,9 +116,9 @@ fn all_allowed_transforms_are_drawn_and_no_others() {
     let mut rng = ChaCha8Rng::seed_from_u64(4);
     let mut draw = |allowed: Augmentation| (0..200).map(|_| allowed.draw(&mut rng)).collect::<Vec<_>>();
     assert!(draw(Augmentation::default()).iter().all(|t| *t == Transform::default()));
-    let drawn = draw(Augmentation { turns: true, mirror: true, shift: 1 });
-    assert!((0..4).all(|turns| drawn.iter().any(|t| t.turns == turns)));
+    let drawn = draw(Augmentation { rotate: true, mirror: true, shift: 1 });
+    assert!((0..4).all(|quarters| drawn.iter().any(|t| t.quarter_turns == quarters)));
     assert!([false, true].iter().all(|mirror| drawn.iter().any(|t| t.mirror == *mirror)));
     assert!((-1..=1).all(|shift| drawn.iter().any(|t| t.shift == shift)));
-    assert!(drawn.iter().all(|t| t.shift.abs() <= 1 && t.turns < 4));
+    assert!(drawn.iter().all(|t| t.shift.abs() <= 1 && t.quarter_turns < 4));
 }

@@ -12,10 +12,10 @@ use crate::onnx::{AttributeProto, DataType, GraphProto, ModelProto, NodeProto, T
 const SUFFIX: &str = ".f16";
 
 /// Smallest number of elements to convert. Smaller tensors, such as biases and norm scales, stay f32.
-const SMALLEST: usize = 1024;
+const MIN_ELEMENTS: usize = 1024;
 
 /// Largest finite f16.
-const LARGEST: f32 = 65504.0;
+const F16_MAX: f32 = 65504.0;
 
 /// The model with its weights stored as f16. Weights with values beyond the range of f16 stay f32.
 ///
@@ -26,11 +26,11 @@ pub fn with_half_weights(model: &ModelProto) -> Result<ModelProto, TensorError> 
     let Some(graph) = &mut model.graph else { return Ok(model) };
     let mut casts = Vec::new();
     for weight in &mut graph.initializer {
-        if weight.element_type() != DataType::Float || weight.elements() < SMALLEST {
+        if weight.element_type() != DataType::Float || weight.elements() < MIN_ELEMENTS {
             continue;
         }
         let values = weight.to_f32()?;
-        if !values.iter().all(|value| value.abs() <= LARGEST) {
+        if !values.iter().all(|value| value.abs() <= F16_MAX) {
             continue;
         }
         let (name, stored) = (weight.name().to_owned(), format!("{}{SUFFIX}", weight.name()));

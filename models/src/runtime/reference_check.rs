@@ -13,8 +13,8 @@ use crate::RuntimeError;
 const QUALITY: Limit = Limit { mean: 0.01, largest: 0.2 };
 /// In voxels.
 const WIDTH: Limit = Limit { mean: 0.1, largest: 4.0 };
-/// Half the squared distance between two quaternions, up to sign: 1 − |r·r*| for unit quaternions. For symmetric
-/// objects, rounding can flip the rotation, so only the mean is limited.
+/// Half the squared distance between two quaternions, up to sign: 1 − |r·r*| for unit quaternions. Rounding can exchange
+/// equivalent rotations of symmetric objects, so only the mean is limited: the largest possible difference is 1.
 const ROTATION: Limit = Limit { mean: 0.02, largest: 1.0 };
 
 struct Limit {
@@ -34,25 +34,25 @@ pub(super) fn difference(
     let expected = expected.maps(0);
     for size in batch_sizes(max_batch) {
         let got = network.infer(&vec![&volume; size])?;
-        // The last volume of the batch, to detect errors in batching.
-        if let Some(what) = apart(&got.maps(size - 1), &expected) {
+        // The last volume, because an error in the batching shows there.
+        if let Some(what) = excess(&got.maps(size - 1), &expected) {
             return Ok(Some(if size == 1 { what } else { format!("in a batch of {size}, {what}") }));
         }
     }
     Ok(None)
 }
 
-fn apart(got: &Maps, expected: &Maps) -> Option<String> {
-    let apart = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).collect::<Vec<_>>();
+fn excess(got: &Maps, expected: &Maps) -> Option<String> {
+    let absolute = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).collect::<Vec<_>>();
     let differences = [
-        ("quality", apart(got.quality, expected.quality), QUALITY),
-        ("width", apart(got.width, expected.width), WIDTH),
-        ("rotation", turned(got, expected), ROTATION),
+        ("quality", absolute(got.quality, expected.quality), QUALITY),
+        ("width", absolute(got.width, expected.width), WIDTH),
+        ("rotation", rotation_differences(got, expected), ROTATION),
     ];
     differences.into_iter().find_map(|(name, differences, limit)| {
         let mean = differences.iter().sum::<f32>() / differences.len().max(1) as f32;
         let largest = differences.iter().copied().fold(0.0, f32::max);
-        // Written so that NaN fails.
+        // With NaN both comparisons are false.
         let agrees = mean <= limit.mean && largest <= limit.largest;
         (!agrees).then(|| {
             format!(
@@ -63,22 +63,22 @@ fn apart(got: &Maps, expected: &Maps) -> Option<String> {
     })
 }
 
-fn turned(got: &Maps, expected: &Maps) -> Vec<f32> {
+fn rotation_differences(got: &Maps, expected: &Maps) -> Vec<f32> {
     let voxels = got.quality.len();
     let at = |maps: &Maps, voxel: usize| [0, 1, 2, 3].map(|channel| maps.rotation[channel * voxels + voxel]);
-    let apart = |voxel: usize| -> f32 {
+    let difference = |voxel: usize| -> f32 {
         let pairs = || at(got, voxel).into_iter().zip(at(expected, voxel));
-        let [minus, plus]: [f32; 2] =
+        let [same_sign, opposite_sign]: [f32; 2] =
             [pairs().map(|(a, b)| (a - b).powi(2)).sum(), pairs().map(|(a, b)| (a + b).powi(2)).sum()];
-        minus.min(plus) / 2.0
+        same_sign.min(opposite_sign) / 2.0
     };
-    (0..voxels).map(apart).collect()
+    (0..voxels).map(difference).collect()
 }
 
-/// A ball and a post on a table, as seen by a camera from above.
+/// The test volume: a ball and a post on a table, seen from above.
 pub(super) fn sample(resolution: usize, voxel_size: f64) -> Volume {
     let size = resolution as f64;
-    // In units of the edge.
+    // Signed distance to the nearest surface; lengths in units of the edge.
     let distance = |x: f64, y: f64, z: f64| {
         let table = z - 0.17;
         let ball = ((x - 0.35).powi(2) + (y - 0.4).powi(2) + (z - 0.3).powi(2)).sqrt() - 0.13;

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use grasp_models::gpd::{describe, gpd};
-use grasp_train::{ClassifierSettings, Examples, Learner, Tally};
+use grasp_train::{CandidateDataset, ClassifierMetrics, ClassifierSettings, ClassifierTrainer};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use time::OffsetDateTime;
@@ -47,12 +47,12 @@ pub(crate) struct Classify {
     threads: Option<usize>,
 }
 
-/// A line of the log.
+/// A line of the output: the metrics of an epoch.
 #[derive(Serialize)]
-struct Record {
+struct ClassifierEpochRecord {
     epoch: u64,
-    training: Tally,
-    validation: Option<Tally>,
+    training: ClassifierMetrics,
+    validation: Option<ClassifierMetrics>,
 }
 
 impl Classify {
@@ -64,7 +64,7 @@ impl Classify {
         if let Some(folder) = self.out.parent() {
             fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
         }
-        let examples = Examples::read(&self.data)?;
+        let examples = CandidateDataset::read(&self.data)?;
         let settings = ClassifierSettings {
             batch: usize::from(self.batch),
             learning_rate: self.lr,
@@ -72,8 +72,8 @@ impl Classify {
             seed: self.seed,
             bf16: self.bf16,
         };
-        let mut learner = Learner::new(gpd(self.seed), &examples, settings)?;
-        let (training, held_out) = learner.candidates();
+        let mut trainer = ClassifierTrainer::new(gpd(self.seed), &examples, settings)?;
+        let (training, held_out) = trainer.candidates();
         ensure!(training > 0, "--val is {}, which leaves no scene for training; use a smaller share", self.val);
         eprintln!(
             "{training} training candidates, {held_out} validation candidates, {} successes",
@@ -82,15 +82,15 @@ impl Classify {
 
         let mut best = f64::INFINITY;
         for epoch in 1..=self.epochs {
-            let bar = self.progress_bar(learner.steps_per_epoch(), epoch)?;
-            let training = learner.epoch(|| bar.inc(1))?;
+            let bar = self.progress_bar(trainer.steps_per_epoch(), epoch)?;
+            let training = trainer.epoch(|| bar.inc(1))?;
             bar.finish_and_clear();
-            let record = Record { epoch, training, validation: learner.validate()? };
+            let record = ClassifierEpochRecord { epoch, training, validation: trainer.validate()? };
             println!("{}", serde_json::to_string(&record)?);
             let loss = record.validation.map_or(f64::NEG_INFINITY, |validation| validation.loss);
             if loss <= best {
                 best = loss;
-                self.write(&learner, &examples, &record)?;
+                self.write(&trainer, &examples, &record)?;
             }
         }
         Ok(())
@@ -102,8 +102,13 @@ impl Classify {
         Ok(ProgressBar::new(steps).with_style(style).with_prefix(prefix))
     }
 
-    /// Writes the classifier with the origin of its weights.
-    fn write(&self, learner: &Learner, examples: &Examples, record: &Record) -> Result<()> {
+    /// Writes the classifier with the provenance of its weights.
+    fn write(
+        &self,
+        trainer: &ClassifierTrainer,
+        examples: &CandidateDataset,
+        record: &ClassifierEpochRecord,
+    ) -> Result<()> {
         let name = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let mut provenance = BTreeMap::new();
         let mut note = |key: &str, value: String| provenance.insert(key.to_owned(), value);
@@ -121,7 +126,7 @@ impl Classify {
         if let Some(validation) = record.validation {
             note("validation", serde_json::to_string(&validation)?);
         }
-        let mut model = learner.model();
+        let mut model = trainer.model();
         describe(&mut model, &name(&self.out), &self.model_version, &provenance);
         Ok(model.write(&self.out)?)
     }

@@ -2,8 +2,8 @@
 //!
 //! Training runs the graph that is served: each node becomes the equivalent libtorch operation, each weight a trainable
 //! tensor. Weights are the floating-point initializers, except scalars (rank 0) and parameters of an operator, such as
-//! the bounds of a `Clip`. Only the operators of grasp networks are implemented. Other operators and attributes are an
-//! error when the graph is loaded, because ignoring them would train a different network.
+//! the bounds of a `Clip`. Only the operators of grasp networks are implemented. A graph with other operators or
+//! attributes is an error when it is loaded, because ignoring them would train a different network.
 
 use std::collections::{HashMap, HashSet};
 use std::ops::RangeInclusive;
@@ -13,8 +13,8 @@ use grasp_models::{upsampled_convolutions, with_full_weights};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 use thiserror::Error;
 
-use crate::heads::{cubes, heads};
-use crate::operators::{Step, check, supported};
+use crate::operators::{NodeCall, check_supported, supported};
+use crate::pointwise::{cubes, head_convolutions};
 
 /// Supported versions of ONNX's operator set. In earlier ones `Split`, `Softmax` and others have another meaning or
 /// have attributes instead of inputs. Later ones are untested.
@@ -41,14 +41,14 @@ pub enum ExecuteError {
         /// Its operator.
         op: String,
     },
-    /// An attribute of an operator is not supported.
+    /// An attribute or an input of an operator is not supported.
     #[error("node `{node}` ({op}): {what} is not supported")]
-    Setting {
+    Unsupported {
         /// The node.
         node: String,
         /// Its operator.
         op: String,
-        /// The attribute.
+        /// The attribute or input.
         what: String,
     },
     /// A node reads a value that no earlier node computes.
@@ -76,19 +76,19 @@ pub enum ExecuteError {
     Output(String),
     /// The requested voxels are not in the batch.
     #[error("the voxels cannot be selected from the maps: {0}")]
-    Cells(TchError),
+    Voxels(TchError),
     /// The values of an initializer cannot be used.
     #[error(transparent)]
     Tensor(#[from] TensorError),
 }
 
-/// How the graph is executed. Only bf16 changes the numerical results, by its precision.
+/// How the graph is executed. Only `bf16` changes the results, within its precision.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Execution {
+pub struct ExecutionOptions {
     /// Device.
     pub device: Device,
-    /// Convolutions, matrix products and uncritical operators after them in bfloat16, as in PyTorch's autocast.
-    /// Weights, sums, softmax, layer norms and outputs are f32.
+    /// Convolutions, matrix products and the operators that keep the type of their input in bfloat16, as in PyTorch's
+    /// autocast. Weights, sums, softmax, layer norms and outputs are f32.
     pub bf16: bool,
     /// Memory layout with the channels of a voxel adjacent.
     pub channels_last: bool,
@@ -97,7 +97,7 @@ pub struct Execution {
 /// A network whose weights can be trained.
 pub struct Executor {
     model: ModelProto,
-    execution: Execution,
+    execution: ExecutionOptions,
     /// The weights, in the order of the initializers.
     parameters: Vec<(String, Tensor)>,
     constants: HashMap<String, Tensor>,
@@ -108,7 +108,7 @@ pub struct Executor {
 }
 
 /// The outputs of a grasp network, f32: for a batch of volumes, or at single voxels, which are volumes of 1³.
-pub struct Outputs {
+pub struct NetworkOutputs {
     /// `[batch, 1, N, N, N]`, in [0, 1].
     pub quality: Tensor,
     /// `[batch, 4, N, N, N]`, unit quaternions x y z w.
@@ -117,7 +117,7 @@ pub struct Outputs {
     pub width: Tensor,
 }
 
-impl Outputs {
+impl NetworkOutputs {
     /// The outputs of `count` volumes or voxels, from index `first`.
     pub(crate) fn narrow(&self, first: usize, count: usize) -> Self {
         let part = |map: &Tensor| map.narrow(0, first as i64, count as i64);
@@ -130,7 +130,7 @@ impl Executor {
     ///
     /// # Errors
     /// [`ExecuteError`] names the node that cannot be executed, or the opset.
-    pub fn new(model: ModelProto, execution: Execution) -> Result<Self, ExecuteError> {
+    pub fn new(model: ModelProto, execution: ExecutionOptions) -> Result<Self, ExecuteError> {
         let model = with_full_weights(&model)?;
         let graph = model.graph.as_ref().ok_or(ExecuteError::NoGraph)?;
         let standard = model.opset_import.iter().find(|opset| matches!(opset.domain(), "" | "ai.onnx"));
@@ -139,13 +139,13 @@ impl Executor {
         if !OPSETS.contains(&opset) {
             return Err(ExecuteError::Opset(opset));
         }
-        graph.node.iter().try_for_each(check)?;
-        let settings: HashSet<&str> = graph.node.iter().flat_map(settings_of).map(String::as_str).collect();
+        graph.node.iter().try_for_each(check_supported)?;
+        let excluded: HashSet<&str> = graph.node.iter().flat_map(operator_parameters).map(String::as_str).collect();
         let mut parameters = Vec::new();
         let mut constants = HashMap::new();
         for initializer in &graph.initializer {
             let name = initializer.name().to_owned();
-            if initializer.is_float() && !initializer.dims.is_empty() && !settings.contains(initializer.name()) {
+            if initializer.is_float() && !initializer.dims.is_empty() && !excluded.contains(initializer.name()) {
                 let weight = tensor_of(initializer)?.to_device(execution.device);
                 parameters.push((name, execution.arrange(&weight).set_requires_grad(true)));
             } else {
@@ -159,13 +159,13 @@ impl Executor {
                 constants.insert(output_name(node, 0), constant(value, execution.device)?);
             }
         }
-        let (heads, upsampled) = (heads(graph), upsampled_convolutions(graph));
+        let (heads, upsampled) = (head_convolutions(graph), upsampled_convolutions(graph));
         Ok(Self { model, execution, parameters, constants, heads, upsampled })
     }
 
-    /// Disables optimizations, so that every value of the graph is computed.
+    /// Disables the convolutions before upsampling, so that every value of the graph is computed.
     #[must_use]
-    pub fn as_written(self) -> Self {
+    pub fn without_optimizations(self) -> Self {
         Self { upsampled: HashMap::new(), ..self }
     }
 
@@ -198,7 +198,7 @@ impl Executor {
     ///
     /// # Errors
     /// [`ExecuteError`] names the node at which it failed.
-    pub fn forward(&self, volumes: &Tensor) -> Result<Outputs, ExecuteError> {
+    pub fn forward(&self, volumes: &Tensor) -> Result<NetworkOutputs, ExecuteError> {
         self.maps(volumes, None)
     }
 
@@ -207,14 +207,14 @@ impl Executor {
     /// # Errors
     /// [`ExecuteError`] names the node that failed, or the missing output.
     pub fn output(&self, input: &Tensor, name: &str) -> Result<Tensor, ExecuteError> {
-        take(&mut self.execute(input, None)?, name)
+        take_output(&mut self.execute(input, None)?, name)
     }
 
     /// Runs any graph with one input, and returns intermediate values by name, in f32.
     ///
     /// # Errors
     /// [`ExecuteError`] names the node that failed, or the missing value.
-    pub fn inside(&self, input: &Tensor, names: &[String]) -> Result<Vec<Tensor>, ExecuteError> {
+    pub fn intermediate_values(&self, input: &Tensor, names: &[String]) -> Result<Vec<Tensor>, ExecuteError> {
         let values = self.execute(input, None)?;
         let value = |name: &String| values.get(name).map(|value| value.to_kind(Kind::Float));
         names.iter().map(|name| value(name).ok_or_else(|| ExecuteError::Output(name.clone()))).collect()
@@ -224,27 +224,27 @@ impl Executor {
     ///
     /// # Errors
     /// [`ExecuteError`] names the node at which it failed.
-    pub fn forward_at(&self, volumes: &Tensor, cells: &[i64]) -> Result<Outputs, ExecuteError> {
+    pub fn forward_at(&self, volumes: &Tensor, voxels: &[i64]) -> Result<NetworkOutputs, ExecuteError> {
         if !self.heads.is_empty() {
-            return self.maps(volumes, Some(cells));
+            return self.maps(volumes, Some(voxels));
         }
-        let Outputs { quality, rotation, width } = self.forward(volumes)?;
+        let NetworkOutputs { quality, rotation, width } = self.forward(volumes)?;
         let at = |map: &Tensor, channels: i64| {
-            cubes(map, cells, 1)
+            cubes(map, voxels, 1)
                 .and_then(|values| values.f_reshape([-1, channels, 1, 1, 1]))
-                .map_err(ExecuteError::Cells)
+                .map_err(ExecuteError::Voxels)
         };
-        Ok(Outputs { quality: at(&quality, 1)?, rotation: at(&rotation, 4)?, width: at(&width, 1)? })
+        Ok(NetworkOutputs { quality: at(&quality, 1)?, rotation: at(&rotation, 4)?, width: at(&width, 1)? })
     }
 
-    fn maps(&self, volumes: &Tensor, cells: Option<&[i64]>) -> Result<Outputs, ExecuteError> {
-        let mut values = self.execute(volumes, cells)?;
-        let [quality, rotation, width] = ["quality", "rotation", "width"].map(|name| take(&mut values, name));
-        Ok(Outputs { quality: quality?, rotation: rotation?, width: width? })
+    fn maps(&self, volumes: &Tensor, voxels: Option<&[i64]>) -> Result<NetworkOutputs, ExecuteError> {
+        let mut values = self.execute(volumes, voxels)?;
+        let [quality, rotation, width] = ["quality", "rotation", "width"].map(|name| take_output(&mut values, name));
+        Ok(NetworkOutputs { quality: quality?, rotation: rotation?, width: width? })
     }
 
-    /// Computes the values of all nodes in order; the heads only at `cells`, if given.
-    fn execute(&self, input: &Tensor, cells: Option<&[i64]>) -> Result<HashMap<String, Tensor>, ExecuteError> {
+    /// Computes the values of all nodes in order; the heads only at `voxels`, if given.
+    fn execute(&self, input: &Tensor, voxels: Option<&[i64]>) -> Result<HashMap<String, Tensor>, ExecuteError> {
         let graph = self.model.graph.as_ref().ok_or(ExecuteError::NoGraph)?;
         let mut values: HashMap<String, Tensor> = HashMap::with_capacity(graph.node.len());
         if let Some(declared) = graph.input.first() {
@@ -254,11 +254,11 @@ impl Executor {
             values.insert(name.clone(), tensor.shallow_clone());
         }
         // Heads at single voxels need their input after upsampling.
-        let is_at_cells = |index: &usize| cells.is_some() && self.heads.contains(index);
+        let is_at_voxels = |index: &usize| voxels.is_some() && self.heads.contains(index);
         let upsampled: HashMap<usize, &NodeProto> = self
             .upsampled
             .iter()
-            .filter(|(conv, _)| !is_at_cells(conv))
+            .filter(|(conv, _)| !is_at_voxels(conv))
             .map(|(&conv, &resize)| (conv, &graph.node[resize]))
             .collect();
         let skipped: HashSet<&String> = upsampled.values().flat_map(|resize| &resize.output).collect();
@@ -278,11 +278,11 @@ impl Executor {
                     }),
                 })
                 .collect::<Result<Vec<_>, _>>()?;
-            let step = Step { node, inputs, execution: self.execution };
-            let outputs = match cells.filter(|_| self.heads.contains(&index)) {
-                Some(cells) => vec![step.convolution_at(cells)?],
-                None if small.is_some() => vec![step.convolution_before_upsampling()?],
-                None => step.run()?,
+            let call = NodeCall { node, inputs, execution: self.execution };
+            let outputs = match voxels.filter(|_| self.heads.contains(&index)) {
+                Some(voxels) => vec![call.convolution_at(voxels)?],
+                None if small.is_some() => vec![call.convolution_before_upsampling()?],
+                None => call.run()?,
             };
             values.extend(node.output.iter().cloned().zip(outputs));
         }
@@ -291,11 +291,11 @@ impl Executor {
 }
 
 /// Removes an output from the values and returns it in f32.
-fn take(values: &mut HashMap<String, Tensor>, name: &str) -> Result<Tensor, ExecuteError> {
+fn take_output(values: &mut HashMap<String, Tensor>, name: &str) -> Result<Tensor, ExecuteError> {
     values.remove(name).map(|value| value.to_kind(Kind::Float)).ok_or_else(|| ExecuteError::Output(name.to_owned()))
 }
 
-impl Execution {
+impl ExecutionOptions {
     /// The weight in the memory layout of this execution.
     pub fn arrange(self, weight: &Tensor) -> Tensor {
         if self.channels_last && weight.dim() == 5 {
@@ -328,7 +328,7 @@ fn constant(tensor: &TensorProto, device: Device) -> Result<Tensor, TensorError>
 }
 
 /// The inputs of a node that are parameters of its operator, which must not be trained.
-fn settings_of(node: &NodeProto) -> &[String] {
+fn operator_parameters(node: &NodeProto) -> &[String] {
     match node.op_type() {
         "Clip" | "Resize" => node.input.get(1..).unwrap_or_default(),
         _ => &[],

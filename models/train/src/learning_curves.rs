@@ -9,18 +9,18 @@ use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
 
-use crate::record::{Record, Validation};
+use crate::epoch_record::{EpochRecord, Validation};
 
 const SIZE: (u32, u32) = (1500, 420);
 
 /// A curve: its name and its value for an epoch.
-type Curve<'a> = (&'a str, Box<dyn Fn(&Record) -> Option<f64>>);
+type Curve<'a> = (&'a str, Box<dyn Fn(&EpochRecord) -> Option<f64>>);
 
 /// Draws losses and validation scores over the epochs.
 ///
 /// # Errors
 /// When the file cannot be written.
-pub fn draw(path: &Path, records: &[Record]) -> anyhow::Result<()> {
+pub fn draw(path: &Path, records: &[EpochRecord]) -> anyhow::Result<()> {
     static FONT: OnceLock<bool> = OnceLock::new();
     if !FONT.get_or_init(|| register_font("sans-serif", FontStyle::Normal, dejavu::sans::regular()).is_ok()) {
         return Err(anyhow!("the built-in font cannot be read"));
@@ -30,7 +30,7 @@ pub fn draw(path: &Path, records: &[Record]) -> anyhow::Result<()> {
     let (left, others) = root.split_horizontally(SIZE.0 / 3);
     let (middle, right) = others.split_horizontally(SIZE.0 / 3);
     let held_out =
-        |value: fn(&Validation) -> Option<f64>| move |record: &Record| record.validation.as_ref().and_then(value);
+        |value: fn(&Validation) -> Option<f64>| move |record: &EpochRecord| record.validation.as_ref().and_then(value);
     let losses: [Curve; 2] =
         [("training", Box::new(|record| Some(record.loss))), ("validation", Box::new(held_out(|v| Some(v.loss))))];
     let highest =
@@ -54,7 +54,7 @@ fn panel(
     title: &str,
     range: Range<f64>,
     curves: &[Curve],
-    records: &[Record],
+    records: &[EpochRecord],
 ) -> anyhow::Result<()> {
     let last = records.last().map_or(1, |record| record.epoch).max(2);
     let mut chart = ChartBuilder::on(area)

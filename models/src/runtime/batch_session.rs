@@ -1,4 +1,4 @@
-//! Sessions with their buffers, for one batch size or for any.
+//! Sessions with their buffers, each for one batch size or for all.
 
 use std::collections::{BTreeMap, btree_map};
 use std::path::Path;
@@ -15,23 +15,23 @@ use crate::upsampling::with_upsampling_folded;
 use crate::with_full_weights;
 
 /// A model file with the properties that are needed to load it.
-pub(super) struct Model<'a> {
+pub(super) struct ModelFile<'a> {
     pub path: &'a Path,
     /// Content of the file.
     bytes: &'a [u8],
-    /// An equivalent graph that is cheaper to compute, if there is one.
-    cheaper: Option<Vec<u8>>,
+    /// An equivalent graph with fewer multiplications, if there is one.
+    optimized: Option<Vec<u8>>,
     threads: usize,
     /// Whether the model is quantised to 8 bits.
     pub is_int8: bool,
     /// The external file with its weights, if any.
-    pub weights_elsewhere: Option<String>,
+    pub external_weights: Option<String>,
     /// Name of the batch dimension.
     batch: Option<String>,
 }
 
 /// A session with its buffers.
-pub(super) struct Plan {
+pub(super) struct BatchSession {
     session: Session,
     /// The fixed batch size; smaller batches are padded. `None` for any size.
     size: Option<usize>,
@@ -44,29 +44,29 @@ pub(super) struct Plan {
 struct Buffers {
     binding: IoBinding,
     input: Tensor<f32>,
-    outputs: Outputs,
+    outputs: OutputTensors,
 }
 
 /// In the order of [`OUTPUTS`].
-pub(super) type Outputs = [Tensor<f32>; 3];
+pub(super) type OutputTensors = [Tensor<f32>; 3];
 
-impl<'a> Model<'a> {
-    /// Reads the properties. An invalid file gets none: ONNX Runtime reports a better error when loading it.
+impl<'a> ModelFile<'a> {
+    /// Reads the properties. An invalid file has none; ONNX Runtime reports a better error when it loads the file.
     pub fn new(path: &'a Path, bytes: &'a [u8], options: &Options) -> Self {
         let model = ModelProto::from_bytes(bytes).unwrap_or_default();
-        let cheaper = cheaper(&model, bytes);
+        let optimized = optimized(&model, bytes);
         let graph = model.graph.unwrap_or_default();
         let is_int8 = graph.node.iter().any(|node| node.op_type() == "QuantizeLinear");
         let batch = graph.input.iter().find(|input| input.name() == INPUT).and_then(|input| input.free(0));
         let batch = batch.map(str::to_owned);
-        let weights_elsewhere = graph.initializer.iter().find_map(|tensor| tensor.external_file()).map(str::to_owned);
-        Self { path, bytes, cheaper, threads: options.threads, is_int8, weights_elsewhere, batch }
+        let external_weights = graph.initializer.iter().find_map(|tensor| tensor.external_file()).map(str::to_owned);
+        Self { path, bytes, optimized, threads: options.threads, is_int8, external_weights, batch }
     }
 
-    /// The unmodified file, if a cheaper graph is used.
+    /// The unmodified file, if an optimized graph is used.
     pub fn original(&self) -> Option<Self> {
-        self.cheaper.as_ref()?;
-        Some(Self { cheaper: None, weights_elsewhere: None, batch: self.batch.clone(), ..*self })
+        self.optimized.as_ref()?;
+        Some(Self { optimized: None, external_weights: None, batch: self.batch.clone(), ..*self })
     }
 
     /// Creates a session, for one fixed batch size if given.
@@ -82,33 +82,33 @@ impl<'a> Model<'a> {
             builder = builder.with_execution_providers([provider]).map_err(ort::Error::from)?;
         }
         if backend.provider == Provider::OpenVino {
-            // Without this option operators that OpenVINO does not support would silently run elsewhere.
+            // Without this option, operators that OpenVINO does not support run on the CPU kernels without an error.
             builder = builder.with_config_entry("session.disable_cpu_ep_fallback", "1").map_err(ort::Error::from)?;
         }
-        Ok(builder.commit_from_memory(self.cheaper.as_deref().unwrap_or(self.bytes))?)
+        Ok(builder.commit_from_memory(self.optimized.as_deref().unwrap_or(self.bytes))?)
     }
 }
 
-/// A cheaper equivalent graph, if there is one. Only if our ONNX types represent the whole file: unknown fields would
+/// An equivalent graph, if there is one. Only if our ONNX types represent the whole file: unknown fields would
 /// be lost.
-fn cheaper(model: &ModelProto, bytes: &[u8]) -> Option<Vec<u8>> {
+fn optimized(model: &ModelProto, bytes: &[u8]) -> Option<Vec<u8>> {
     if model.encoded_len() != bytes.len() {
         return None;
     }
     with_upsampling_folded(&with_full_weights(model).ok()?).map(|model| model.encode_to_vec())
 }
 
-impl Plan {
-    /// The plans for batches of up to `max_batch`, smallest first. One session serves all sizes if the provider
+impl BatchSession {
+    /// The sessions for batches of up to `max_batch`, smallest first. One session serves all sizes if the provider
     /// supports changing shapes; otherwise there is one per size of [`batch_sizes`].
     ///
     /// OpenVINO fuses the operators after the heads only for a known shape, which halves the time of VGN's network in
     /// bf16. TensorRT would build a new engine for each size.
-    pub fn all(model: &Model, backend: Backend, max_batch: usize) -> Result<Vec<Self>, LoadReason> {
+    pub fn all(model: &ModelFile, backend: Backend, max_batch: usize) -> Result<Vec<Self>, LoadReason> {
         let fixed = matches!(backend.provider, Provider::OpenVino | Provider::TensorRt) && model.batch.is_some();
         let sizes = if fixed { batch_sizes(max_batch).map(Some).collect() } else { vec![None] };
-        let plan = |size| Ok(Self { session: model.open(backend, size)?, size, buffers: BTreeMap::new() });
-        sizes.into_iter().map(plan).collect()
+        let session = |size| Ok(Self { session: model.open(backend, size)?, size, buffers: BTreeMap::new() });
+        sizes.into_iter().map(session).collect()
     }
 
     pub fn session(&self) -> &Session {
@@ -119,7 +119,7 @@ impl Plan {
         self.size
     }
 
-    pub fn takes(&self, batch: usize) -> bool {
+    pub fn fits(&self, batch: usize) -> bool {
         self.size.is_none_or(|size| batch <= size)
     }
 
@@ -129,9 +129,9 @@ impl Plan {
         Ok(buffers.input.extract_tensor_mut().1)
     }
 
-    /// Runs a batch on the content of its buffers. With a larger fixed size the remaining volumes are computed too and
+    /// Runs a batch on the content of its buffers. If the fixed size is larger, the outputs of the remaining volumes are
     /// ignored.
-    pub fn run(&mut self, batch: usize, resolution: usize) -> ort::Result<&Outputs> {
+    pub fn run(&mut self, batch: usize, resolution: usize) -> ort::Result<&OutputTensors> {
         let (session, buffers) = self.session_and_buffers(batch, resolution)?;
         // Bound again for each run, because on some devices binding copies the input.
         buffers.binding.bind_input(INPUT, &buffers.input)?;
@@ -184,11 +184,11 @@ mod tests {
         graph.value_info.push(ValueInfoProto::tensor(&graph.node[0].output[0].clone(), vec![]));
         let mut bytes = vgn.encode_to_vec();
         let read = |bytes: &[u8]| ModelProto::from_bytes(bytes).unwrap();
-        assert!(cheaper(&read(&bytes), &bytes).is_some());
+        assert!(optimized(&read(&bytes), &bytes).is_some());
 
         // Field 100, which the published format does not have.
         bytes.extend([0xa2, 0x06, 0x00]);
-        assert!(cheaper(&read(&bytes), &bytes).is_none());
+        assert!(optimized(&read(&bytes), &bytes).is_none());
     }
 
     #[test]

@@ -6,7 +6,7 @@ use sha2::{Digest, Sha256};
 use tch::{Kind, Tensor};
 
 /// Labelled grasp candidates, all in memory.
-pub struct Examples {
+pub struct CandidateDataset {
     /// u8 `[n, CHANNELS, IMAGE_SIZE, IMAGE_SIZE]`, 255 for 1.
     images: Tensor,
     /// Whether each candidate succeeded.
@@ -15,7 +15,7 @@ pub struct Examples {
     scenes: Vec<(usize, u64)>,
 }
 
-impl Examples {
+impl CandidateDataset {
     /// Reads files of [`Candidates`]; several are mixed.
     ///
     /// # Errors
@@ -62,7 +62,7 @@ impl Examples {
         })
     }
 
-    /// Images, f32 in [0, 1], and their classes: 1 for a success.
+    /// Images, f32 `[n, CHANNELS, IMAGE_SIZE, IMAGE_SIZE]` in [0, 1], and their classes, i64 `[n]`: 1 for a success.
     pub(crate) fn batch(&self, indices: &[i64]) -> (Tensor, Tensor) {
         let images = self.images.index_select(0, &Tensor::from_slice(indices)).to_kind(Kind::Float) / 255.0;
         let labels: Vec<i64> = indices.iter().map(|&index| i64::from(self.labels[index as usize])).collect();
@@ -70,7 +70,7 @@ impl Examples {
     }
 
     /// Number of failures and of successes among these candidates.
-    pub(crate) fn classes(&self, indices: &[i64]) -> [usize; 2] {
+    pub(crate) fn class_counts(&self, indices: &[i64]) -> [usize; 2] {
         let successes = indices.iter().filter(|&&index| self.labels[index as usize]).count();
         [indices.len() - successes, successes]
     }

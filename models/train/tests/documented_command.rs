@@ -9,9 +9,12 @@ use grasp::RESOLUTION;
 use grasp_models::Store;
 
 #[test]
-fn the_training_command_of_the_documents_works() {
+fn the_training_command_of_the_documentation_works() {
     let page = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/training.md")).unwrap();
-    let line = page.lines().find(|line| line.starts_with("grasp-train train ")).expect("docs/training.md trains");
+    let line = page
+        .lines()
+        .find(|line| line.starts_with("grasp-train train "))
+        .expect("docs/training.md has a line with `grasp-train train`");
     let arguments: Vec<&str> = line.split_whitespace().skip(1).collect();
     let value = |flag: &str| arguments[arguments.iter().position(|&word| word == flag).unwrap() + 1];
 

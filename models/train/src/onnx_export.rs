@@ -13,7 +13,7 @@ use grasp_models::{
 use nalgebra::Isometry3;
 use serde::Serialize;
 
-use crate::calibrate::ranges;
+use crate::activation_ranges::activation_ranges;
 
 /// Prints one JSON object: the sizes of both files, and with --data the differences of the outputs.
 #[derive(Args)]
@@ -21,15 +21,16 @@ pub(crate) struct Export {
     /// Input network.
     #[arg(long)]
     from: PathBuf,
-    /// Format of the weights. fp32 and fp16 compute in f32, and fp16 halves the file. int8 also computes in 8 bits and
-    /// is calibrated on volumes of --data.
+    /// Format of the weights. fp32 and fp16 compute in f32; fp16 halves the file. int8 also computes in 8 bits; its
+    /// scales are calibrated on volumes of --data.
     #[arg(long, value_enum)]
     precision: Precision,
     /// Rotation averaging: average the network over the four quarter rotations of its volume, for four times the
     /// computation. The network must regress axes.
     #[arg(long)]
     average_rotations: bool,
-    #[arg(long, hide = true, num_args = 0..=1, default_missing_value = "", value_parser = refuse_turns)]
+    /// The former name of `--average-rotations`.
+    #[arg(long, hide = true, num_args = 0..=1, default_missing_value = "", value_parser = refuse_former_name)]
     turns: Option<String>,
     /// Output file. Its stem is the model's name.
     #[arg(long)]
@@ -37,15 +38,15 @@ pub(crate) struct Export {
     /// Data set folders for comparison and calibration.
     #[arg(long, num_args = 1..)]
     data: Vec<PathBuf>,
-    /// Number of volumes for the comparison, evenly spaced over the data.
+    /// Number of volumes for the comparison, evenly spaced over the data sets.
     #[arg(long, default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..))]
     volumes: u64,
-    /// Number of volumes for the calibration, evenly spaced over the data.
+    /// Number of volumes for the calibration, evenly spaced over the data sets.
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
     calibrate: u64,
 }
 
-fn refuse_turns(_: &str) -> Result<String, String> {
+fn refuse_former_name(_: &str) -> Result<String, String> {
     Err("`--turns` is now `--average-rotations`".to_owned())
 }
 
@@ -68,26 +69,26 @@ impl Precision {
 
 /// Absolute difference of an output, over all voxels and volumes.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
-struct Moved {
+struct OutputDifference {
     largest: f64,
     mean: f64,
 }
 
 /// The printed report.
 #[derive(Serialize)]
-struct Report {
+struct ExportReport {
     from_bytes: u64,
     out_bytes: u64,
     #[serde(skip_serializing_if = "Option::is_none")]
-    compared: Option<Compared>,
+    compared: Option<OutputComparison>,
 }
 
 #[derive(Default, Serialize)]
-struct Compared {
+struct OutputComparison {
     volumes: usize,
-    quality: Moved,
-    rotation: Moved,
-    width_voxels: Moved,
+    quality: OutputDifference,
+    rotation: OutputDifference,
+    width_voxels: OutputDifference,
 }
 
 impl Export {
@@ -99,14 +100,15 @@ impl Export {
         exported.write(&self.out)?;
         let bytes = |path: &PathBuf| std::fs::metadata(path).map(|file| file.len());
         let compared = data.map(|data| self.compare(&data)).transpose()?;
-        let report = Report { from_bytes: bytes(&self.from)?, out_bytes: bytes(&self.out)?, compared };
+        let report = ExportReport { from_bytes: bytes(&self.from)?, out_bytes: bytes(&self.out)?, compared };
         println!("{}", serde_json::to_string(&report)?);
         Ok(())
     }
 
     fn exported(&self, model: &ModelProto, data: Option<&Dataset>) -> Result<ModelProto> {
         let model = with_full_weights(model)?;
-        // Averaging comes after the calibration for int8, because libtorch does not execute the nodes it adds.
+        // Rotation averaging comes after the calibration of int8, because `Executor` does not support the nodes that it
+        // adds.
         let model = match (self.precision, data) {
             (Precision::Fp32 | Precision::Fp16, _) => model,
             (Precision::Int8, Some(data)) => self.quantized(&model, data)?,
@@ -119,7 +121,7 @@ impl Export {
         let mut note = |key: &str, value: &str| metadata.provenance.insert(key.to_owned(), value.to_owned());
         note("precision", self.precision.name());
         if self.average_rotations {
-            note("averaged_over_turns", "4");
+            note("averaged_over_rotations", "4");
         }
         metadata.write_to(&mut model);
         Ok(model)
@@ -128,16 +130,16 @@ impl Export {
     fn quantized(&self, model: &ModelProto, data: &Dataset) -> Result<ModelProto> {
         let count = data.len().min(self.calibrate as usize);
         let scenes = (0..count).map(|number| number * data.len() / count);
-        let ranges = ranges(model, data, scenes)?;
+        let ranges = activation_ranges(model, data, scenes)?;
         Ok(with_int8(model, &ranges)?)
     }
 
-    fn compare(&self, dataset: &Dataset) -> Result<Compared> {
+    fn compare(&self, dataset: &Dataset) -> Result<OutputComparison> {
         let load = |path| Network::load(path, &Options::default());
         let (mut before, mut after) = (load(&self.from)?, load(&self.out)?);
         let voxel_size = before.metadata().voxel_size;
         let count = dataset.len().min(self.volumes as usize);
-        let mut compared = Compared { volumes: count, ..Compared::default() };
+        let mut compared = OutputComparison { volumes: count, ..OutputComparison::default() };
         for number in 0..count {
             let scene = number * dataset.len() / count;
             let values = dataset.volume(scene, 0).iter().map(|&byte| grasp_data::value(byte)).collect();
@@ -149,18 +151,18 @@ impl Export {
     }
 }
 
-impl Compared {
+impl OutputComparison {
     /// Adds the differences of one volume.
     fn add(&mut self, before: &Maps, after: &Maps) {
         let share = 1.0 / self.volumes as f64;
-        for (moved, before, after) in [
+        for (difference, before, after) in [
             (&mut self.quality, before.quality, after.quality),
             (&mut self.rotation, before.rotation, after.rotation),
             (&mut self.width_voxels, before.width, after.width),
         ] {
             let differences = || before.iter().zip(after).map(|(before, after)| f64::from((before - after).abs()));
-            moved.largest = differences().fold(moved.largest, f64::max);
-            moved.mean += share * differences().sum::<f64>() / before.len().max(1) as f64;
+            difference.largest = differences().fold(difference.largest, f64::max);
+            difference.mean += share * differences().sum::<f64>() / before.len().max(1) as f64;
         }
     }
 }

@@ -7,16 +7,16 @@ use crate::augment::Augmentation;
 /// Target of the quality in the binary cross-entropy.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Quality {
-    /// Success of the grasp: 1 or 0.
+pub enum QualityTarget {
+    /// The label of the trial: 1 for a success, 0 for a failure.
     #[default]
     Label,
-    /// Success rate of its repetitions; the label if there are none.
+    /// The success rate of its repetitions with small pose errors; the label if there are none.
     Share,
 }
 
-impl Quality {
-    /// The target of a grasp.
+impl QualityTarget {
+    /// The target of a trial, in [0, 1].
     #[must_use]
     pub fn of(self, trial: &Trial) -> f32 {
         match self {
@@ -28,7 +28,7 @@ impl Quality {
 
 /// Settings of a run. Together with the initial network and the data they determine its result.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Settings {
+pub struct TrainingSettings {
     /// Number of epochs.
     pub epochs: u64,
     /// Scenes per forward pass.
@@ -54,7 +54,7 @@ pub struct Settings {
     /// Whether failures and successes have the same total weight in the loss. VGN balances the data instead.
     pub balance: bool,
     /// Target of the quality. Rotation and width do not depend on it.
-    pub quality: Quality,
+    pub quality: QualityTarget,
     /// Weight of the rotation in the loss.
     pub rotation_weight: f64,
     /// Point of a voxel that a grasp refers to, `corner` or `center`.
@@ -72,8 +72,9 @@ fn origin_name<S: serde::Serializer>(origin: &VoxelOrigin, serializer: S) -> Res
     })
 }
 
-impl Settings {
-    /// The learning rate of a step.
+impl TrainingSettings {
+    /// The learning rate of step `step`, from 0: linear warm-up, then constant, or half a cosine to 0 (Loshchilov and
+    /// Hutter, "SGDR: Stochastic Gradient Descent with Warm Restarts", ICLR 2017, without restarts).
     #[must_use]
     pub fn learning_rate_at(&self, step: u64, steps_per_epoch: u64) -> f64 {
         let Self { epochs, learning_rate, warmup, cosine, .. } = *self;
@@ -88,8 +89,8 @@ impl Settings {
         learning_rate * 0.5 * (1.0 + (std::f64::consts::PI * progress.min(1.0)).cos())
     }
 
-    /// A text that must be the same for a run to be resumed: settings, scenes and labels. The number of epochs is
-    /// excluded if the learning rate is constant.
+    /// Settings, scenes and labels as a text. A run can only be resumed with the same text. The number of epochs is not
+    /// part of it if the learning rate is constant.
     pub(crate) fn fingerprint(&self, dataset: &Dataset, training: usize, validation: usize) -> String {
         let mut settings = self.clone();
         if !settings.cosine {

@@ -18,10 +18,11 @@ use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::planner::PlannerSpec;
 use grasp_sim::scene::SceneKind;
 use grasp_sim::score::Summary;
-use grasp_train::{ClassifierSettings, Examples, Learner};
+use grasp_train::{CandidateDataset, ClassifierSettings, ClassifierTrainer};
 use nalgebra::{Isometry3, Point3, Vector3};
 
-/// A wall between the fingers: along the approach the grasp succeeds, across it fails.
+/// Adds a candidate with a wall between the fingers. It succeeds if the wall is parallel to the approach, and fails if
+/// it is perpendicular.
 fn push(number: u64, candidates: &mut Candidates) {
     let success = number.is_multiple_of(3);
     let offset = (number % 7) as f64 * 0.003 - 0.009;
@@ -34,7 +35,7 @@ fn push(number: u64, candidates: &mut Candidates) {
     candidates.push(number / 4, &Image::of(&Cloud::new(points), &candidate), success);
 }
 
-fn examples(folder: &Path, count: u64) -> PathBuf {
+fn candidate_file(folder: &Path, count: u64) -> PathBuf {
     let path = folder.join("walls.npz");
     let mut walls = Candidates::default();
     (0..count).for_each(|number| push(number, &mut walls));
@@ -48,19 +49,19 @@ fn classify(folder: &Path, arguments: &str) -> Output {
 }
 
 #[test]
-fn a_small_set_is_memorized() {
+fn a_small_data_set_is_memorized() {
     let folder = tempfile::tempdir().unwrap();
-    let examples = Examples::read(&[examples(folder.path(), 48)]).unwrap();
-    assert_eq!((examples.len(), examples.successes()), (48, 16));
+    let dataset = CandidateDataset::read(&[candidate_file(folder.path(), 48)]).unwrap();
+    assert_eq!((dataset.len(), dataset.successes()), (48, 16));
     let settings = ClassifierSettings { batch: 16, learning_rate: 1e-3, validation: 0.25, seed: 1, bf16: false };
-    let mut learner = Learner::new(gpd(1), &examples, settings).unwrap();
-    let (training, held_out) = learner.candidates();
+    let mut trainer = ClassifierTrainer::new(gpd(1), &dataset, settings).unwrap();
+    let (training, held_out) = trainer.candidates();
     assert!(training + held_out == 48 && held_out > 0 && held_out % 4 == 0, "validation has whole scenes");
-    let first = learner.epoch(|| ()).unwrap();
-    let last = (0..15).map(|_| learner.epoch(|| ()).unwrap()).last().unwrap();
+    let first = trainer.epoch(|| ()).unwrap();
+    let last = (0..15).map(|_| trainer.epoch(|| ()).unwrap()).last().unwrap();
     assert!(last.loss < 0.1 && last.loss < first.loss / 4.0, "from {} to {}", first.loss, last.loss);
     assert_eq!((last.accuracy, last.precision, last.recall), (1.0, 1.0, 1.0));
-    assert!(learner.validate().unwrap().unwrap().accuracy > 0.9, "the validation scenes have the same walls");
+    assert!(trainer.validate().unwrap().unwrap().accuracy > 0.9, "the validation scenes have the same walls");
 }
 
 #[test]
@@ -75,9 +76,9 @@ fn a_trained_classifier_plans_in_the_benchmark() {
         noise: 1.0,
         seed: 1,
     };
-    let mut tried = Candidates::default();
-    (0..6).for_each(|number| tried.append(config.candidates(number)));
-    tried.write(&folder.path().join("packed.npz")).unwrap();
+    let mut candidates = Candidates::default();
+    (0..6).for_each(|number| candidates.append(config.candidates(number)));
+    candidates.write(&folder.path().join("packed.npz")).unwrap();
 
     let arguments = "--data packed.npz --out models/gpd.onnx --epochs 2 --val 0.3 --batch 16 --model-version 2";
     let output = classify(folder.path(), arguments);
@@ -114,7 +115,7 @@ fn a_trained_classifier_plans_in_the_benchmark() {
 #[test]
 fn the_same_seed_gives_the_same_classifier() {
     let folder = tempfile::tempdir().unwrap();
-    examples(folder.path(), 24);
+    candidate_file(folder.path(), 24);
     let train = |name: &str, seed: u64| {
         let arguments = format!("--data walls.npz --out {name}.onnx --epochs 1 --threads 1 --seed {seed}");
         assert!(classify(folder.path(), &arguments).status.success());
@@ -128,7 +129,7 @@ fn the_same_seed_gives_the_same_classifier() {
 #[test]
 fn errors_name_the_flag_or_the_file() {
     let folder = tempfile::tempdir().unwrap();
-    examples(folder.path(), 8);
+    candidate_file(folder.path(), 8);
     fs::write(folder.path().join("text.npz"), "not a zip").unwrap();
     for (arguments, expected) in [
         ("--data text.npz --out x.onnx", "text.npz: "),
@@ -138,8 +139,8 @@ fn errors_name_the_flag_or_the_file() {
         ("--out x.onnx", "--data"),
     ] {
         let output = classify(folder.path(), arguments);
-        let said = String::from_utf8_lossy(&output.stderr);
-        assert!(!output.status.success() && said.contains(expected), "{arguments}: {said}");
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert!(!output.status.success() && stderr.contains(expected), "{arguments}: {stderr}");
     }
     assert!(!folder.path().join("x.onnx").exists());
 }
