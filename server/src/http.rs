@@ -16,6 +16,7 @@ use tokio_stream::wrappers::WatchStream;
 use tokio_stream::{Stream, StreamExt};
 
 use crate::readiness::State;
+use crate::serving::engine::Engine;
 use crate::serving::registry::ModelRegistry;
 use crate::telemetry::metrics::Metrics;
 use crate::telemetry::recent::RecentRequests;
@@ -69,7 +70,7 @@ async fn request(Path(number): Path<u64>, Shared(pages): Shared<HttpState>) -> R
 
 /// The served models with their provider and precision.
 async fn models(Shared(pages): Shared<HttpState>) -> Json<Value> {
-    let model = |engine: &Arc<crate::serving::engine::Engine>| {
+    let model = |engine: &Arc<Engine>| {
         json!({
             "name": engine.source.name(),
             "version": engine.source.version(),

@@ -1,6 +1,7 @@
 //! The served models: registry, queues, session threads, hot reload, and the fusion of views into scenes.
 
 pub(crate) mod engine;
+pub(crate) mod job;
 pub(crate) mod queue;
 pub(crate) mod registry;
 pub(crate) mod reload;

@@ -1,7 +1,7 @@
 //! The simulated depth camera: poses, rendering and noise.
 
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_3, TAU};
-use std::ops::RangeInclusive;
+use std::ops::{Range, RangeInclusive};
 
 use grasp::{DepthImage, Fusion, Intrinsics, SurfacePoint};
 pub use grasp_data::raw::View;
@@ -20,6 +20,9 @@ const NEAR: f64 = 0.1;
 /// Greatest measured depth, metres.
 const FAR: f64 = 2.0;
 
+/// Greatest difference of a [`Views::RandomSide`] from the paper's azimuth, radians.
+const JITTER: f64 = TAU / 72.0;
+
 /// Camera poses of an observation.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Views {
@@ -28,6 +31,8 @@ pub enum Views {
         /// Radians; 0 is the paper's view.
         azimuth: f64,
     },
+    /// One random view from the paper's side: its azimuth ±5°, polar angle 30–75°, distance 0.48–0.72 m.
+    RandomSide,
     /// VGN's six views on a circle, 30° from the vertical.
     Circle,
     /// Random views, their number in this range: any azimuth, polar angle 20–75°, distance 0.48–0.72 m.
@@ -44,21 +49,23 @@ impl Views {
             Self::Side { azimuth } => {
                 vec![look_at(&Point3::new(0.15, 0.15, 0.1), 0.6, FRAC_PI_3, azimuth - FRAC_PI_2)]
             }
+            Self::RandomSide => vec![random_view(30.0..75.0, -FRAC_PI_2 - JITTER..-FRAC_PI_2 + JITTER, rng)],
             Self::Circle => (0..6)
                 .map(|i| look_at(&Point3::new(0.15, 0.15, 0.0), 0.6, TAU / 12.0, f64::from(i) * TAU / 6.0))
                 .collect(),
             Self::Random(count) => {
                 let count = rng.random_range(count.clone());
-                (0..count)
-                    .map(|_| {
-                        let (distance, polar) =
-                            (rng.random_range(0.48..0.72), rng.random_range(20f64..75.0).to_radians());
-                        look_at(&Point3::new(0.15, 0.15, 0.08), distance, polar, rng.random_range(0.0..TAU))
-                    })
-                    .collect()
+                (0..count).map(|_| random_view(20.0..75.0, 0.0..TAU, rng)).collect()
             }
         }
     }
+}
+
+/// A camera at a random distance of 0.48–0.72 m, at a random angle from the vertical (degrees) and azimuth (radians).
+fn random_view(polar: Range<f64>, azimuth: Range<f64>, rng: &mut impl Rng) -> Isometry3<f64> {
+    let (distance, polar) = (rng.random_range(0.48..0.72), rng.random_range(polar).to_radians());
+    let azimuth = rng.random_range(azimuth);
+    look_at(&Point3::new(0.15, 0.15, 0.08), distance, polar, azimuth)
 }
 
 /// `T_camera_task` of an upright camera at `distance` (metres) from `target`, at the angle `polar` from the vertical

@@ -96,9 +96,10 @@ struct SceneArgs {
     #[arg(long, value_enum, default_value = "all")]
     part: Part,
 
-    /// Cameras: `side[:DEGREES]` (the paper's single view, rotated about the vertical), `circle` (six views from
-    /// above), or `random:MIN-MAX` (MIN to MAX views of any azimuth, 20–75° from the vertical). From a comma-separated
-    /// list one entry is drawn for each observation.
+    /// Cameras: `side[:DEGREES]` (the paper's single view, rotated about the vertical), `side:random` (one view of the
+    /// same azimuth ±5°, 30–75° from the vertical), `circle` (six views from above), or `random:MIN-MAX` (MIN to MAX
+    /// views of any azimuth, 20–75° from the vertical). From a comma-separated list one entry is drawn for each
+    /// observation.
     #[arg(long, default_value = "side", value_parser = parse_camera_words)]
     views: String,
 
@@ -119,6 +120,27 @@ enum Part {
 }
 
 impl Part {
+    fn name(self) -> &'static str {
+        match self {
+            Self::All => "all",
+            Self::Train => "train",
+            Self::Validation => "validation",
+        }
+    }
+
+    /// The objects of this part of a set that was read from the folder `name`.
+    fn of(self, objects: ObjectSet, name: &str) -> anyhow::Result<ObjectSet> {
+        let is_kept: fn(usize) -> bool = match self {
+            Self::All => return Ok(objects),
+            Self::Train => |index| index % 5 != 4,
+            Self::Validation => |index| index % 5 == 4,
+        };
+        ensure!(PathBuf::from(name).is_dir(), "--part needs a folder of URDF files, but --objects is `{name}`");
+        let part = objects.listed().iter().enumerate().filter(|(index, _)| is_kept(*index));
+        ObjectSet::of(part.map(|(_, object)| Arc::clone(object)).collect())
+            .with_context(|| format!("--objects {name}: too few URDF files for this --part; `validation` needs five"))
+    }
+
     /// Suffix of the folder's name in reports.
     fn suffix(self) -> &'static str {
         match self {
@@ -169,16 +191,7 @@ impl SceneArgs {
 
     fn objects(&self, default: &str) -> anyhow::Result<ObjectSet> {
         let name = self.objects.as_deref().unwrap_or(default);
-        let objects = self.scene.objects(name)?;
-        let is_kept: fn(usize) -> bool = match self.part {
-            Part::All => return Ok(objects),
-            Part::Train => |index| index % 5 != 4,
-            Part::Validation => |index| index % 5 == 4,
-        };
-        ensure!(PathBuf::from(name).is_dir(), "--part needs a folder of URDF files, but --objects is `{name}`");
-        let part = objects.listed().iter().enumerate().filter(|(index, _)| is_kept(*index));
-        ObjectSet::of(part.map(|(_, object)| Arc::clone(object)).collect())
-            .with_context(|| format!("--objects {name}: too few URDF files for this --part; `validation` needs five"))
+        self.part.of(self.scene.objects(name)?, name)
     }
 
     fn views(&self) -> anyhow::Result<Views> {
@@ -210,7 +223,7 @@ fn parse_share(text: &str) -> Result<f64, String> {
 }
 
 /// Valid values of `--views`, for error messages.
-const VIEWS: &str = "side, side:90, circle, random:1-6, or a comma-separated list of these";
+const VIEWS: &str = "side, side:90, side:random, circle, random:1-6, or a comma-separated list of these";
 
 fn parse_views(text: &str) -> Option<Views> {
     if text.contains(',') {
@@ -219,6 +232,7 @@ fn parse_views(text: &str) -> Option<Views> {
     let (name, rest) = text.split_once(':').unwrap_or((text, ""));
     match name {
         "side" if rest.is_empty() => Some(Views::Side { azimuth: 0.0 }),
+        "side" if rest == "random" => Some(Views::RandomSide),
         "side" => Some(Views::Side { azimuth: rest.parse::<f64>().ok()?.to_radians() }),
         "circle" if rest.is_empty() => Some(Views::Circle),
         // `anywhere` is the former name, which older data sets contain.
@@ -247,6 +261,7 @@ mod tests {
     fn views_are_parsed() {
         assert_eq!(parse_views("side"), Some(Views::Side { azimuth: 0.0 }));
         assert_eq!(parse_views("side:180"), Some(Views::Side { azimuth: std::f64::consts::PI }));
+        assert_eq!(parse_views("side:random"), Some(Views::RandomSide));
         assert_eq!(parse_views("circle"), Some(Views::Circle));
         assert_eq!(parse_views("random:1-6"), Some(Views::Random(1..=6)));
         assert_eq!(parse_views("random:2"), Some(Views::Random(2..=2)));

@@ -333,6 +333,13 @@ fn scenes_are_observed_again() {
     desk.run("observe other --views random:1-2 --observations 2 --seed 4 --out again");
     assert_eq!(bytes_of(&desk.path("again")), bytes);
 
+    // A part of a folder of objects.
+    desk.run("objects --objects test --out objects");
+    let label = "label --objects objects --part validation --scenes 2 --points 2 --seed 4";
+    desk.run(&format!("{label} --views side --out part"));
+    desk.run("observe part --views side --seed 4 --out part-again");
+    assert_eq!(desk.scenes("part-again"), desk.scenes("part"));
+
     // A data set of another simulator: its first scene differs.
     let setup = fs::read_to_string(desk.path("data/setup.json")).unwrap();
     fs::write(desk.path("data/setup.json"), setup.replace("\"seed\": 4", "\"seed\": 5")).unwrap();

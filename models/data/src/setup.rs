@@ -42,6 +42,9 @@ pub struct Provenance {
     pub scene: String,
     /// Objects: the built-in `train` or `test`, or the folder of the objects.
     pub objects: String,
+    /// Part of the folder: `train`, `validation`, or `all`.
+    #[serde(default = "all", skip_serializing_if = "is_all")]
+    pub part: String,
     /// Grasp points per scene.
     pub points: usize,
     /// Camera views of the scenes.
@@ -58,6 +61,15 @@ pub struct Provenance {
     pub observation_seed: Option<u64>,
     /// Version of the simulator. Labels can differ between versions.
     pub version: String,
+}
+
+/// The part of data sets that do not store one.
+fn all() -> String {
+    "all".to_owned()
+}
+
+fn is_all(part: &str) -> bool {
+    part == "all"
 }
 
 impl Setup {

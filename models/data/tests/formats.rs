@@ -14,6 +14,7 @@ fn setup() -> Setup {
     Setup::benchmark(Provenance {
         scene: "pile".into(),
         objects: "train".into(),
+        part: "all".to_owned(),
         points: 2,
         views: "side".into(),
         observations: 2,

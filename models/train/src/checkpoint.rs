@@ -12,8 +12,9 @@ use tch::{Tensor, no_grad};
 use thiserror::Error;
 
 use crate::adam::Adam;
-use crate::executor::{Executor, tensor_of, values_of};
+use crate::executor::Executor;
 use crate::loss::LossSums;
+use crate::tensors::{tensor_of, values_of};
 use crate::weight_average::WeightAverage;
 
 /// The state of a run that the network's file does not contain. Shuffling and augmentation are functions of the seed

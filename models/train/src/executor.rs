@@ -6,93 +6,16 @@
 //! attributes is an error when it is loaded, because ignoring them would train a different network.
 
 use std::collections::{HashMap, HashSet};
-use std::ops::RangeInclusive;
 
-use grasp_models::onnx::{ModelProto, NodeProto, OperatorSetIdProto, TensorError, TensorProto};
+use grasp_models::onnx::{ModelProto, NodeProto};
 use grasp_models::{upsampled_convolutions, with_full_weights};
-use tch::{Device, Kind, TchError, Tensor, no_grad};
-use thiserror::Error;
+use tch::{Device, Kind, Tensor};
 
-use crate::operators::{NodeCall, check_supported, supported};
+use crate::execution_options::ExecutionOptions;
+use crate::operators::NodeCall;
 use crate::pointwise::{cubes, head_convolutions};
-
-/// Supported versions of ONNX's operator set. In earlier ones `Split`, `Softmax` and others have another meaning or
-/// have attributes instead of inputs. Later ones are untested.
-const OPSETS: RangeInclusive<i64> = 13..=20;
-
-/// Why a graph cannot be executed.
-#[derive(Debug, Error)]
-pub enum ExecuteError {
-    /// The file has no graph.
-    #[error("the model has no graph; export it again")]
-    NoGraph,
-    /// The model has an unsupported opset.
-    #[error(
-        "the model has opset {0}, training needs an opset from {first} to {last}; export it again with one of these",
-        first = OPSETS.start(),
-        last = OPSETS.end()
-    )]
-    Opset(i64),
-    /// The operator is not implemented.
-    #[error("node `{node}`: the operator `{op}` cannot be trained; supported: {}", supported())]
-    Operator {
-        /// The node.
-        node: String,
-        /// Its operator.
-        op: String,
-    },
-    /// An attribute or an input of an operator is not supported.
-    #[error("node `{node}` ({op}): {what} is not supported")]
-    Unsupported {
-        /// The node.
-        node: String,
-        /// Its operator.
-        op: String,
-        /// The attribute or input.
-        what: String,
-    },
-    /// A node reads a value that no earlier node computes.
-    #[error("node `{node}` ({op}): no earlier node computes its input `{value}`")]
-    Missing {
-        /// The node.
-        node: String,
-        /// Its operator.
-        op: String,
-        /// The missing value.
-        value: String,
-    },
-    /// libtorch failed.
-    #[error("node `{node}` ({op}): {source}")]
-    Torch {
-        /// The node.
-        node: String,
-        /// Its operator.
-        op: String,
-        /// libtorch's error.
-        source: TchError,
-    },
-    /// The graph has no such value.
-    #[error("the graph does not compute `{0}`")]
-    Output(String),
-    /// The requested voxels are not in the batch.
-    #[error("the voxels cannot be selected from the maps: {0}")]
-    Voxels(TchError),
-    /// The values of an initializer cannot be used.
-    #[error(transparent)]
-    Tensor(#[from] TensorError),
-}
-
-/// How the graph is executed. Only `bf16` changes the results, within its precision.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct ExecutionOptions {
-    /// Device.
-    pub device: Device,
-    /// Convolutions, matrix products and the operators that keep the type of their input in bfloat16, as in PyTorch's
-    /// autocast. Weights, sums, softmax, layer norms and outputs are f32.
-    pub bf16: bool,
-    /// Memory layout with the channels of a voxel adjacent.
-    pub channels_last: bool,
-}
+use crate::supported::{ExecuteError, supported_graph};
+use crate::tensors::{constant, tensor_of, values_of};
 
 /// A network whose weights can be trained.
 pub struct Executor {
@@ -132,14 +55,7 @@ impl Executor {
     /// [`ExecuteError`] names the node that cannot be executed, or the opset.
     pub fn new(model: ModelProto, execution: ExecutionOptions) -> Result<Self, ExecuteError> {
         let model = with_full_weights(&model)?;
-        let graph = model.graph.as_ref().ok_or(ExecuteError::NoGraph)?;
-        let standard = model.opset_import.iter().find(|opset| matches!(opset.domain(), "" | "ai.onnx"));
-        // ONNX: a missing version means 1.
-        let opset = standard.map_or(1, OperatorSetIdProto::version);
-        if !OPSETS.contains(&opset) {
-            return Err(ExecuteError::Opset(opset));
-        }
-        graph.node.iter().try_for_each(check_supported)?;
+        let graph = supported_graph(&model)?;
         let excluded: HashSet<&str> = graph.node.iter().flat_map(operator_parameters).map(String::as_str).collect();
         let mut parameters = Vec::new();
         let mut constants = HashMap::new();
@@ -293,38 +209,6 @@ impl Executor {
 /// Removes an output from the values and returns it in f32.
 fn take_output(values: &mut HashMap<String, Tensor>, name: &str) -> Result<Tensor, ExecuteError> {
     values.remove(name).map(|value| value.to_kind(Kind::Float)).ok_or_else(|| ExecuteError::Output(name.to_owned()))
-}
-
-impl ExecutionOptions {
-    /// The weight in the memory layout of this execution.
-    pub fn arrange(self, weight: &Tensor) -> Tensor {
-        if self.channels_last && weight.dim() == 5 {
-            weight.permute([0, 2, 3, 4, 1]).contiguous().permute([0, 4, 1, 2, 3])
-        } else {
-            weight.contiguous()
-        }
-    }
-}
-
-/// The values of a tensor, row-major.
-pub(crate) fn values_of(tensor: &Tensor) -> Vec<f32> {
-    let tensor = no_grad(|| tensor.to_device(Device::Cpu).contiguous());
-    let mut values = vec![0.0; tensor.numel()];
-    let count = values.len();
-    tensor.copy_data(&mut values, count);
-    values
-}
-
-pub(crate) fn tensor_of(tensor: &TensorProto) -> Result<Tensor, TensorError> {
-    let flat =
-        if tensor.is_float() { Tensor::from_slice(&tensor.to_f32()?) } else { Tensor::from_slice(&tensor.to_i64()?) };
-    Ok(flat.reshape(&tensor.dims))
-}
-
-/// A constant tensor. Integers are shapes and sizes, which are read on the CPU.
-fn constant(tensor: &TensorProto, device: Device) -> Result<Tensor, TensorError> {
-    let device = if tensor.is_float() { device } else { Device::Cpu };
-    Ok(tensor_of(tensor)?.to_device(device))
 }
 
 /// The inputs of a node that are parameters of its operator, which must not be trained.

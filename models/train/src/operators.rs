@@ -4,57 +4,10 @@ use grasp_models::onnx::{AttributeProto, NodeProto};
 use grasp_models::upsampled_taps;
 use tch::{Device, Kind, TchError, Tensor};
 
-use crate::executor::{ExecuteError, ExecutionOptions, values_of};
+use crate::execution_options::ExecutionOptions;
 use crate::pointwise::cubes;
-
-/// Supported operators with their supported attributes.
-const OPERATORS: &[(&str, &[&str])] = &[
-    ("Add", &[]),
-    ("Clip", &[]),
-    ("Concat", &["axis"]),
-    ("Constant", &["value"]),
-    ("Conv", &["dilations", "group", "kernel_shape", "pads", "strides"]),
-    ("ConvTranspose", &["dilations", "group", "kernel_shape", "pads", "strides"]),
-    ("Div", &[]),
-    ("Erf", &[]),
-    ("Expand", &[]),
-    ("Flatten", &["axis"]),
-    ("InstanceNormalization", &["epsilon"]),
-    ("LayerNormalization", &["axis", "epsilon"]),
-    ("LeakyRelu", &["alpha"]),
-    ("MatMul", &[]),
-    ("MaxPool", &["ceil_mode", "dilations", "kernel_shape", "pads", "strides"]),
-    ("Mul", &[]),
-    ("ReduceL2", &["axes", "keepdims", "noop_with_empty_axes"]),
-    ("Relu", &[]),
-    ("Reshape", &[]),
-    ("Resize", &["coordinate_transformation_mode", "cubic_coeff_a", "mode", "nearest_mode"]),
-    ("Shape", &[]),
-    ("Sigmoid", &[]),
-    ("Slice", &[]),
-    ("Softmax", &["axis"]),
-    ("Split", &["axis"]),
-    ("Sub", &[]),
-    ("Transpose", &["perm"]),
-];
-
-/// The supported operators, for error messages.
-pub(crate) fn supported() -> String {
-    OPERATORS.iter().map(|&(op, _)| op).collect::<Vec<_>>().join(", ")
-}
-
-/// Checks that the operator and its attributes are supported. Ignoring one of them would train a different network.
-pub(crate) fn check_supported(node: &NodeProto) -> Result<(), ExecuteError> {
-    let (name, op) = (node.name().to_owned(), node.op_type().to_owned());
-    let known = OPERATORS.iter().find(|(known, _)| *known == op && node.domain().is_empty());
-    let Some((_, attributes)) = known else { return Err(ExecuteError::Operator { node: name, op }) };
-    match node.attribute.iter().find(|attribute| !attributes.contains(&attribute.name())) {
-        Some(unknown) => {
-            Err(ExecuteError::Unsupported { node: name, op, what: format!("the attribute `{}`", unknown.name()) })
-        }
-        None => Ok(()),
-    }
-}
+use crate::supported::ExecuteError;
+use crate::tensors::values_of;
 
 /// One node with its input values.
 pub(crate) struct NodeCall<'a> {

@@ -13,7 +13,8 @@ use tracing::{Span, debug, info, info_span};
 
 use crate::readiness::State;
 use crate::rpc::refusal::Refusal;
-use crate::serving::engine::{Detection, Engine, Reply, SessionOutput, Tensors};
+use crate::serving::engine::Engine;
+use crate::serving::job::{Detection, Reply, SessionOutput, Tensors};
 use crate::telemetry::metrics::Metrics;
 use crate::telemetry::recent::{Detected, Outcome, RecentRequests};
 use crate::telemetry::subscriber::{self, REQUEST};

@@ -6,7 +6,8 @@ use tonic::metadata::{MetadataMap, MetadataValue};
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
-use crate::serving::engine::{EngineError, Overloaded};
+use crate::serving::engine::Overloaded;
+use crate::serving::job::EngineError;
 
 /// Why a request ends without grasps.
 #[derive(Debug, Error)]

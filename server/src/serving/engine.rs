@@ -1,22 +1,21 @@
 use std::io;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use grasp::{DecodeError, Dropped, Grasp, Volume};
-use grasp_models::{Backend, Options, RuntimeError};
-use grasp_planner::{Loaded, PlanError, Scene, Source};
+use grasp::Volume;
+use grasp_models::{Backend, Options};
+use grasp_planner::{Loaded, Scene, Source};
 use grasp_proto::DetectParams;
-use prometheus::{Histogram, IntGauge};
 use thiserror::Error;
 use tokio::sync::oneshot;
 use tracing::{Span, info, warn};
 
-use super::session::{Session, warm_up};
-use crate::serving::queue::{Batching, Full, Queue, QueueSlot};
-use crate::telemetry::metrics::Metrics;
+use super::job::{Detection, Job, Reply, Task, Tensors};
+use super::queue::{Batching, Full, Queue, QueueSlot};
+use super::session::{ServiceTime, Session, warm_up};
+use crate::telemetry::metrics::{Metrics, ModelLabels, QueueMetrics};
 use crate::transport::deadline::Deadline;
 
 /// One model with its queue. Its session threads end when the engine is dropped.
@@ -40,14 +39,6 @@ pub(crate) struct Serving {
     pub batching: Batching,
 }
 
-/// The metrics of a model's queue.
-pub(crate) struct Gauges {
-    /// Queued requests.
-    pub waiting: IntGauge,
-    /// Volumes per batch.
-    pub batch: Histogram,
-}
-
 /// The session threads of all engines.
 #[derive(Default)]
 pub(crate) struct SessionThreads(Mutex<Vec<JoinHandle<()>>>);
@@ -60,118 +51,6 @@ pub(crate) struct Overloaded {
     /// Estimated time until a slot is free.
     pub retry_after: Duration,
 }
-
-/// A session's result for one scene, with its timings.
-pub(crate) struct SessionOutput<T> {
-    pub value: T,
-    pub queue: Duration,
-    pub inference: Duration,
-    pub postprocessing: Duration,
-}
-
-/// The grasps in a scene.
-pub(crate) struct Detection {
-    /// Best first, at most as many as requested.
-    pub grasps: Vec<Grasp>,
-    /// For each grasp, whether the hand collides; None if not requested.
-    pub collides: Option<Vec<bool>>,
-    /// Counts of dropped candidates by reason.
-    pub dropped: Dropped,
-    /// Grasps beyond the requested number.
-    pub over_limit: usize,
-    pub volume: Volume,
-}
-
-/// A network's [`OUTPUTS`](grasp_models::OUTPUTS), as bytes: f32, little-endian.
-pub(crate) struct Tensors(pub [Vec<u8>; 3]);
-
-/// Why a session returned no result.
-#[derive(Clone, Debug, Error)]
-pub(crate) enum EngineError {
-    #[error(transparent)]
-    Run(#[from] RuntimeError),
-    #[error(transparent)]
-    Decode(#[from] DecodeError),
-    #[error("the session panicked: {0}")]
-    Panic(String),
-    #[error("the planner has no network, which ModelInfer requires")]
-    NoNetwork,
-    #[error("the session thread has ended")]
-    SessionEnded,
-    #[error("the deadline passed before the request was finished")]
-    Expired,
-}
-
-impl From<PlanError> for EngineError {
-    fn from(error: PlanError) -> Self {
-        match error {
-            PlanError::Run(error) => error.into(),
-            PlanError::Decode(error) => error.into(),
-            // Planning is cancelled when the deadline passes or the client cancels; the latter receives no response.
-            PlanError::Cancelled => Self::Expired,
-        }
-    }
-}
-
-/// The pending result of a queued scene. Dropping it removes the scene from the queue.
-pub(crate) struct Reply<T> {
-    receiver: Receiver<T>,
-    _slot: QueueSlot<Job>,
-}
-
-pub(super) type Sender<T> = oneshot::Sender<Result<SessionOutput<T>, EngineError>>;
-type Receiver<T> = oneshot::Receiver<Result<SessionOutput<T>, EngineError>>;
-
-impl<T> Reply<T> {
-    /// Waits for the result until the deadline.
-    pub async fn wait(self, deadline: Option<Deadline>) -> Result<SessionOutput<T>, EngineError> {
-        let Self { receiver, _slot } = self;
-        let result = match deadline {
-            None => receiver.await,
-            Some(Deadline(deadline)) => {
-                let result = tokio::time::timeout_at(deadline.into(), receiver).await;
-                result.map_err(|_| EngineError::Expired)?
-            }
-        };
-        // The sender is dropped without a result if the session thread has ended.
-        result.unwrap_or(Err(EngineError::SessionEnded))
-    }
-}
-
-pub(super) struct Job {
-    pub scene: Scene,
-    pub task: Task,
-    pub deadline: Option<Deadline>,
-    pub span: Span,
-    pub submitted: Instant,
-}
-
-/// What a session computes from a scene.
-pub(super) enum Task {
-    Grasps(Box<DetectParams>, Sender<Detection>),
-    /// The network's raw output.
-    Maps(Sender<Tensors>),
-}
-
-impl Task {
-    pub fn is_closed(&self) -> bool {
-        match self {
-            Self::Grasps(_, reply) => reply.is_closed(),
-            Self::Maps(reply) => reply.is_closed(),
-        }
-    }
-
-    /// Sends an error. A failed send is ignored: the call counts as cancelled by the client.
-    pub fn fail(self, error: EngineError) {
-        match self {
-            Self::Grasps(_, reply) => drop(reply.send(Err(error))),
-            Self::Maps(reply) => drop(reply.send(Err(error))),
-        }
-    }
-}
-
-/// Time per scene of the last batch: the estimated time until a queue slot is free.
-pub(super) struct ServiceTime(AtomicU64);
 
 impl Engine {
     /// Loads and warms up the sessions, and starts their threads.
@@ -192,7 +71,7 @@ impl Engine {
                     .with_context(|| format!("the warm-up inference of the model {label} failed"))?;
             }
         }
-        let Gauges { waiting, batch } = metrics.gauges(&label);
+        let QueueMetrics { waiting, batch } = metrics.queue(&label);
         let queue = Arc::new(Queue::new(workers, capacity, waiting));
         // Created before the threads, so that an early return drops it, which closes the queue and ends started
         // threads.
@@ -229,14 +108,20 @@ impl Engine {
     ) -> Result<Reply<Detection>, Overloaded> {
         let (sender, receiver) = oneshot::channel();
         let slot = self.push(scene, Task::Grasps(Box::new(params), sender), deadline, span)?;
-        Ok(Reply { receiver, _slot: slot })
+        Ok(Reply::new(receiver, slot))
     }
 
     /// Queues a volume for the network's raw output. Refuses immediately if the queue is full.
     pub fn maps(&self, volume: Volume, deadline: Option<Deadline>, span: Span) -> Result<Reply<Tensors>, Overloaded> {
         let (sender, receiver) = oneshot::channel();
         let slot = self.push(Scene { volume, points: None }, Task::Maps(sender), deadline, span)?;
-        Ok(Reply { receiver, _slot: slot })
+        Ok(Reply::new(receiver, slot))
+    }
+
+    /// The labels of the served model in the metrics.
+    pub fn labels(&self) -> ModelLabels {
+        let Backend { provider, precision } = self.backend;
+        ModelLabels([self.label.clone(), provider.to_string(), precision.to_string(), self.source.sha256().to_owned()])
     }
 
     /// Queue length, requests.
@@ -306,22 +191,5 @@ impl SessionThreads {
             // Fails only after a panic, which ended the thread.
             let _ = thread.join();
         }
-    }
-}
-
-impl ServiceTime {
-    fn new(duration: Duration) -> Self {
-        let service_time = Self(AtomicU64::new(0));
-        service_time.set(duration);
-        service_time
-    }
-
-    pub fn set(&self, duration: Duration) {
-        self.0.store(duration.as_micros().try_into().unwrap_or(u64::MAX), Ordering::Relaxed);
-    }
-
-    /// At least one millisecond, the unit of the retry hint.
-    fn get(&self) -> Duration {
-        Duration::from_micros(self.0.load(Ordering::Relaxed)).max(Duration::from_millis(1))
     }
 }

@@ -151,7 +151,8 @@ impl ModelFolder {
         }
         self.models.replace(engines, default.as_deref());
         let now = self.models.now();
-        self.metrics.replaced(&before, &now);
+        let labels = |engines: &[Arc<Engine>]| engines.iter().map(|engine| engine.labels()).collect::<Vec<_>>();
+        self.metrics.replaced(&labels(&before), &labels(&now));
         for removed in before.iter().filter(|engine| !now.iter().any(|other| Arc::ptr_eq(engine, other))) {
             info!(model = removed.label, sha256 = removed.source.sha256(), "model no longer served");
         }

@@ -2,6 +2,7 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use grasp::{DecodeParams, Decoded, Obstacles, Volume, decode};
@@ -12,7 +13,7 @@ use nalgebra::Isometry3;
 use prometheus::Histogram;
 use tracing::error;
 
-use super::engine::{Detection, EngineError, Job, Sender, ServiceTime, SessionOutput, Task, Tensors};
+use super::job::{Detection, EngineError, Job, Sender, SessionOutput, Task, Tensors};
 use super::queue::{Batching, Queue};
 use crate::transport::deadline::Deadline;
 
@@ -27,11 +28,31 @@ pub(super) struct Session {
     pub service_time: Arc<ServiceTime>,
 }
 
+/// Time per scene of the last batch: the estimated time until a queue slot is free.
+pub(super) struct ServiceTime(AtomicU64);
+
 /// When a session took a batch from the queue, and how long its inference took.
 #[derive(Clone, Copy)]
 struct BatchTimes {
     taken: Instant,
     inference: Duration,
+}
+
+impl ServiceTime {
+    pub fn new(duration: Duration) -> Self {
+        let service_time = Self(AtomicU64::new(0));
+        service_time.set(duration);
+        service_time
+    }
+
+    pub fn set(&self, duration: Duration) {
+        self.0.store(duration.as_micros().try_into().unwrap_or(u64::MAX), Ordering::Relaxed);
+    }
+
+    /// At least one millisecond, the unit of the retry hint.
+    pub fn get(&self) -> Duration {
+        Duration::from_micros(self.0.load(Ordering::Relaxed)).max(Duration::from_millis(1))
+    }
 }
 
 impl Session {

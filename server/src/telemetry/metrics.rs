@@ -1,20 +1,17 @@
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use grasp_models::Backend;
 use prometheus::core::Collector;
 #[cfg(target_os = "linux")]
 use prometheus::process_collector::ProcessCollector;
 use prometheus::{
-    HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, IntGaugeVec, Opts, Registry, TEXT_FORMAT,
-    TextEncoder,
+    Histogram, HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, IntGaugeVec, Opts, Registry,
+    TEXT_FORMAT, TextEncoder,
 };
 use tonic::Code;
 use tracing_appender::non_blocking::ErrorCounter;
 
 use crate::readiness::State;
-use crate::serving::engine::{Engine, Gauges};
 use crate::telemetry::timings::StageTimings;
 use crate::transport::connections::ConnectionLimit;
 
@@ -50,6 +47,18 @@ pub(crate) struct Metrics {
     /// The log's counter of dropped lines, and how many of them `dropped_lines` includes.
     dropped: (ErrorCounter, AtomicU64),
 }
+
+/// The metrics of a model's queue.
+pub(crate) struct QueueMetrics {
+    /// Queued requests.
+    pub waiting: IntGauge,
+    /// Volumes per batch.
+    pub batch: Histogram,
+}
+
+/// The labels of `graspd_model_info`: model, provider, precision and file hash.
+#[derive(PartialEq, Eq)]
+pub(crate) struct ModelLabels(pub [String; 4]);
 
 impl Metrics {
     /// Content type of [`render`](Self::render).
@@ -127,18 +136,13 @@ impl Metrics {
     }
 
     /// Updates `graspd_model_info` after the served models have changed.
-    pub fn replaced(&self, before: &[Arc<Engine>], now: &[Arc<Engine>]) {
-        let labels = |engine: &Engine| {
-            let Backend { provider, precision } = engine.backend;
-            [engine.label.clone(), provider.to_string(), precision.to_string(), engine.source.sha256().to_owned()]
-        };
-        let now: Vec<_> = now.iter().map(|engine| labels(engine)).collect();
-        for labels in &now {
+    pub fn replaced(&self, before: &[ModelLabels], now: &[ModelLabels]) {
+        for ModelLabels(labels) in now {
             self.models.with_label_values(labels).set(1);
         }
-        for removed in before.iter().map(|engine| labels(engine)).filter(|labels| !now.contains(labels)) {
+        for ModelLabels(labels) in before.iter().filter(|labels| !now.contains(labels)) {
             // Fails only if the series does not exist.
-            let _ = self.models.remove_label_values(&removed.each_ref().map(String::as_str));
+            let _ = self.models.remove_label_values(&labels.each_ref().map(String::as_str));
         }
     }
 
@@ -153,14 +157,17 @@ impl Metrics {
     }
 
     /// The metrics of a model's queue.
-    pub fn gauges(&self, model: &str) -> Gauges {
+    pub fn queue(&self, model: &str) -> QueueMetrics {
         for (stage, _) in StageTimings::default().stages() {
             self.stages.with_label_values(&[model, stage]);
         }
         for code in [Code::Ok, Code::Internal, Code::ResourceExhausted, Code::DeadlineExceeded, Code::Cancelled] {
             self.requests.with_label_values(&[model, code_name(code)]);
         }
-        Gauges { waiting: self.waiting.with_label_values(&[model]), batch: self.batches.with_label_values(&[model]) }
+        QueueMetrics {
+            waiting: self.waiting.with_label_values(&[model]),
+            batch: self.batches.with_label_values(&[model]),
+        }
     }
 
     /// A limit on open connections with its metrics.

@@ -81,6 +81,7 @@ impl Label {
         let setup = Setup::benchmark(Provenance {
             scene: self.scene.scene.name().to_owned(),
             objects: self.scene.objects.clone().unwrap_or_else(|| OBJECTS.to_owned()),
+            part: self.scene.part.name().to_owned(),
             points: config.points,
             views: self.scene.views.clone(),
             observations: config.observations,

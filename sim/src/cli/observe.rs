@@ -8,7 +8,7 @@ use grasp_sim::label::SceneConfig;
 use grasp_sim::ordered;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{Scene, VIEWS, parse_camera_words, parse_share, parse_views, refuse_looks};
+use super::{Part, Scene, VIEWS, parse_camera_words, parse_share, parse_views, refuse_looks};
 
 /// Much faster than labelling, because no grasp is tried. An interrupted run continues where it stopped.
 #[derive(Args)]
@@ -52,9 +52,10 @@ impl Observe {
         let missing = || format!("{}: setup.json has no provenance; label the scenes again", self.data.display());
         let made = Setup::read(&self.data)?.provenance.with_context(missing)?;
         let scene = Scene::from_str(&made.scene, false).map_err(anyhow::Error::msg)?;
+        let part = Part::from_str(&made.part, false).map_err(anyhow::Error::msg)?;
         let before = SceneConfig {
             kind: scene.kind(),
-            objects: scene.objects(&made.objects)?,
+            objects: part.of(scene.objects(&made.objects)?, &made.objects)?,
             points: made.points,
             views: parse(&made.views)?,
             observations: made.observations,

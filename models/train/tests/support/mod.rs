@@ -45,6 +45,7 @@ pub fn provenance() -> Provenance {
     Provenance {
         scene: "boxes".into(),
         objects: "boxes".into(),
+        part: "all".to_owned(),
         points: 2,
         views: "all".into(),
         observations: 1,
