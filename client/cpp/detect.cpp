@@ -20,7 +20,7 @@
 namespace pb = grasp::v1;
 using Numbers = std::vector<double>;
 
-// Detection is idempotent, so that it can be retried. gRPC obeys the retry hint of a busy server. Deadlines are set per
+// Detection is idempotent, so it can be retried. gRPC follows the retry hint of a busy server. Deadlines are set per
 // call: a "timeout" in this configuration can expire up to 2 s early (github.com/grpc/grpc/issues/40633).
 constexpr char SERVICE_CONFIG[] = R"(
 {"methodConfig": [{"name": [{"service": "grasp.v1.GraspService"}], "retryPolicy": {
@@ -86,7 +86,7 @@ void print(const pb::DetectGraspsResponse &reply, double round_trip) {
                     grasp.quality(), grasp.width(), at.x(), at.y(), at.z(), rotation.x(), rotation.y(), rotation.z(),
                     rotation.w(), before.x(), before.y(), before.z());
     }
-    // Replies without grasps report the reasons.
+    // The reasons; set in replies without grasps.
     if (reply.has_dropped()) std::printf("voxels without a grasp: %s\n", reply.dropped().ShortDebugString().c_str());
     const auto &took = reply.latency();
     const std::pair<const char *, double> stages[] = {
@@ -108,7 +108,7 @@ std::string describe(const grpc::Status &status) {
 }
 
 Numbers numbers(const std::string &flag, std::string text, std::size_t count) {
-    // Also accepts the brackets and commas of ROS's output.
+    // Brackets and commas are ignored, so that arrays printed by ROS can be pasted.
     std::replace_if(text.begin(), text.end(), [](char c) { return std::strchr("[],", c); }, ' ');
     std::istringstream stream(text);
     Numbers numbers;

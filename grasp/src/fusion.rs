@@ -322,9 +322,9 @@ mod tests {
         fusion.integrate(&DepthImage::new(camera, &depth).unwrap(), &facing());
         let again = Fusion::of(&fusion.volume(Isometry3::identity()).unwrap());
         assert!(again.values().iter().zip(fusion.values()).all(|(a, b)| (a - b).abs() < 1e-6));
-        let (surface, wanted) = (again.surface(), fusion.surface());
-        assert!(surface.len() == wanted.len() && surface.len() > 500, "{} points", surface.len());
-        let worst = surface.iter().zip(&wanted).map(|(a, b)| (a.position - b.position).norm()).fold(0.0, f64::max);
+        let (surface, expected) = (again.surface(), fusion.surface());
+        assert!(surface.len() == expected.len() && surface.len() > 500, "{} points", surface.len());
+        let worst = surface.iter().zip(&expected).map(|(a, b)| (a.position - b.position).norm()).fold(0.0, f64::max);
         assert!(worst < 1e-6 && surface.iter().all(|point| point.normal.z < -0.99), "{worst}");
     }
 

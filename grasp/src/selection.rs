@@ -1,3 +1,5 @@
+use std::ops::AddAssign;
+
 use nalgebra::Isometry3;
 
 use crate::{Constraints, DecodeParams, Grasp, Hand, Obstacles, Violation, Volume};
@@ -25,6 +27,20 @@ pub struct Dropped {
     pub collision: usize,
     /// Suppressed by a better grasp nearby.
     pub suppressed: usize,
+}
+
+impl AddAssign for Dropped {
+    fn add_assign(&mut self, other: Self) {
+        self.below_threshold += other.below_threshold;
+        self.mask += other.mask;
+        self.width += other.width;
+        self.border += other.border;
+        self.region += other.region;
+        self.approach += other.approach;
+        self.height += other.height;
+        self.collision += other.collision;
+        self.suppressed += other.suppressed;
+    }
 }
 
 /// Result of [`decode`](crate::decode) or [`select`].

@@ -166,8 +166,8 @@ mod tests {
             assert!(normal.dot(&(a - centre)) > 0.0, "the normal points to free space");
             area += normal.norm();
         }
-        let wanted = 4.0 * std::f64::consts::PI * 0.05 * 0.05;
-        assert!((area / wanted - 1.0).abs() < 0.03, "{area} m² of {wanted}");
+        let expected = 4.0 * std::f64::consts::PI * 0.05 * 0.05;
+        assert!((area / expected - 1.0).abs() < 0.03, "{area} m² of {expected}");
         // Euler's formula for a closed surface.
         assert_eq!(triangles.len(), 2 * (vertices.len() - 2));
     }

@@ -27,8 +27,8 @@ pub fn gpd(seed: u64) -> ModelProto {
     let mut x = b.input(INPUT, &[CHANNELS, IMAGE_SIZE, IMAGE_SIZE]);
     let mut size = IMAGE_SIZE;
     for (layer, [inputs, outputs]) in [[CHANNELS, 20], [20, 50]].into_iter().enumerate() {
-        x = b.conv_2d(&format!("conv.{layer}"), &x, Conv { inputs, outputs, kernel: 5, stride: 1, bias: true });
-        x = max_pool(b, &x);
+        x = b.conv_2d(&format!("conv.{layer}"), &x, Conv { inputs, outputs, kernel: 5, stride: 1, bias: true }, 0);
+        x = b.max_pool_2d(&x);
         x = b.node("Relu", &[&x], vec![]);
         size = (size - 4) / 2;
     }
@@ -39,18 +39,19 @@ pub fn gpd(seed: u64) -> ModelProto {
     b.output(OUTPUT, &x, &[2]);
     let mut model = builder.finish();
     let provenance = [("architecture", "gpd".to_owned()), ("seed", seed.to_string())];
-    describe(&mut model, "gpd", "1", &provenance.map(|(key, value)| (key.to_owned(), value)).into());
+    describe(&mut model, "gpd", "1", None, &provenance.map(|(key, value)| (key.to_owned(), value)).into());
     model
 }
 
-/// Max pooling over 2 × 2 pixels.
-fn max_pool(b: &mut Builder, x: &str) -> String {
-    let attributes = vec![AttributeProto::ints("kernel_shape", &[2; 2]), AttributeProto::ints("strides", &[2; 2])];
-    b.node("MaxPool", &[x], attributes)
-}
-
-/// Replaces the metadata of the file: `graspd.name`, `graspd.version` and `graspd.provenance.…`.
-pub fn describe(model: &mut ModelProto, name: &str, version: &str, provenance: &BTreeMap<String, String>) {
+/// Replaces the metadata of the file: `graspd.name`, `graspd.version`, for an evaluator `graspd.network`, and
+/// `graspd.provenance.…`.
+pub fn describe(
+    model: &mut ModelProto,
+    name: &str,
+    version: &str,
+    network: Option<&str>,
+    provenance: &BTreeMap<String, String>,
+) {
     model.metadata_props.retain(|property| !property.key().starts_with(PREFIX));
     let mut put = |key: &str, value: &str| {
         let key = Some(format!("{PREFIX}{key}"));
@@ -58,6 +59,9 @@ pub fn describe(model: &mut ModelProto, name: &str, version: &str, provenance: &
     };
     put("name", name);
     put("version", version);
+    if let Some(network) = network {
+        put("network", network);
+    }
     for (key, value) in provenance {
         put(&format!("{PROVENANCE}{key}"), value);
     }

@@ -128,9 +128,15 @@ impl Builder {
         self.convolution::<3>(name, x, conv, (conv.kernel as i64 - 1) / 2)
     }
 
-    /// A 2D convolution without padding: the size decreases by `kernel` - 1.
-    pub fn conv_2d(&mut self, name: &str, x: &str, conv: Conv) -> String {
-        self.convolution::<2>(name, x, conv, 0)
+    /// A 2D convolution with `pad` zeros on each side. Without padding the size decreases by `kernel` - 1.
+    pub fn conv_2d(&mut self, name: &str, x: &str, conv: Conv, pad: usize) -> String {
+        self.convolution::<2>(name, x, conv, pad as i64)
+    }
+
+    /// 2D max pooling: the size is halved.
+    pub fn max_pool_2d(&mut self, x: &str) -> String {
+        let attributes = vec![AttributeProto::ints("kernel_shape", &[2; 2]), AttributeProto::ints("strides", &[2; 2])];
+        self.node("MaxPool", &[x], attributes)
     }
 
     fn convolution<const AXES: usize>(&mut self, name: &str, x: &str, conv: Conv, pad: i64) -> String {

@@ -1,9 +1,10 @@
 //! The networks of graspd: their definitions as ONNX graphs, model files with metadata, and ONNX Runtime.
 //!
 //! [`build`] creates a network with random weights. A model file contains its [`Metadata`]. A [`Store`] is a folder of
-//! model files. A [`Network`] runs one of them. [`gpd`] defines the classifier of grasp candidates, which a
-//! [`Classifier`] runs.
+//! model files. A [`Network`] runs one of them. [`gpd`] defines the classifier of grasp candidates, [`evaluator`] that of
+//! the poses of a network's grasps. A [`Classifier`] runs both.
 
+mod evaluator;
 pub mod gpd;
 mod graph;
 mod half_weights;
@@ -19,6 +20,7 @@ mod transformer;
 mod upsampling;
 mod vgn;
 
+pub use evaluator::evaluator;
 pub use half_weights::{with_full_weights, with_half_weights};
 pub use metadata::{Metadata, MetadataError};
 pub use networks::{Architecture, BuildError, build};

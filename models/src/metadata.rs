@@ -23,6 +23,8 @@ pub struct Metadata {
     /// Azimuth of the camera in training, if it was constant: degrees about the vertical axis through the middle of the
     /// volume, from x towards y. `None` for a network that accepts any view.
     pub camera_azimuth: Option<f64>,
+    /// Name of the network whose grasps an evaluator scores. `None` for other models.
+    pub network: Option<String>,
     /// Origin of the weights: data, seeds, steps, date and other entries (`graspd.provenance.…`).
     pub provenance: BTreeMap<String, String>,
 }
@@ -65,6 +67,7 @@ impl Metadata {
             voxel_size: WORKSPACE_SIZE / resolution as f64,
             voxel_origin: VoxelOrigin::Corner,
             camera_azimuth: None,
+            network: None,
             provenance: BTreeMap::new(),
         }
     }
@@ -118,6 +121,7 @@ impl Metadata {
                         parse("camera_azimuth", &value, "a number of degrees", |angle: &f64| angle.is_finite())?;
                     metadata.camera_azimuth = Some(azimuth);
                 }
+                "network" => metadata.network = Some(value),
                 _ => {
                     if let Some(key) = key.strip_prefix(PROVENANCE) {
                         metadata.provenance.insert(key.to_owned(), value);
@@ -143,6 +147,9 @@ impl Metadata {
         put("voxel_origin", self.voxel_origin.name().to_owned());
         if let Some(azimuth) = self.camera_azimuth {
             put("camera_azimuth", azimuth.to_string());
+        }
+        if let Some(network) = &self.network {
+            put("network", network.clone());
         }
         for (key, value) in &self.provenance {
             put(&format!("{PROVENANCE}{key}"), value.clone());

@@ -92,6 +92,7 @@ impl Architecture {
             voxel_size: grasp::WORKSPACE_SIZE / resolution as f64,
             voxel_origin: VoxelOrigin::Corner,
             camera_azimuth: None,
+            network: None,
             provenance: BTreeMap::from(provenance.map(|(key, value)| (key.to_owned(), value))),
         };
         metadata.write_to(&mut model);

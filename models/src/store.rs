@@ -75,6 +75,14 @@ pub enum EntryError {
         /// What is wrong.
         source: MetadataError,
     },
+    /// The network of an evaluator is not in the model folder.
+    #[error("{}: the evaluator's network `{network}` is not in the model folder; add it, or set `graspd.network`", path.display())]
+    NoNetwork {
+        /// The file.
+        path: PathBuf,
+        /// The value of `graspd.network`; empty if it is missing.
+        network: String,
+    },
     /// Another file has the same name and version.
     #[error("{} and {} are both `{name}` version {version}; remove one", first.display(), second.display())]
     Duplicate {
@@ -96,6 +104,7 @@ impl EntryError {
         match self {
             Self::File(FileError::Io { path, .. } | FileError::Decode { path, .. })
             | Self::Metadata { path, .. }
+            | Self::NoNetwork { path, .. }
             | Self::Duplicate { second: path, .. } => path,
         }
     }

@@ -307,8 +307,9 @@ fn images(count: u64) -> Vec<Image> {
 #[test]
 fn a_classifier_scores_images_independently() {
     let (_folder, path) = save(&gpd::gpd(0));
-    let mut classifier = Classifier::load(&path, &Options::default()).unwrap();
+    let mut classifier = Classifier::load(&path, &Image::SHAPE, &Options::default()).unwrap();
     let images = images(40);
+    let images: Vec<&[u8]> = images.iter().map(Image::pixels).collect();
     let together = classifier.score(&images).unwrap();
     assert_eq!(together.len(), images.len());
     assert!(together.iter().any(|score| (score - together[0]).abs() > 1e-5), "other images have other scores");
@@ -322,7 +323,7 @@ fn a_classifier_scores_images_independently() {
 #[test]
 fn a_network_is_not_loaded_as_a_classifier_nor_a_classifier_as_a_network() {
     let (_folder, path) = save(&build("vgn", 0).unwrap());
-    let error = Classifier::load(&path, &Options::default()).err().unwrap().to_string();
+    let error = Classifier::load(&path, &Image::SHAPE, &Options::default()).err().unwrap().to_string();
     assert!(error.contains("network.onnx: found `tsdf` instead of `images`; a classifier has the input"), "{error}");
     let (_folder, path) = save(&gpd::gpd(0));
     let error = Network::load(&path, &Options::default()).err().unwrap().to_string();

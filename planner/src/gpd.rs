@@ -27,7 +27,7 @@ impl Gpd {
     /// # Errors
     /// [`LoadError`] if the file is not a valid classifier.
     pub fn load(path: &Path) -> Result<Self, LoadError> {
-        Ok(Self::new(Classifier::load(path, &Options::default())?))
+        Ok(Self::new(Classifier::load(path, &Image::SHAPE, &Options::default())?))
     }
 
     /// The default parameters: the threshold 0.5 keeps candidates that succeed more likely than not, as in GPD's code.
@@ -46,7 +46,8 @@ impl Planner for Gpd {
                 return Err(PlanError::Cancelled);
             }
             let images: Vec<Image> = batch.iter().map(|candidate| Image::of(&fit.cloud, candidate)).collect();
-            scores.extend(self.classifier.score(&images)?);
+            let pixels: Vec<&[u8]> = images.iter().map(Image::pixels).collect();
+            scores.extend(self.classifier.score(&pixels)?);
         }
         let grasps = scored(&fit.candidates, &scores);
         Ok(fit.select(grasps, scene, &params.decode))

@@ -1,6 +1,7 @@
 //! Grasp planners: they find grasps in a volume, or in its observed points. The server and the benchmark use the same
 //! planners.
 
+mod evaluator;
 mod gpd;
 mod hand_fit;
 mod network;
@@ -11,9 +12,10 @@ use grasp::{DecodeError, DecodeParams, Decoded, SurfacePoint, Volume};
 use grasp_models::RuntimeError;
 use thiserror::Error;
 
+pub use evaluator::Evaluator;
 pub use gpd::Gpd;
 pub use hand_fit::{HandFit, object_points};
-pub use network::NetworkPlanner;
+pub use network::{Inference, NetworkPlanner};
 pub use shaf::{HighestProposal, Shaf};
 pub use source::{Loaded, Source};
 

@@ -1,28 +1,36 @@
 use std::path::Path;
 
-use grasp::{Decoded, Volume, decode};
+use grasp::{DecodeParams, Decoded, Maps, Volume, decode};
 use grasp_models::{LoadError, Network, Options, Output, RuntimeError};
 
-use crate::{PlanError, PlanParams, Planner, Scene};
+use crate::{Evaluator, PlanError, PlanParams, Planner, Scene};
 
-/// A network with the inputs and outputs of VGN. Its output maps are decoded into grasps.
+/// A network with the inputs and outputs of VGN. Its output maps are decoded into grasps, which an [`Evaluator`] may
+/// score and move.
 pub struct NetworkPlanner {
     network: Network,
+    evaluator: Option<Evaluator>,
+}
+
+/// The output of a network for a batch of volumes.
+pub struct Inference<'a> {
+    output: Output<'a>,
+    evaluator: Option<&'a mut Evaluator>,
 }
 
 impl NetworkPlanner {
     /// A planner with a loaded network.
     #[must_use]
-    pub fn new(network: Network) -> Self {
-        Self { network }
+    pub fn new(network: Network, evaluator: Option<Evaluator>) -> Self {
+        Self { network, evaluator }
     }
 
-    /// Loads the network from a file.
+    /// Loads the network from a file, without an evaluator.
     ///
     /// # Errors
     /// [`LoadError`] if the file is not a valid network.
     pub fn load(path: &Path, options: &Options) -> Result<Self, LoadError> {
-        Ok(Self::new(Network::load(path, options)?))
+        Ok(Self::new(Network::load(path, options)?, None))
     }
 
     /// The network.
@@ -35,15 +43,44 @@ impl NetworkPlanner {
     ///
     /// # Errors
     /// [`RuntimeError`] if the batch does not fit the network or ONNX Runtime fails.
-    pub fn infer(&mut self, volumes: &[&Volume]) -> Result<Output<'_>, RuntimeError> {
-        self.network.infer(volumes)
+    pub fn infer(&mut self, volumes: &[&Volume]) -> Result<Inference<'_>, RuntimeError> {
+        Ok(Inference { output: self.network.infer(volumes)?, evaluator: self.evaluator.as_mut() })
+    }
+}
+
+impl Inference<'_> {
+    /// The maps of the volume at `index` of the batch.
+    #[must_use]
+    pub fn maps(&self, index: usize) -> Maps<'_> {
+        self.output.maps(index)
+    }
+
+    /// The grasps in `volume`, which is the one at `index` of the batch. The evaluator stops when `is_wanted` returns
+    /// false.
+    ///
+    /// # Errors
+    /// [`PlanError`] if the maps are invalid, the evaluator fails, or planning is cancelled.
+    pub fn decode(
+        &mut self,
+        index: usize,
+        volume: &Volume,
+        params: &DecodeParams,
+        is_wanted: &dyn Fn() -> bool,
+    ) -> Result<Decoded, PlanError> {
+        let maps = self.output.maps(index);
+        Ok(match &mut self.evaluator {
+            None => decode(volume, &maps, params)?,
+            Some(evaluator) => {
+                let proposals = decode(volume, &maps, &Evaluator::proposal_params(params))?;
+                evaluator.refine(proposals, volume, params, is_wanted)?
+            }
+        })
     }
 }
 
 impl Planner for NetworkPlanner {
-    /// Ignores `is_wanted`: an inference cannot be interrupted.
-    fn plan(&mut self, scene: &Scene, params: &PlanParams, _: &dyn Fn() -> bool) -> Result<Decoded, PlanError> {
-        let output = self.network.infer(&[&scene.volume])?;
-        Ok(decode(&scene.volume, &output.maps(0), &params.decode)?)
+    /// The inference of the network cannot be interrupted.
+    fn plan(&mut self, scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Decoded, PlanError> {
+        self.infer(&[&scene.volume])?.decode(0, &scene.volume, &params.decode, is_wanted)
     }
 }

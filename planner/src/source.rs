@@ -2,16 +2,24 @@ use std::cmp::Ordering;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use grasp::DecodeParams;
-use grasp_models::{Backend, Classifier, Entry, LoadError, Network, Options};
+use grasp::gpd::Image;
+use grasp::{DecodeParams, Patch};
+use grasp_models::{Backend, Classifier, Entry, LoadError, Metadata, Network, Options};
 
-use crate::{Gpd, NetworkPlanner, Planner, Shaf};
+use crate::{Evaluator, Gpd, NetworkPlanner, Planner, Shaf};
 
 /// A planner of a model folder by name and version, before it is loaded.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Source {
     /// A network.
     Network(Entry),
+    /// A network whose grasps an evaluator scores. Name and version are those of the evaluator.
+    Evaluated {
+        /// The network.
+        network: Entry,
+        /// The evaluator.
+        evaluator: Entry,
+    },
     /// GPD with a classifier.
     Gpd(Entry),
     /// SHAF, which needs no file.
@@ -21,7 +29,7 @@ pub enum Source {
 /// A loaded planner.
 pub enum Loaded {
     /// A network, which accepts batches of volumes.
-    Network(NetworkPlanner),
+    Network(Box<NetworkPlanner>),
     /// A planner that processes one scene at a time.
     Single(Box<dyn Planner + Send>),
 }
@@ -33,7 +41,7 @@ impl Source {
 
     fn entry(&self) -> Option<&Entry> {
         match self {
-            Self::Network(entry) | Self::Gpd(entry) => Some(entry),
+            Self::Network(entry) | Self::Evaluated { evaluator: entry, .. } | Self::Gpd(entry) => Some(entry),
             Self::Shaf => None,
         }
     }
@@ -65,17 +73,22 @@ impl Source {
     /// Origin of the model: the provenance entries of its file.
     #[must_use]
     pub fn provenance(&self) -> BTreeMap<String, String> {
-        match self.entry() {
-            Some(entry) => entry.metadata.provenance.clone(),
-            None => [("method".to_owned(), "the highest place where the hand fits".to_owned())].into(),
+        match (self, self.entry()) {
+            (Self::Evaluated { network, evaluator }, _) => {
+                let Metadata { name, version, .. } = &network.metadata;
+                let network = ("network".to_owned(), format!("{name} {version}, sha256 {}", network.sha256));
+                evaluator.metadata.provenance.clone().into_iter().chain([network]).collect()
+            }
+            (_, Some(entry)) => entry.metadata.provenance.clone(),
+            (_, None) => [("method".to_owned(), "the highest place where the hand fits".to_owned())].into(),
         }
     }
 
-    /// The entry of the network, if the planner is a network.
+    /// The entry of the network, if the planner has one.
     #[must_use]
     pub fn network(&self) -> Option<&Entry> {
         match self {
-            Self::Network(entry) => Some(entry),
+            Self::Network(network) | Self::Evaluated { network, .. } => Some(network),
             Self::Gpd(_) | Self::Shaf => None,
         }
     }
@@ -94,6 +107,7 @@ impl Source {
     pub fn decode_params(&self) -> DecodeParams {
         match self {
             Self::Network(entry) => entry.metadata.decode_params(),
+            Self::Evaluated { network, .. } => Evaluator::decode_params(&network.metadata),
             Self::Gpd(_) => Gpd::decode_params(),
             Self::Shaf => Shaf::decode_params(),
         }
@@ -109,10 +123,20 @@ impl Source {
             Self::Network(entry) => {
                 let networks = Network::load_several(entry, options, count)?;
                 let backend = networks.first().map_or(Backend::REFERENCE, Network::backend);
-                (networks.into_iter().map(|network| Loaded::Network(NetworkPlanner::new(network))).collect(), backend)
+                let planner = |network| Loaded::Network(Box::new(NetworkPlanner::new(network, None)));
+                (networks.into_iter().map(planner).collect(), backend)
+            }
+            Self::Evaluated { network, evaluator } => {
+                let networks = Network::load_several(network, options, count)?;
+                let backend = networks.first().map_or(Backend::REFERENCE, Network::backend);
+                let evaluators = Classifier::load_several(evaluator, &Patch::SHAPE, options, count)?;
+                let planner = |(network, evaluator)| {
+                    Loaded::Network(Box::new(NetworkPlanner::new(network, Some(Evaluator::new(evaluator)))))
+                };
+                (networks.into_iter().zip(evaluators).map(planner).collect(), backend)
             }
             Self::Gpd(entry) => {
-                let classifiers = Classifier::load_several(entry, options, count)?.into_iter();
+                let classifiers = Classifier::load_several(entry, &Image::SHAPE, options, count)?.into_iter();
                 (classifiers.map(|classifier| single(Box::new(Gpd::new(classifier)))).collect(), Backend::REFERENCE)
             }
             Self::Shaf => ((0..count).map(|_| single(Box::new(Shaf))).collect(), Backend::REFERENCE),

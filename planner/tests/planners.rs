@@ -4,8 +4,8 @@ use std::cell::Cell;
 use std::path::PathBuf;
 
 use grasp::{DecodeParams, Decoded, DepthImage, Fusion, RESOLUTION, SurfacePoint, WORKSPACE_SIZE, seen_from};
-use grasp_models::Options;
-use grasp_planner::{Gpd, HighestProposal, NetworkPlanner, PlanError, PlanParams, Planner, Scene, Shaf};
+use grasp_models::{Network, Options};
+use grasp_planner::{Evaluator, Gpd, HighestProposal, NetworkPlanner, PlanError, PlanParams, Planner, Scene, Shaf};
 use nalgebra::{Isometry3, Point3, Vector3};
 
 const TABLE: f64 = 0.05;
@@ -62,8 +62,12 @@ fn planners() -> Vec<(&'static str, Box<dyn Planner>, DecodeParams)> {
     let network = network();
     let decode = network.network().metadata().decode_params();
     let proposals = NetworkPlanner::load(&zoo("vgn-packed.onnx"), &Options::default()).unwrap();
+    let evaluated = Network::load(&zoo("vgn-packed.onnx"), &Options::default()).unwrap();
+    let of_evaluated = Evaluator::decode_params(evaluated.metadata());
+    let evaluator = Evaluator::load(&zoo("evaluators/graspd-packed.onnx"), &Options::default()).unwrap();
     vec![
         ("network", Box::new(network), decode),
+        ("evaluator", Box::new(NetworkPlanner::new(evaluated, Some(evaluator))), of_evaluated),
         ("highest proposal", Box::new(HighestProposal(proposals)), decode),
         ("gpd", Box::new(Gpd::load(&zoo("classifiers/gpd.onnx")).unwrap()), Gpd::decode_params()),
         ("shaf", Box::new(Shaf), Shaf::decode_params()),

@@ -225,7 +225,7 @@ fn mode(collision: &pb::CollisionCheck) -> Result<Collision, FieldError> {
         Ok(Mode::Flag) => Ok(Collision::Flag),
         Ok(Mode::Filter) => Ok(Collision::Filter),
         Err(_) => {
-            let needed = "must be 0 (off), 1 (flag) or 2 (filter)";
+            let needed = "must be MODE_OFF (0), MODE_FLAG (1) or MODE_FILTER (2)";
             Err(FieldError::new("options.collision.mode", collision.mode, needed))
         }
     }
@@ -248,7 +248,7 @@ fn convention(convention: &pb::Convention) -> Result<Convention, FieldError> {
             return Err(FieldError::new(ORIGIN, origin.as_str_name(), needed));
         }
         (Err(_), _) => {
-            let needed = "must be 0 (finger base), 1 (TCP) or 2 (parent)";
+            let needed = "must be ORIGIN_FINGER_BASE (0), ORIGIN_TCP (1) or ORIGIN_PARENT (2)";
             return Err(FieldError::new(ORIGIN, convention.origin, needed));
         }
     };
@@ -256,7 +256,7 @@ fn convention(convention: &pb::Convention) -> Result<Convention, FieldError> {
         Ok(Axis::Y) => ClosingAxis::Y,
         Ok(Axis::X) => ClosingAxis::X,
         Err(_) => {
-            let needed = "must be 0 (y) or 1 (x)";
+            let needed = "must be CLOSING_AXIS_Y (0) or CLOSING_AXIS_X (1)";
             return Err(FieldError::new("options.convention.closing_axis", convention.closing_axis, needed));
         }
     };
@@ -353,7 +353,7 @@ mod tests {
         let collision = Some(pb::CollisionCheck { mode: 7, table_height: None });
         assert_eq!(
             refused(pb::Options { collision, ..Default::default() }),
-            "options.collision.mode is 7, must be 0 (off), 1 (flag) or 2 (filter)"
+            "options.collision.mode is 7, must be MODE_OFF (0), MODE_FLAG (1) or MODE_FILTER (2)"
         );
     }
 }

@@ -90,7 +90,8 @@ fn try_depth_view(view: &pb::DepthView, frame_from_task: &Isometry3<f64>) -> Res
         pb::DepthUnit::F32Metres => 4,
         pb::DepthUnit::U16Millimetres => 2,
         pb::DepthUnit::Unspecified => {
-            return Err(FieldError::new("unit", view.unit, "must be 1 (f32, metres) or 2 (u16, millimetres)"));
+            let needed = "must be DEPTH_UNIT_F32_METRES (1) or DEPTH_UNIT_U16_MILLIMETRES (2)";
+            return Err(FieldError::new("unit", view.unit, needed));
         }
     };
     if view.data.len() != pixels * value_size {
@@ -239,13 +240,13 @@ mod tests {
     #[test]
     fn both_units_and_both_directions_give_the_same_view() {
         let frame_from_task = Isometry3::translation(1.0, 2.0, 3.0);
-        let wanted = depth_view(&view(), 0, &frame_from_task).unwrap();
-        assert_eq!(wanted.depth, [0.5; 12]);
+        let expected = depth_view(&view(), 0, &frame_from_task).unwrap();
+        assert_eq!(expected.depth, [0.5; 12]);
         let intrinsics = Intrinsics { width: 4, height: 3, fx: 5.0, fy: 5.0, cx: 2.0, cy: 1.5 };
-        assert_eq!(wanted.intrinsics, intrinsics);
+        assert_eq!(expected.intrinsics, intrinsics);
 
         let metres: Vec<u8> = [0.5_f32; 12].iter().flat_map(|v| v.to_le_bytes()).collect();
-        let frame_from_camera = frame_from_task * wanted.camera_from_task.inverse();
+        let frame_from_camera = frame_from_task * expected.camera_from_task.inverse();
         let other = pb::DepthView {
             data: metres.into(),
             unit: pb::DepthUnit::F32Metres.into(),
@@ -253,8 +254,8 @@ mod tests {
             ..view()
         };
         let other = depth_view(&other, 0, &frame_from_task).unwrap();
-        assert_eq!(other.depth, wanted.depth);
-        assert!((other.camera_from_task.to_homogeneous() - wanted.camera_from_task.to_homogeneous()).norm() < 1e-9);
+        assert_eq!(other.depth, expected.depth);
+        assert!((other.camera_from_task.to_homogeneous() - expected.camera_from_task.to_homogeneous()).norm() < 1e-9);
     }
 
     #[test]
@@ -285,7 +286,10 @@ mod tests {
             refused(|v| v.data = vec![0; 23].into()),
             "views[1].data is 23 bytes, 4 × 3 pixels need 24 (DEPTH_UNIT_U16_MILLIMETRES)"
         );
-        assert_eq!(refused(|v| v.unit = 0), "views[1].unit is 0, must be 1 (f32, metres) or 2 (u16, millimetres)");
+        assert_eq!(
+            refused(|v| v.unit = 0),
+            "views[1].unit is 0, must be DEPTH_UNIT_F32_METRES (1) or DEPTH_UNIT_U16_MILLIMETRES (2)"
+        );
         assert!(refused(|v| v.extrinsics = None).starts_with("views[1].extrinsics is absent, camera_from_task"));
         let nowhere = pb::Pose { position: None, orientation: None };
         assert_eq!(

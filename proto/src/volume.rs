@@ -19,7 +19,8 @@ pub fn resolution(volume: &pb::Volume) -> Result<usize, FieldError> {
         pb::DataType::F16 => 2,
         pb::DataType::U8 => 1,
         pb::DataType::Unspecified => {
-            return Err(FieldError::new("volume.dtype", volume.dtype, "must be 1 (f32), 2 (f16) or 3 (u8)"));
+            let needed = "must be DATA_TYPE_F32 (1), DATA_TYPE_F16 (2) or DATA_TYPE_U8 (3)";
+            return Err(FieldError::new("volume.dtype", volume.dtype, needed));
         }
     };
     let resolution = volume.resolution as usize;
@@ -147,10 +148,10 @@ mod tests {
         fn unaligned_data_is_decoded(volume in volume(), offset in 0..4_usize) {
             for dtype in [pb::DataType::F32, pb::DataType::F16] {
                 let mut message = encode(&volume, dtype, "");
-                let wanted = Volume::try_from(&message).unwrap();
+                let expected = Volume::try_from(&message).unwrap();
                 let shifted = [&[0xff; 4][..offset], &message.data].concat();
                 message.data = prost::bytes::Bytes::from(shifted).slice(offset..);
-                prop_assert_eq!(Volume::try_from(&message).unwrap(), wanted);
+                prop_assert_eq!(Volume::try_from(&message).unwrap(), expected);
             }
         }
     }

@@ -2,6 +2,7 @@
 
 pub(crate) mod engine;
 pub(crate) mod job;
+mod model_files;
 pub(crate) mod queue;
 pub(crate) mod registry;
 pub(crate) mod reload;

@@ -1,4 +1,5 @@
-"""The clutter-removal benchmark: grasps are executed until the table is empty or two fail in a row."""
+"""The clutter-removal benchmark: executes grasps until the table is empty, no object is visible, no grasp is
+proposed, or two grasps fail in a row."""
 
 from __future__ import annotations
 
@@ -15,18 +16,18 @@ from planners import Grasp, Planner, Random, Served
 from world import Attempt, World
 
 MAX_FAILURES = 2
-"""Failures in a row that end a round."""
+"""Number of consecutive failures that ends a round."""
 
 
 @dataclass(frozen=True)
 class BenchmarkConfig:
-    """Scenes, planner and cameras."""
+    """Configuration of scenes, planner and cameras."""
 
     scene: str
-    """`packed` or `pile`."""
+    """Scenario: `packed` or `pile`."""
     urdfs: list[Path]
     count: int
-    """Objects a scene."""
+    """Initial number of objects per scene."""
     planner: str
     """`random` or `grpc:HOST:PORT`."""
     options: Options
@@ -35,18 +36,18 @@ class BenchmarkConfig:
     noise: bool
     hand: Path
     pictures: Path | None
-    """A folder for a picture of every attempt, the fingers closed."""
+    """Folder for a picture of each attempt with the fingers closed; None: no pictures."""
 
 
 @dataclass(frozen=True)
 class Executed:
-    """A grasp that was executed."""
+    """An executed grasp."""
 
     grasp: Grasp
     proposals: int
-    """How many grasps the planner proposed."""
+    """Number of grasps that the planner proposed."""
     objects: int
-    """On the table before the attempt."""
+    """Number of objects on the table before the attempt."""
     attempt: Attempt
 
 
@@ -57,18 +58,18 @@ class Round:
     seed: int
     number: int
     objects: int
-    """On the table at the start."""
+    """Number of objects on the table at the start."""
     executed: list[Executed] = field(default_factory=list)
     ending: str = "cleared"
-    """Else `nothing_seen`, `nothing_proposed` or `gave_up`."""
+    """Why the round ended: `cleared`, `nothing_seen`, `nothing_proposed` or `gave_up`."""
     fusion: list[float] = field(default_factory=list)
-    """Seconds to fuse each observation, if the planner reports them."""
+    """Duration of the fusion of each observation, seconds; 0 if the planner does not report it."""
     planning: list[float] = field(default_factory=list)
-    """Seconds of each planning without fusion."""
+    """Duration of each planning without the fusion, seconds."""
 
 
 class Benchmark:
-    """A world and a planner, for any number of rounds."""
+    """A world and a planner, used for any number of rounds."""
 
     def __init__(self, config: BenchmarkConfig) -> None:
         self.config = config
@@ -78,43 +79,43 @@ class Benchmark:
     def play(self, seed: int, number: int) -> Round:
         """Clears the scene of a round as far as the planner can."""
         config, world = self.config, self.world
-        # One generator each, so that the scene does not depend on what the planner and the camera draw.
+        # Separate generators, so that the scene does not depend on the random numbers of the planner and the camera.
         scene_rng, noise_rng, planner_rng = (np.random.default_rng([seed, number, use]) for use in range(3))
         planner: Planner = self.served or Random(planner_rng)
         make = world.packed if config.scene == "packed" else world.pile
         make(config.urdfs, config.count, scene_rng)
-        played = Round(seed, number, len(world.objects))
+        round_ = Round(seed, number, len(world.objects))
         failures = 0
         while world.objects:
             views = observe(world, config.cameras, noise_rng if config.noise else None)
             if not sees_anything(views):
-                played.ending = "nothing_seen"
+                round_.ending = "nothing_seen"
                 break
             start = time.perf_counter()
             plan = planner.plan(views)
-            played.planning.append(time.perf_counter() - start - plan.fusion)
-            played.fusion.append(plan.fusion)
+            round_.planning.append(time.perf_counter() - start - plan.fusion)
+            round_.fusion.append(plan.fusion)
             if not plan.grasps:
-                played.ending = "nothing_proposed"
+                round_.ending = "nothing_proposed"
                 break
             best, objects = plan.grasps[0], len(world.objects)
-            attempt = world.execute(best.pose, closed=self.draws(played, best))
-            played.executed.append(Executed(best, len(plan.grasps), objects, attempt))
+            attempt = world.execute(best.pose, closed=self.draws(round_, best))
+            round_.executed.append(Executed(best, len(plan.grasps), objects, attempt))
             failures = 0 if attempt.success else failures + 1
             if failures == MAX_FAILURES:
-                played.ending = "gave_up"
+                round_.ending = "gave_up"
                 break
-        return played
+        return round_
 
-    def draws(self, played: Round, grasp: Grasp) -> Callable[[], None] | None:
-        """What draws the next attempt of a round, if pictures are requested."""
+    def draws(self, round_: Round, grasp: Grasp) -> Callable[[], None] | None:
+        """Returns a function that draws the next attempt of a round; None without pictures."""
         folder = self.config.pictures
         if folder is None:
             return None
-        path = folder / f"{self.config.scene}-{played.seed}-{played.number:04}-{len(played.executed):02}.png"
+        path = folder / f"{self.config.scene}-{round_.seed}-{round_.number:04}-{len(round_.executed):02}.png"
 
         def draw() -> None:
-            # Along the hand's x axis, so that its fingers are side by side.
+            # The camera looks along the hand's x axis, so that the fingers are side by side in the picture.
             x, y, _ = grasp.pose.matrix()[:3, 0]
             picture, _ = render(self.world, look_at(grasp.pose.position, 0.45, 1.2, math.atan2(y, x)))
             save_png(path, picture)

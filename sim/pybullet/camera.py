@@ -1,4 +1,4 @@
-"""The depth camera of the benchmark: where it stands, what it sees, and how it errs."""
+"""The depth camera of the benchmark: poses, rendering and noise."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ WIDTH, HEIGHT = 640, 480
 K: Array = np.array([[540.0, 0.0, 320.0], [0.0, 540.0, 240.0], [0.0, 0.0, 1.0]])
 NEAR, FAR = 0.1, 2.0
 
-# Above the table, away from the borders: where a point counts as part of an object (the bounds of GIGA's code).
+# A point within these bounds counts as a point of an object: above the table, away from the borders (GIGA's code).
 LOWEST = (0.02, 0.02, 0.055)
 HIGHEST = (0.28, 0.28, 0.3)
 
 
 def look_at(target: Sequence[float], distance: float, polar: float, azimuth: float) -> Array:
-    """T_camera_task of an upright camera at `distance` from `target`, `polar` from the vertical, at `azimuth` about
-    it, radians."""
+    """T_camera_task of an upright camera that looks at `target` from `distance`, metres. `polar` is its angle from the
+    vertical and `azimuth` its angle about the vertical, radians."""
     away = np.array([math.sin(polar) * math.cos(azimuth), math.sin(polar) * math.sin(azimuth), math.cos(polar)])
     right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
     task_from_camera = np.eye(4)
@@ -38,17 +38,17 @@ def look_at(target: Sequence[float], distance: float, polar: float, azimuth: flo
 
 
 def side(azimuth: float = 0.0) -> list[Array]:
-    """The one side view of the paper, turned by `azimuth` about the vertical, radians."""
+    """The paper's single side view, rotated by `azimuth` about the vertical, radians."""
     return [look_at((0.15, 0.15, 0.1), 0.6, math.pi / 3, azimuth - math.pi / 2)]
 
 
 def circle(count: int = 6) -> list[Array]:
-    """So many of VGN's views, 30° from the vertical."""
+    """`count` views on VGN's circle, 30° from the vertical."""
     return [look_at((0.15, 0.15, 0.0), 0.6, math.pi / 6, 2 * math.pi * i / count) for i in range(count)]
 
 
 def render(world: World, camera_from_task: Array) -> tuple[NDArray[np.uint8], Array]:
-    """The picture `[row][column][red, green, blue]` and the depth `[row][column]`, without noise."""
+    """The colour image `[row][column][red, green, blue]` and the depth `[row][column]`, metres, without noise."""
     # OpenGL's camera looks along -z, with y up.
     view = np.diag([1.0, -1.0, -1.0, 1.0]) @ camera_from_task
     fov = math.degrees(2 * math.atan(K[1, 2] / K[1, 1]))
@@ -64,7 +64,7 @@ def render(world: World, camera_from_task: Array) -> tuple[NDArray[np.uint8], Ar
 
 
 def observe(world: World, cameras: Sequence[Array], noise: np.random.Generator | None = None) -> list[DepthView]:
-    """What each camera sees; with the benchmark's noise, if there is a generator for it."""
+    """The depth image of each camera. With a generator `noise`, the benchmark's noise is added."""
     views = []
     for camera_from_task in cameras:
         _, depth = render(world, camera_from_task)
@@ -75,8 +75,8 @@ def observe(world: World, cameras: Sequence[Array], noise: np.random.Generator |
 
 
 def noisy(depth: Array, rng: np.random.Generator) -> Array:
-    """The noise of GIGA's evaluation (Dex-Net's model): a Gamma factor for the image, and for every second image
-    N(0, 5 mm) drawn on a grid of a quarter of the resolution and enlarged bilinearly."""
+    """Adds the noise of GIGA's evaluation (Dex-Net's model): a Gamma-distributed factor per image, and with probability
+    0.5 noise N(0, 5 mm), drawn on a grid of a quarter of the resolution and enlarged bilinearly."""
     depth = depth * rng.gamma(1000.0, 0.001)
     if rng.random() < 0.5:
         coarse = rng.normal(0.0, 0.005, (HEIGHT // 4, WIDTH // 4))
@@ -85,14 +85,14 @@ def noisy(depth: Array, rng: np.random.Generator) -> Array:
 
 
 def enlarging(pixels: int) -> Array:
-    """The share `[pixel][cell]` that each cell of a row of a quarter of the resolution has in each pixel."""
+    """The weights `[pixel][cell]` that enlarge a row by a factor of four with linear interpolation."""
     cells = np.arange(pixels // 4)
     at = np.clip((np.arange(pixels) + 0.5) / 4 - 0.5, 0, cells[-1])
     return np.maximum(0.0, 1.0 - np.abs(at[:, None] - cells))
 
 
 def points(view: DepthView) -> Array:
-    """`[row][column]` x, y, z of each pixel in the task frame."""
+    """x, y, z of each pixel in the task frame, `[row][column][3]`, metres."""
     rows, columns = np.indices(view.depth.shape)
     rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(view.k).T
     task_from_camera = np.linalg.inv(np.asarray(view.camera_from_task))
@@ -101,20 +101,20 @@ def points(view: DepthView) -> Array:
 
 
 def is_within_reach(positions: Array) -> NDArray[np.bool_]:
-    """Whether each position is above the table and away from the borders."""
+    """Whether each position is between `LOWEST` and `HIGHEST`."""
     inside: NDArray[np.bool_] = np.all((positions >= LOWEST) & (positions <= HIGHEST), axis=-1)
     return inside
 
 
 def sees_anything(views: Sequence[DepthView]) -> bool:
-    """Whether any pixel shows something that could be grasped."""
+    """Whether any pixel shows a point of an object."""
     return any(bool(is_within_reach(points(view)).any()) for view in views)
 
 
 def save_png(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Writes a picture `[row][column][red, green, blue]`."""
+    """Writes an image `[row][column][red, green, blue]`. Written by hand, so that no image library is required."""
     height, width, _ = picture.shape
-    # Each row begins with its filter: none.
+    # Each row begins with its filter type, 0: no filter.
     rows = np.pad(picture.reshape(height, -1), [(0, 0), (1, 0)]).tobytes()
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]

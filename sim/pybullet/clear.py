@@ -1,6 +1,6 @@
-"""Clears tables with a planner and reports its success rates: `grasp-sim bench` in PyBullet.
+"""Runs the clutter-removal benchmark of `grasp-sim bench` in PyBullet.
 
-The scene of a round depends on its seed and its number alone. The last line that is printed is a JSON object.
+The initial scene of a round is the same for every planner. The last line of the output is a JSON object.
 """
 
 from __future__ import annotations
@@ -22,52 +22,80 @@ from world import HAND
 
 
 def arguments() -> argparse.Namespace:
-    """The command line."""
+    """Parses the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("--scene", choices=["packed", "pile"], default="packed")
+    parser.add_argument(
+        "--scene",
+        choices=["packed", "pile"],
+        default="packed",
+        help="scenario: objects upright (packed) or dropped (pile)",
+    )
     parser.add_argument("--objects", type=Path, required=True, metavar="DIR", help="folder of URDF files")
     parser.add_argument(
         "--part",
         choices=["all", "train", "validation"],
         default="all",
-        help="of the folder's files by name, validation is every fifth, train the others",
+        help="part of the folder's files in the order of their names: validation is every fifth file, train the others",
     )
-    parser.add_argument("--count", type=positive, default=5, metavar="N", help="objects a scene")
-    parser.add_argument("--planner", type=planner, default="random", help="random, or grpc:HOST:PORT, a running graspd")
-    parser.add_argument("--model", default="", metavar="NAME", help="name of a model of the server, instead of its default model")
+    parser.add_argument("--count", type=positive, default=5, metavar="N", help="initial number of objects per scene")
+    parser.add_argument(
+        "--planner", type=planner, default="random", help="planner: random, or grpc:HOST:PORT for a running graspd"
+    )
+    parser.add_argument(
+        "--model", default="", metavar="NAME", help="model of the server; if not set, the server's default model"
+    )
     parser.add_argument("--threshold", type=share, default=0.9, metavar="T", help="smallest quality of a grasp")
     parser.add_argument(
         "--force",
         type=lambda text: None if text == "none" else share(text),
         default=0.5,
         metavar="T",
-        help="if no grasp reaches the threshold, take the best one down to this quality; none disables it",
+        help="if no grasp reaches the threshold, execute the best grasp if its quality is at least this; none disables "
+        "this",
     )
-    parser.add_argument("--clear", action="store_true", help="drop grasps whose open hand would collide with the observed surface")
     parser.add_argument(
-        "--views", type=cameras, default="side", help="side[:DEGREES], one side view; or N, so many on VGN's circle"
+        "--clear", action="store_true", help="drop grasps whose open hand would collide with the observed surface"
+    )
+    parser.add_argument(
+        "--views",
+        type=cameras,
+        default="side",
+        help="cameras: side[:DEGREES] (the paper's single view, rotated about the vertical), or the number of views on "
+        "VGN's circle, 30 degrees from the vertical",
     )
     parser.add_argument("--noise", choices=["none", "dex"], default="dex", help="depth noise; the benchmark uses dex")
-    parser.add_argument("--rounds", type=positive, default=100, metavar="N", help="scenes for each seed")
+    parser.add_argument("--rounds", type=positive, default=100, metavar="N", help="rounds (scenes) per seed")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="the first seed")
-    parser.add_argument("--seeds", type=positive, default=1, metavar="K", help="number of consecutive seeds")
-    parser.add_argument("--hand", type=Path, default=HAND, metavar="URDF", help="a hand with the frames and joints of sim/hand/hand.urdf")
-    parser.add_argument("--jobs", type=positive, default=1, metavar="J", help="parallel processes; more make each planning slower")
-    parser.add_argument("--attempts", type=Path, metavar="FILE", help="also write one JSON line for each attempt")
-    parser.add_argument("--pictures", type=Path, metavar="DIR", help="also draw each attempt, the fingers closed")
+    parser.add_argument("--seeds", type=positive, default=1, metavar="K", help="number of seeds, starting with --seed")
+    parser.add_argument(
+        "--hand", type=Path, default=HAND, metavar="URDF", help="hand with the frames and joints of sim/hand/hand.urdf"
+    )
+    parser.add_argument(
+        "--jobs",
+        type=positive,
+        default=1,
+        metavar="J",
+        help="number of parallel processes; with more than one the planning times are longer",
+    )
+    parser.add_argument(
+        "--attempts", type=Path, metavar="FILE", help="also write every attempt to this file, as JSON lines"
+    )
+    parser.add_argument(
+        "--pictures", type=Path, metavar="DIR", help="also draw every attempt into this folder, with the fingers closed"
+    )
     parser.add_argument("--out", type=Path, metavar="FILE", help="also write the report to this file")
     return parser.parse_args()
 
 
 def positive(text: str) -> int:
-    """A count."""
+    """Parses an integer greater than 0."""
     if not text.isdecimal() or int(text) == 0:
         raise argparse.ArgumentTypeError(f"is {text!r}, must be an integer greater than 0")
     return int(text)
 
 
 def share(text: str) -> float:
-    """A quality."""
+    """Parses a quality, greater than 0 and at most 1."""
     try:
         value = float(text)
     except ValueError:
@@ -78,14 +106,14 @@ def share(text: str) -> float:
 
 
 def planner(text: str) -> str:
-    """`random`, or the address of a server."""
+    """Checks the name of a planner."""
     if text != "random" and not text.startswith("grpc:"):
         raise argparse.ArgumentTypeError(f"is {text!r}, must be random or grpc:HOST:PORT")
     return text
 
 
 def cameras(text: str) -> list[Array]:
-    """Camera poses."""
+    """Parses `--views` into camera poses."""
     kind, _, angle = text.partition(":")
     try:
         if kind == "side":
@@ -98,7 +126,7 @@ def cameras(text: str) -> list[Array]:
 
 
 def part_of(folder: Path, part: str) -> list[Path]:
-    """The URDFs of a folder, or of a part of it."""
+    """The URDF files of a folder, or of a part of it."""
     urdfs = sorted(folder.glob("*.urdf"))
     kept = [urdf for index, urdf in enumerate(urdfs) if part == "all" or (index % 5 == 4) == (part == "validation")]
     if not kept:
@@ -106,41 +134,41 @@ def part_of(folder: Path, part: str) -> list[Path]:
     return kept
 
 
-def played(config: BenchmarkConfig, numbers: list[tuple[int, int]], jobs: int) -> Iterator[Round]:
-    """Plays rounds, each a seed and a number, in order."""
+def run(config: BenchmarkConfig, numbers: list[tuple[int, int]], jobs: int) -> Iterator[Round]:
+    """Runs rounds in order, each given by its seed and number."""
     if jobs == 1:
         start(config)
-        yield from map(play, numbers)
+        yield from map(run_round, numbers)
         return
-    # Bullet and gRPC do not survive a fork.
+    # Bullet and gRPC do not work in forked processes.
     with multiprocessing.get_context("spawn").Pool(jobs, start, [config]) as pool:
-        yield from pool.imap(play, numbers)
+        yield from pool.imap(run_round, numbers)
 
 
-# One for each process.
+# One instance per process.
 benchmark: Benchmark
 
 
 def start(config: BenchmarkConfig) -> None:
-    """Prepares a process."""
+    """Initialises a process."""
     global benchmark
     benchmark = Benchmark(config)
 
 
-def play(number: tuple[int, int]) -> Round:
-    """Plays a round."""
+def run_round(number: tuple[int, int]) -> Round:
+    """Runs a round."""
     return benchmark.play(*number)
 
 
 def attempts(planner: str, rounds: Iterable[Round]) -> Iterator[dict[str, Any]]:
-    """A record of each attempt, with the names of `grasp-sim bench --attempts`."""
-    for played in rounds:
-        for number, executed in enumerate(played.executed):
+    """One record per attempt, with the field names of `grasp-sim bench --attempts`."""
+    for round_ in rounds:
+        for number, executed in enumerate(round_.executed):
             grasp, attempt = executed.grasp, executed.attempt
             yield {
                 "planner": planner,
-                "seed": played.seed,
-                "round": played.number,
+                "seed": round_.seed,
+                "round": round_.number,
                 "attempt": number,
                 "outcome": attempt.outcome,
                 "success": attempt.success,
@@ -160,48 +188,48 @@ def attempts(planner: str, rounds: Iterable[Round]) -> Iterator[dict[str, Any]]:
 
 def main() -> None:
     """Runs the benchmark and prints the report."""
-    asked = arguments()
-    collision = CollisionCheck("filter") if asked.clear else None
-    if asked.pictures:
-        asked.pictures.mkdir(parents=True, exist_ok=True)
+    args = arguments()
+    collision = CollisionCheck("filter") if args.clear else None
+    if args.pictures:
+        args.pictures.mkdir(parents=True, exist_ok=True)
     config = BenchmarkConfig(
-        scene=asked.scene,
-        urdfs=part_of(asked.objects, asked.part),
-        count=asked.count,
-        planner=asked.planner,
-        options=Options(asked.model, threshold=asked.threshold, force=asked.force, collision=collision),
-        cameras=asked.views,
-        noise=asked.noise == "dex",
-        hand=asked.hand,
-        pictures=asked.pictures,
+        scene=args.scene,
+        urdfs=part_of(args.objects, args.part),
+        count=args.count,
+        planner=args.planner,
+        options=Options(args.model, threshold=args.threshold, force=args.force, collision=collision),
+        cameras=args.views,
+        noise=args.noise == "dex",
+        hand=args.hand,
+        pictures=args.pictures,
     )
-    seeds = range(asked.seed, asked.seed + asked.seeds)
-    numbers = [(seed, number) for seed in seeds for number in range(asked.rounds)]
+    seeds = range(args.seed, args.seed + args.seeds)
+    numbers = [(seed, number) for seed in seeds for number in range(args.rounds)]
     rounds = []
-    for done, latest in enumerate(played(config, numbers, asked.jobs), 1):
+    for done, latest in enumerate(run(config, numbers, args.jobs), 1):
         rounds.append(latest)
         if sys.stderr.isatty():
             print(f"\r{done} of {len(numbers)} rounds", end="", file=sys.stderr, flush=True)
     if sys.stderr.isatty():
         print(file=sys.stderr)
-    each = [summary([one for one in rounds if one.seed == seed]) for seed in seeds]
+    each = [summary([round_ for round_ in rounds if round_.seed == seed]) for seed in seeds]
     report = summary(rounds) | {
         "seeds": {figure: spread([whole[figure] for whole in each]) for figure in ["gsr", "dr"]},
-        "planner": asked.planner,
+        "planner": args.planner,
         "decoding": {
-            "model": asked.model,
-            "threshold": asked.threshold,
-            "force": asked.force,
-            "clear": asked.clear,
+            "model": args.model,
+            "threshold": args.threshold,
+            "force": args.force,
+            "clear": args.clear,
         },
-        "setup": f"PyBullet, {asked.scene}, {len(config.urdfs)} objects of {asked.objects} ({asked.part}), "
-        f"{len(config.cameras)} views, noise {asked.noise}, {asked.count} objects a scene, {asked.rounds} rounds, "
-        f"seed {asked.seed}, hand {asked.hand}",
+        "setup": f"PyBullet, {args.scene}, {len(config.urdfs)} objects of {args.objects} ({args.part}), "
+        f"{len(config.cameras)} views, noise {args.noise}, {args.count} objects a scene, {args.rounds} rounds, "
+        f"seed {args.seed}, hand {args.hand}",
     }
-    if asked.attempts:
-        asked.attempts.write_text("".join(f"{json.dumps(line)}\n" for line in attempts(asked.planner, rounds)))
-    if asked.out:
-        asked.out.write_text(json.dumps(report, indent=1) + "\n")
+    if args.attempts:
+        args.attempts.write_text("".join(f"{json.dumps(line)}\n" for line in attempts(args.planner, rounds)))
+    if args.out:
+        args.out.write_text(json.dumps(report, indent=1) + "\n")
     print(json.dumps(report))
 
 

@@ -1,4 +1,4 @@
-"""The free hand of the benchmark: a constraint of limited force holds it, and is moved where the hand shall go."""
+"""The free-floating hand of the benchmark. A constraint of limited force holds and moves the hand."""
 
 from __future__ import annotations
 
@@ -12,30 +12,34 @@ from pybullet_utils.bullet_client import BulletClient  # type: ignore[import-unt
 STEPS_PER_SECOND = 240
 
 MAX_OPENING = 0.08
-"""Between the fingers, metres."""
+"""Largest distance between the fingers, metres."""
 
 LINK_TO_GRASP = 0.062
-"""From the origin of the hand's base link to the grasp frame, along z, metres."""
+"""Distance from the origin of the hand's base link to the grasp frame, along z, metres."""
 
 HOLDING_FORCE = 300.0
+"""Largest force of the constraint that holds the hand, newtons."""
 FINGER_FORCE = 20.0
-"""Newtons."""
+"""Largest force of each finger, newtons."""
 
 STRIDE = 0.002
+"""Distance by which the constraint is moved at once, metres."""
 SPEED = 0.1
+"""Metres per second."""
 CLOSING_TIME = 0.5
+"""Seconds."""
 
 FINGERS = (0, 1)
-"""The joints of a hand's URDF: prismatic, from 0 (shut) to 0.04 m each."""
+"""Finger joints of the URDF: prismatic, from 0 (closed) to 0.04 m each."""
 
 
 class Hand:
-    """An open hand whose grasp frame is at `pose`. Poses are those of the grasp frame in the task frame."""
+    """A hand, created open with its grasp frame at `pose`. All poses are `T_task_grasp`."""
 
     def __init__(self, bullet: BulletClient, urdf: Path, pose: Pose) -> None:
         self._bullet = bullet
         self.body: int = bullet.loadURDF(str(urdf))
-        # To Bullet a body is where its centre of mass is.
+        # Bullet's pose of a body is that of its centre of mass.
         com = bullet.getDynamicsInfo(self.body, -1)[3:5]
         self._com_from_grasp = bullet.multiplyTransforms(
             *bullet.invertTransform(*com), (0.0, 0.0, LINK_TO_GRASP), (0.0, 0.0, 0.0, 1.0)
@@ -55,7 +59,7 @@ class Hand:
             childFrameOrientation=quaternion,
         )
         self._hold_at(pose)
-        # Keeps both fingers equally far from the middle.
+        # Keeps both fingers at the same distance from the middle.
         self._gear: int = bullet.createConstraint(
             parentBodyUniqueId=self.body,
             parentLinkIndex=FINGERS[0],
@@ -75,22 +79,22 @@ class Hand:
 
     @property
     def pose(self) -> Pose:
-        """Where it is, which is a little behind where it is held."""
+        """Pose of the grasp frame. It lags slightly behind the pose of the constraint."""
         com = self._bullet.getBasePositionAndOrientation(self.body)
         return Pose(*self._bullet.multiplyTransforms(*com, *self._com_from_grasp))
 
     @property
     def opening(self) -> float:
-        """Between the fingers, metres."""
+        """Distance between the fingers, metres."""
         return float(sum(self._bullet.getJointState(self.body, finger)[0] for finger in FINGERS))
 
     def touched(self) -> list[int]:
-        """The bodies that it touched in the last step."""
+        """The bodies in contact with the hand in the last step."""
         return [contact[2] for contact in self._bullet.getContactPoints(self.body)]
 
     def move_to(self, position: tuple[float, float, float], *, until_contact: bool = False) -> int | None:
-        """Moves straight on, turned as it is now. With `until_contact` it stops after the first stride that touched
-        something, which is the answer; None: nothing did."""
+        """Moves in a straight line without rotation. With `until_contact` the motion stops after the first stride with
+        a contact. Returns the number of that stride, or None without a contact."""
         start = self.pose
         way = np.subtract(position, start.position)
         length = float(np.linalg.norm(way))
@@ -105,12 +109,12 @@ class Hand:
         return None
 
     def close(self) -> None:
-        """Closes the fingers on what is between them."""
+        """Closes the fingers."""
         self._drive_fingers(0.0)
         self._step(int(CLOSING_TIME * STEPS_PER_SECOND))
 
     def remove(self) -> None:
-        """Takes it out of the world."""
+        """Removes the hand from the world."""
         self._bullet.removeConstraint(self._gear)
         self._bullet.removeConstraint(self._holder)
         self._bullet.removeBody(self.body)

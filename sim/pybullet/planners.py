@@ -1,4 +1,4 @@
-"""Planners: each gets depth images and proposes grasps, best first."""
+"""Planners. Each proposes grasps for depth images, best first."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from graspd import Client, DepthView, Options, Pose
 from hand import MAX_OPENING
 
 FINGER_DEPTH = 0.05
+"""Distance from the finger base to the fingertips, metres."""
 
 
 @dataclass(frozen=True)
 class Grasp:
-    """A proposal."""
+    """A proposed grasp."""
 
     pose: Pose
     width: float
@@ -26,27 +27,27 @@ class Grasp:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a planner makes of an observation."""
+    """The result of a planner."""
 
     grasps: list[Grasp]
     """Best first."""
     fusion: float = 0.0
-    """Seconds of the planning that went into fusing the images."""
+    """Duration of the fusion of the images, seconds; 0 if the planner does not report it."""
 
 
 class Planner(Protocol):
     """Proposes grasps in the task frame."""
 
     def plan(self, views: Sequence[DepthView]) -> Plan:
-        """For what was seen."""
+        """Proposes grasps for the depth images."""
 
 
 class Served:
-    """A running graspd, which gets the depth images."""
+    """A running graspd. It gets the depth images."""
 
     def __init__(self, address: str, options: Options | None = None) -> None:
         self.options = options
-        # GPD on a busy machine takes seconds.
+        # GPD takes seconds on a busy machine.
         self.client = Client(address, timeout=60.0)
 
     def plan(self, views: Sequence[DepthView]) -> Plan:
@@ -57,13 +58,13 @@ class Served:
 
 
 class Random:
-    """A random point of the observed surface, approached against its normal, at a random depth and yaw."""
+    """Random grasps: at a random point of the observed surface, against its normal, with a random depth and yaw."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
 
     def plan(self, views: Sequence[DepthView]) -> Plan:
-        """One grasp, or none where no surface can be reached."""
+        """One grasp; none if no point of an object was observed."""
         positions, normals = graspable(views)
         if not len(positions):
             return Plan([])
@@ -71,7 +72,7 @@ class Random:
         z = -normals[index]
         depth = self.rng.uniform(-0.1, 1.1) * FINGER_DEPTH
         yaw = self.rng.uniform(0.0, math.pi)
-        # Along x as far as the approach lets it, then turned about the approach.
+        # The task frame's x axis, projected onto the plane normal to the approach and rotated about it by the yaw.
         x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9999 else np.array([0.0, 1.0, 0.0])
         y = np.cross(z, x) / np.linalg.norm(np.cross(z, x))
         x = np.cross(y, z)
@@ -83,9 +84,9 @@ class Random:
 
 
 def graspable(views: Sequence[DepthView]) -> tuple[Array, Array]:
-    """Points of the observed surface within reach that do not face down, and their normals.
+    """Observed points of objects whose surface does not face down, and their normals.
 
-    A point a voxel of 2.5 mm, however many pixels show it, as in the fine volume of VGN's code."""
+    At most one point per voxel of 2.5 mm, as in the fine volume of VGN's code."""
     clouds = [surface(view) for view in views]
     positions = np.concatenate([cloud[0] for cloud in clouds])
     normals = np.concatenate([cloud[1] for cloud in clouds])
@@ -96,11 +97,11 @@ def graspable(views: Sequence[DepthView]) -> tuple[Array, Array]:
 
 
 def surface(view: DepthView) -> tuple[Array, Array]:
-    """A point and its normal for every pixel whose neighbours, two pixels away, are on the same surface."""
+    """The point and the normal of every pixel whose neighbours at a distance of two pixels are on the same surface."""
     seen = points(view)
     across, down = seen[2:-2, 4:] - seen[2:-2, :-4], seen[4:, 2:-2] - seen[:-4, 2:-2]
-    # Further apart, there is an edge between them.
+    # At a larger distance there is an edge between the neighbours.
     smooth = (np.linalg.norm(across, axis=-1) < 0.02) & (np.linalg.norm(down, axis=-1) < 0.02)
-    # Rows run down and columns right in the image, so that this is towards the camera.
+    # Rows increase downwards and columns to the right, so the cross product points towards the camera.
     normals = np.cross(down, across)[smooth]
     return seen[2:-2, 2:-2][smooth], normals / np.linalg.norm(normals, axis=-1, keepdims=True)

@@ -1,7 +1,7 @@
-"""Replays the trials of `grasp-sim label --export`, and reports how many successes and failures have the same result.
+"""Repeats the trials of `grasp-sim label --export` in PyBullet, and reports how many have the same result.
 
-A trial succeeds here if the object rose. Scenes in which an object moves by more than 3 mm when they are placed are
-skipped. Of each other scene at most 12 successes and 12 failures are tried. The last line that is printed is a JSON object.
+A trial is a success if the object rose. A scene is skipped if an object moves by more than 3 mm after placement. In
+each other scene at most 12 successes and 12 failures are repeated. The last line of the output is a JSON object.
 """
 
 from __future__ import annotations
@@ -24,43 +24,45 @@ from score import share, wilson
 from world import HAND, World
 
 MOST_MOVED = 0.003
-"""Metres; a scene in which an object moves further is skipped."""
+"""Metres; a scene is skipped if an object moves further."""
 SETTLING_TIME = 0.5
+"""Seconds."""
 TRIALS = 12
-"""Of each label in a scene."""
+"""Largest number of successes, and of failures, per scene."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How trials are run."""
+    """Settings of the trials."""
 
     folders: list[Path]
     hand: Path
     allow_contact: bool
+    """Whether the hand closes on contact during the approach; otherwise a contact is a failure."""
     shake: tuple[float, float]
-    """By how much each grasp is moved at first, the root of the mean square, metres and radians."""
+    """Random error of each grasp's pose: root mean square, metres and radians."""
     seed: int
 
 
 @dataclass(frozen=True)
 class Replay:
-    """A scene that was placed."""
+    """The result of one scene."""
 
     moved: list[float]
-    """How far each object moved, metres."""
+    """Distance by which each object moved after placement, metres."""
     records: list[dict[str, Any]] | None
-    """The result of each trial; None if the objects moved."""
+    """One record per trial; None if the scene was skipped."""
 
 
 class Replayer:
-    """A world for any number of scenes."""
+    """A world, used for any number of scenes."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.world = World(settings.hand)
 
     def replay(self, scene: dict[str, Any]) -> Replay:
-        """Places a scene and tries its grasps."""
+        """Places the objects of a scene and executes its grasps."""
         world, settings = self.world, self.settings
         rng = np.random.default_rng([settings.seed, scene["scene"]])
         objects = [(self.urdf(each["object"]), each["scale"], pose(each["pose"])) for each in scene["objects"]]
@@ -78,13 +80,13 @@ class Replayer:
                 grasp = shaken(pose(trial["pose"]), settings.shake, rng)
                 attempt = world.execute(grasp, allow_contact=settings.allow_contact, remove=False)
                 world.restore(state)
-                there = {key: trial[key] for key in ["pose", "label", "executed", "width", "yaws"] if key in trial}
+                fields = {key: trial[key] for key in ["pose", "label", "executed", "width", "yaws"] if key in trial}
                 source = trial.get("object")
                 records.append(
                     {
                         "scene": scene["scene"],
                         "trial": index,
-                        **there,
+                        **fields,
                         "drawn_from": None if source is None else scene["objects"][source]["object"],
                         "expected": success,
                         "success": attempt.success,
@@ -96,12 +98,12 @@ class Replayer:
         return Replay(moved, records)
 
     def expected(self, trial: dict[str, Any]) -> int:
-        """The exported result: with contacts allowed if that was tried, else without contacts."""
+        """The exported result: `executed` if contacts are allowed and the export has it, otherwise `label`."""
         executed = trial.get("executed") if self.settings.allow_contact else None
         return int(trial["label"] if executed is None else executed)
 
     def urdf(self, name: str) -> Path:
-        """The file of an object."""
+        """The URDF file of an object."""
         for folder in self.settings.folders:
             path = folder / f"{name}.urdf"
             if path.is_file():
@@ -111,13 +113,13 @@ class Replayer:
 
 
 def pose(numbers: list[float]) -> Pose:
-    """From x, y, z and a quaternion."""
+    """A pose from x, y, z and a quaternion x, y, z, w."""
     x, y, z, qx, qy, qz, qw = numbers
     return Pose((x, y, z), (qx, qy, qz, qw))
 
 
 def shaken(grasp: Pose, shake: tuple[float, float], rng: np.random.Generator) -> Pose:
-    """The grasp moved and turned about its origin, normally distributed."""
+    """The grasp with a normally distributed error of its position and of its rotation about its origin."""
     way, turn = (rng.normal(size=3) * size / math.sqrt(3) for size in shake)
     angle = float(np.linalg.norm(turn))
     if angle == 0.0 and not way.any():
@@ -132,9 +134,9 @@ def shaken(grasp: Pose, shake: tuple[float, float], rng: np.random.Generator) ->
 
 
 def arguments() -> argparse.Namespace:
-    """The command line."""
+    """Parses the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("export", type=Path, help="what grasp-sim label --export wrote")
+    parser.add_argument("export", type=Path, help="file written by grasp-sim label --export")
     parser.add_argument(
         "--objects", type=Path, nargs="+", required=True, metavar="DIR", help="folders of the objects' URDF files"
     )
@@ -142,26 +144,33 @@ def arguments() -> argparse.Namespace:
         "--contact",
         choices=["allow", "forbid"],
         default="forbid",
-        help="what a contact on the way is: allow closes the hand there, as the benchmark does, and compares with what "
-        "was executed so; forbid makes it a failure, as labels have it",
+        help="effect of a contact on the approach. allow: the hand closes there, as in the benchmark; the result is "
+        "compared with `executed` if the file has it. forbid: the trial fails, as in labels; the result is compared "
+        "with `label`",
     )
     parser.add_argument(
         "--shake",
         type=shake,
         default=(0.0, 0.0),
         metavar="MM,DEG",
-        help="move each grasp by so much first, normally distributed",
+        help="root mean square of a random error of each grasp's pose, millimetres and degrees",
     )
-    parser.add_argument("--limit", type=positive, default=400, metavar="N", help="successes, and failures, at most")
-    parser.add_argument("--seed", type=int, default=1, metavar="S", help="of the shaking")
-    parser.add_argument("--hand", type=Path, default=HAND, metavar="URDF", help="a hand with the frames and joints of sim/hand/hand.urdf")
-    parser.add_argument("--jobs", type=positive, default=1, metavar="J", help="processes")
-    parser.add_argument("--records", type=Path, metavar="FILE", help="also write a JSON line a trial")
+    parser.add_argument(
+        "--limit", type=positive, default=400, metavar="N", help="largest number of successes, and of failures"
+    )
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="seed of the pose errors")
+    parser.add_argument(
+        "--hand", type=Path, default=HAND, metavar="URDF", help="hand with the frames and joints of sim/hand/hand.urdf"
+    )
+    parser.add_argument("--jobs", type=positive, default=1, metavar="J", help="number of parallel processes")
+    parser.add_argument(
+        "--records", type=Path, metavar="FILE", help="also write every trial to this file, as JSON lines"
+    )
     return parser.parse_args()
 
 
 def shake(text: str) -> tuple[float, float]:
-    """Metres and radians from millimetres and degrees."""
+    """Parses millimetres and degrees into metres and radians."""
     try:
         millimetres, degrees = map(float, text.split(","))
     except ValueError:
@@ -170,21 +179,21 @@ def shake(text: str) -> tuple[float, float]:
 
 
 def scenes(path: Path) -> list[dict[str, Any]]:
-    """The scenes of an export."""
+    """Reads the scenes of an export."""
     read = []
     for number, line in enumerate(path.read_text().splitlines(), 1):
         try:
             scene = json.loads(line)
         except json.JSONDecodeError as mistake:
-            raise ValueError(f"{path}, line {number} is not JSON ({mistake}): export it again") from None
+            raise ValueError(f"{path}, line {number} is not JSON ({mistake}); export the scenes again") from None
         if not {"scene", "objects", "trials"} <= set(scene):
-            raise ValueError(f"{path}, line {number} lacks scene, objects or trials: was it written by --export?")
+            raise ValueError(f"{path}, line {number} lacks scene, objects or trials; use grasp-sim label --export")
         read.append(scene)
     return read
 
 
 def replays(settings: Settings, read: list[dict[str, Any]], jobs: int) -> Iterator[Replay]:
-    """Replays scenes in their order."""
+    """Repeats the trials of the scenes, in their order."""
     if jobs == 1:
         start(settings)
         yield from map(replay, read)
@@ -193,23 +202,23 @@ def replays(settings: Settings, read: list[dict[str, Any]], jobs: int) -> Iterat
         yield from pool.imap(replay, read)
 
 
-# Of this process.
+# One instance per process.
 replayer: Replayer
 
 
 def start(settings: Settings) -> None:
-    """Makes a process ready to replay."""
+    """Initialises a process."""
     global replayer
     replayer = Replayer(settings)
 
 
 def replay(scene: dict[str, Any]) -> Replay:
-    """Replays a scene."""
+    """Repeats the trials of a scene."""
     return replayer.replay(scene)
 
 
 def kept(records: list[dict[str, Any]], expected: int) -> dict[str, Any]:
-    """How many of one label came out the same, and the 95 % interval."""
+    """Percentage of the trials with this expected result that have it here too, with its 95 % interval."""
     outcomes = [record["rose"] == bool(expected) for record in records if record["expected"] == expected]
     low, high = wilson(sum(outcomes), len(outcomes))
     return {
@@ -220,33 +229,33 @@ def kept(records: list[dict[str, Any]], expected: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Replays and reports."""
-    asked = arguments()
-    settings = Settings(asked.objects, asked.hand, asked.contact == "allow", asked.shake, asked.seed)
+    """Repeats the trials and prints the report."""
+    args = arguments()
+    settings = Settings(args.objects, args.hand, args.contact == "allow", args.shake, args.seed)
     records: list[dict[str, Any]] = []
     moved: list[float] = []
-    laid = skipped = 0
-    left = {0: asked.limit, 1: asked.limit}
-    for one in replays(settings, scenes(asked.export), asked.jobs):
-        laid += 1
-        moved += one.moved
-        skipped += one.records is None
-        for record in one.records or []:
-            if left[record["expected"]]:
-                left[record["expected"]] -= 1
+    placed = skipped = 0
+    remaining = {0: args.limit, 1: args.limit}
+    for result in replays(settings, scenes(args.export), args.jobs):
+        placed += 1
+        moved += result.moved
+        skipped += result.records is None
+        for record in result.records or []:
+            if remaining[record["expected"]]:
+                remaining[record["expected"]] -= 1
                 records.append(record)
-        if not any(left.values()):
+        if not any(remaining.values()):
             break
     report = {
         "success_kept": kept(records, 1),
         "failure_kept": kept(records, 0),
-        "scenes": laid,
+        "scenes": placed,
         "scenes_skipped": skipped,
         "moved_mm_median": round(1e3 * statistics.median(moved or [0.0]), 2),
         "moved_mm_p95": round(1e3 * float(np.percentile(moved or [0.0], 95)), 2),
     }
-    if asked.records:
-        asked.records.write_text("".join(f"{json.dumps(record)}\n" for record in records))
+    if args.records:
+        args.records.write_text("".join(f"{json.dumps(record)}\n" for record in records))
     print(json.dumps(report))
 
 

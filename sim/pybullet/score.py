@@ -1,4 +1,4 @@
-"""The benchmark's figures, under the names of `grasp-sim bench`."""
+"""The figures of the benchmark, with the names of `grasp-sim bench`."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from typing import Any
 from benchmark import Round
 
 Z = 1.96
-"""Of a 95 % interval."""
+"""Half-width of a 95 % interval, in standard deviations."""
 
 
 def summary(rounds: Sequence[Round]) -> dict[str, Any]:
-    """Pools rounds, as the papers do."""
-    attempts = [executed.attempt for played in rounds for executed in played.executed]
+    """Figures of all rounds together: attempts are pooled, as in the papers."""
+    attempts = [executed.attempt for round_ in rounds for executed in round_.executed]
     outcomes = Counter(attempt.outcome for attempt in attempts)
-    endings = Counter(played.ending for played in rounds)
-    objects, successes = sum(played.objects for played in rounds), outcomes["lifted"]
-    fusion = [seconds for played in rounds for seconds in played.fusion]
-    planning = [seconds for played in rounds for seconds in played.planning]
+    endings = Counter(round_.ending for round_ in rounds)
+    objects, successes = sum(round_.objects for round_ in rounds), outcomes["lifted"]
+    fusion = [seconds for round_ in rounds for seconds in round_.fusion]
+    planning = [seconds for round_ in rounds for seconds in round_.planning]
     stopped_short = [
         attempt
         for attempt in attempts
@@ -53,24 +53,24 @@ def summary(rounds: Sequence[Round]) -> dict[str, Any]:
 
 
 def spread(values: Sequence[float]) -> dict[str, Any]:
-    """A figure over several seeds: mean, sample standard deviation (None of one), how many, and which."""
+    """A figure over several seeds: mean, sample standard deviation (None for one seed), number of seeds, and values."""
     std = statistics.stdev(values) if len(values) > 1 else None
     return {"mean": statistics.fmean(values), "std": std, "n": len(values), "each": list(values)}
 
 
 def share(part: int, whole: int) -> float:
-    """0 of nothing."""
+    """The share part / whole; 0 if the whole is 0."""
     return part / whole if whole else 0.0
 
 
 def half_interval(part: int, whole: int) -> float:
-    """Half of the 95 % interval of a share, by the normal approximation."""
+    """Half-width of the 95 % interval of a share, by the normal approximation."""
     p = share(part, whole)
     return Z * math.sqrt(p * (1 - p) / whole) if whole else 0.0
 
 
 def wilson(part: int, whole: int) -> tuple[float, float]:
-    """The 95 % interval of a share, which is right near 0 and 1 too (Wilson 1927)."""
+    """The 95 % score interval of a share, which is also valid near 0 and 1 (Wilson 1927)."""
     if not whole:
         return 0.0, 1.0
     p, shrink = part / whole, 1 + Z * Z / whole
@@ -80,7 +80,7 @@ def wilson(part: int, whole: int) -> tuple[float, float]:
 
 
 def percentile_ms(seconds: Sequence[float], below: float) -> float:
-    """The value that this share lies below, milliseconds; 0 of nothing."""
+    """The value that a share `below` of the values lies below, milliseconds; 0 without values."""
     if not seconds:
         return 0.0
     return 1e3 * sorted(seconds)[min(int(below * len(seconds)), len(seconds) - 1)]

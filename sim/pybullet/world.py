@@ -1,7 +1,7 @@
-"""A table with objects in PyBullet, and grasps tried on them: the benchmark's protocol in the engine of VGN's own code.
+"""A table with objects in PyBullet, and the execution of grasps with the benchmark's protocol.
 
-Lengths are in metres, poses `graspd.Pose` in the task frame: its origin is a corner of the cube of 0.3 m, z is up, the
-table is at z = 0.05.
+Lengths are in metres. Poses are `graspd.Pose` in the task frame: its origin is a corner of the cube of 0.3 m, z is up,
+and the table is at z = 0.05.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from hand import MAX_OPENING, STEPS_PER_SECOND, Hand
 from pybullet_utils.bullet_client import BulletClient  # type: ignore[import-untyped]
 
 HAND = Path(__file__).resolve().parent.parent / "hand/hand.urdf"
-"""The Panda hand."""
+"""URDF of the Panda hand."""
 
 SIZE = 0.3
 TABLE_HEIGHT = 0.05
@@ -26,19 +26,20 @@ TABLE_FRICTION = 0.5
 SOLVER_ITERATIONS = 150
 
 REST_SPEED = 0.01
-"""Norm of a resting body's velocity, m/s and rad/s together."""
+"""Largest velocity norm of a body at rest, m/s and rad/s together."""
 REST_CHUNK = 60
-"""Steps between two checks that everything rests."""
+"""Steps between two checks for rest."""
 
 PREGRASP_DISTANCE = 0.05
 LIFT = 0.1
 STEEPEST_LIFT_BACK = math.pi / 3
-"""How far off straight down an approach may be for the hand to lift back along it; else it lifts straight up."""
+"""Largest angle between an approach and straight down for a lift back along the approach; otherwise straight up."""
 EMPTY_OPENING = 0.1 * MAX_OPENING
-"""A hand with a smaller opening holds nothing."""
+"""Largest opening of an empty grasp."""
 LEAST_RISE = 0.03
+"""Smallest rise of an object that is in the air."""
 WIDEST_OPENING = MAX_OPENING + 0.005
-"""Wider, a finger is jammed beyond the end of its range."""
+"""With a larger opening, a finger is jammed beyond the end of its range."""
 
 
 @dataclass(frozen=True)
@@ -48,32 +49,32 @@ class Attempt:
     outcome: str
     """`lifted`, `blocked_at_pregrasp`, `blocked_on_approach`, `closed_on_nothing` or `lost_in_lift`.
 
-    Where contacts are allowed the hand closes where its approach met something, and a failure is called
-    `blocked_at_pregrasp` if that was in the first 2 mm."""
+    If contacts are allowed, the hand closes at the first contact of its approach. A failure is then
+    `blocked_at_pregrasp` if the contact was in the first 2 mm."""
     opening: float
-    """Between the fingers at the end."""
+    """Distance between the fingers at the end."""
     rise: float
-    """Of the object in the hand; 0 without one."""
+    """Height by which the held object rose; 0 without a held object."""
     object: str | None
-    """The name of the object in the hand."""
+    """Name of the held object; None without a held object."""
     touched: bool
-    """Whether the approach met something."""
+    """Whether there was a contact during the approach."""
     short_by: float
-    """From where the hand closed to the grasp; 0 if nothing stopped it."""
+    """Distance from the grasp at which the approach ended; 0 without a contact."""
 
     @property
     def success(self) -> bool:
-        """VGN's check: after the lift the hand touches something that is not the table, and is not shut."""
+        """VGN's check: after the lift the hand touches an object and is not closed."""
         return self.outcome == "lifted"
 
     @property
     def rose(self) -> bool:
-        """A success whose object is in the air, for VGN's check also passes when a finger is jammed."""
+        """Whether a success has its object in the air. VGN's check also accepts a jammed finger that lifts nothing."""
         return self.success and self.rise > LEAST_RISE and self.opening < WIDEST_OPENING
 
 
 class World:
-    """A table, at first an empty one."""
+    """A table, initially empty."""
 
     def __init__(self, hand: str | Path = HAND) -> None:
         """`hand` is the URDF of a hand with the frames and the order of joints of `sim/hand/hand.urdf`."""
@@ -86,40 +87,40 @@ class World:
         self.bullet.disconnect()
 
     def clear(self) -> None:
-        """Empties the table."""
+        """Removes all objects."""
         self.bullet.resetSimulation()
         self.bullet.setPhysicsEngineParameter(
             fixedTimeStep=1 / STEPS_PER_SECOND, numSolverIterations=SOLVER_ITERATIONS
         )
         self.bullet.setGravity(0, 0, -9.81)
         self.objects: dict[int, str] = {}
-        """What stands on the table: Bullet's numbers and the names."""
+        """The objects on the table: Bullet's body ids and the names."""
         self.table = self._box((SIZE / 2, SIZE / 2, TABLE_HEIGHT - 0.01), (1.2, 1.2, 0.02))
 
     # Scenes
 
     def add(self, urdf: str | Path, pose: Pose, scale: float = 1.0) -> int:
-        """Adds an object whose base link is at `pose`; the answer is Bullet's number of it."""
+        """Adds an object with its base link at `pose`. Returns Bullet's body id."""
         path = existing(urdf)
         try:
             body = int(self.bullet.loadURDF(str(path), pose.position, pose.quaternion, globalScaling=scale))
         except pybullet.error:
-            raise ValueError(f"{path} is not a URDF that PyBullet can load; its messages above say why") from None
+            raise ValueError(f"{path} is not a URDF that PyBullet can load; see PyBullet's messages above") from None
         self.objects[body] = path.stem
         return body
 
     def place(self, objects: Iterable[tuple[str | Path, float, Pose]]) -> list[int]:
-        """Empties the table and puts these on it, each a URDF, its scale and the pose of its base link."""
+        """Replaces all objects, each given by URDF, scale and pose of the base link. Returns Bullet's body ids."""
         self.clear()
         return [self.add(urdf, pose, scale) for urdf, scale, pose in objects]
 
     def remove(self, body: int) -> None:
-        """Takes an object away."""
+        """Removes an object."""
         self.bullet.removeBody(body)
         del self.objects[body]
 
     def pile(self, urdfs: Sequence[Path], count: int, rng: np.random.Generator) -> None:
-        """Makes a pile: objects dropped one by one into an open box, which is then taken away."""
+        """Makes a pile: drops objects one by one into an open box, then removes the box."""
         self.clear()
         low, high, top, thickness = 0.02, 0.28, 0.13, 0.004
         middle, side, z = (low + high) / 2, high - low, TABLE_HEIGHT + top / 2
@@ -140,7 +141,7 @@ class World:
         self.settle()
 
     def packed(self, urdfs: Sequence[Path], count: int, rng: np.random.Generator) -> None:
-        """Stands up to `count` objects upright where there is room."""
+        """Places up to `count` objects upright at free positions."""
         self.clear()
         for _ in range(12):
             if len(self.objects) == count:
@@ -151,7 +152,7 @@ class World:
             yaw = rng.uniform(0, 2 * math.pi)
             quaternion = (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
             body = self.add(urdf, Pose((x, y, 1.0), quaternion), rng.uniform(0.7, 0.9))
-            # As VGN's code has it, the centre of mass goes to half the object's height.
+            # As in VGN's code, the centre of mass is placed at half the object's height.
             low, high = self.bullet.getAABB(body)
             z = TABLE_HEIGHT + (high[2] - low[2]) / 2 + 0.002
             self.bullet.resetBasePositionAndOrientation(body, (x, y, z), quaternion)
@@ -164,7 +165,7 @@ class World:
             self.forget(before)
 
     def settle(self) -> None:
-        """Simulates until everything rests, and removes objects outside the workspace, until none leaves it."""
+        """Simulates until everything rests and removes objects that left the workspace, until no object leaves."""
         while True:
             self.wait_for_rest(2.0)
             gone = [body for body in self.objects if not all(0 <= c <= SIZE for c in self.position(body))]
@@ -174,7 +175,7 @@ class World:
                 self.remove(body)
 
     def wait_for_rest(self, seconds: float) -> None:
-        """Simulates until everything rests, at most `seconds`."""
+        """Simulates until everything rests, for at most `seconds`."""
         for _ in range(math.ceil(seconds * STEPS_PER_SECOND / REST_CHUNK)):
             for _ in range(REST_CHUNK):
                 self.bullet.stepSimulation()
@@ -182,20 +183,20 @@ class World:
                 return
 
     def position(self, body: int) -> tuple[float, float, float]:
-        """Of an object's centre of mass."""
+        """Position of an object's centre of mass."""
         x, y, z = self.bullet.getBasePositionAndOrientation(body)[0]
         return x, y, z
 
     def save(self) -> int:
-        """Saves poses and velocities, until `forget`."""
+        """Saves poses and velocities. Returns the id of the saved state, which is valid until `forget`."""
         return int(self.bullet.saveState())
 
     def restore(self, state: int) -> None:
-        """Restores poses and velocities. The objects must be the same."""
+        """Restores a saved state. The world must contain the same objects."""
         self.bullet.restoreState(stateId=state)
 
     def forget(self, state: int) -> None:
-        """Ends a `save`."""
+        """Deletes a saved state."""
         self.bullet.removeState(state)
 
     # Grasps
@@ -207,10 +208,11 @@ class World:
         remove: bool = True,
         closed: Callable[[], None] | None = None,
     ) -> Attempt:
-        """Tries a grasp: pre-grasp, approach, close, lift.
+        """Executes a grasp: pre-grasp, approach, close, lift.
 
-        `allow_contact`: the hand closes where its approach met something; else that is a failure. `remove`: takes away
-        what was lifted, and lets the rest settle. `closed` is called when the fingers have closed.
+        `allow_contact`: at the first contact of the approach the hand closes; otherwise a contact is a failure.
+        `remove`: removes the lifted object and lets the other objects settle. `closed` is called after the fingers have
+        closed.
         """
         heights = {body: self.position(body)[2] for body in self.objects}
         hand = Hand(self.bullet, self.hand, moved(pose, -PREGRASP_DISTANCE))
@@ -254,7 +256,7 @@ class World:
         return next((body for body in hand.touched() if body in self.objects), None)
 
     def _box(self, centre: tuple[float, float, float], edges: tuple[float, float, float]) -> int:
-        """A box that does not move."""
+        """A fixed box."""
         half = [edge / 2 for edge in edges]
         shape = self.bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half)
         look = self.bullet.createVisualShape(pybullet.GEOM_BOX, halfExtents=half, rgbaColor=(0.9, 0.9, 0.9, 1))
@@ -264,13 +266,13 @@ class World:
 
 
 def moved(pose: Pose, distance: float) -> Pose:
-    """The pose so far along its own z."""
+    """The pose, moved by `distance` along its own z axis."""
     x, y, z = pose.position + distance * pose.matrix()[:3, 2]
     return Pose((x, y, z), pose.quaternion)
 
 
 def retreat(pose: Pose) -> tuple[float, float, float]:
-    """Where the lift from a grasp ends: back along the approach, or above the grasp if that is too flat."""
+    """End position of the lift from a grasp: back along the approach, or straight up if the approach is too flat."""
     down = -pose.matrix()[2, 2]
     if math.acos(min(max(down, -1.0), 1.0)) > STEEPEST_LIFT_BACK:
         x, y, z = pose.position
@@ -279,7 +281,7 @@ def retreat(pose: Pose) -> tuple[float, float, float]:
 
 
 def existing(urdf: str | Path) -> Path:
-    """The path, if there is such a file."""
+    """The path of a file. Raises `FileNotFoundError` if it does not exist."""
     path = Path(urdf)
     if not path.is_file():
         raise FileNotFoundError(f"{path} not found; pass a URDF file")

@@ -1,4 +1,5 @@
-//! The clutter-removal benchmark: a planner's best grasp is executed repeatedly until the table is empty or it fails.
+//! The clutter-removal benchmark: a planner's best grasp is executed repeatedly until the table is empty, no object is
+//! visible, no grasp is proposed, or two grasps in a row fail.
 
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};

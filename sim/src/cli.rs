@@ -48,13 +48,13 @@ pub enum Command {
     Replay(replay::Replay),
     /// Draw objects, or write them as URDF and OBJ.
     Objects(objects::Objects),
-    /// Generate scenes, try grasp candidates and write training data for GPD's classifier.
+    /// Generate scenes, try grasp candidates and write training data for a classifier of them.
     Candidates(candidates::Candidates),
     /// Run the clutter-removal benchmark with planners.
     Bench(bench::Bench),
     /// Compare the predicted quality of executed grasps with their success rate.
     Reliability(reliability::ReliabilityArgs),
-    /// Regenerate the tables of the paper.
+    /// Measure the paper's tables and write them with the published figures.
     Tables(tables::Tables),
     /// Run one scene end to end: camera, graspd, execution of the best grasp.
     Demo(demo::Demo),

@@ -27,8 +27,8 @@ const REPEATS: usize = 6;
 /// Repetitions end after this many successes without a failure. Most grasps hold, and further failures are rare then.
 const ENOUGH: usize = 3;
 
-/// Greatest number of failed tries of a grasp that is labelled a success. Of grasps with more failures one in three
-/// fails in another simulator.
+/// Largest number of failed repetitions of a grasp that is labelled a success. Of grasps with more failures one in
+/// three fails in another simulator.
 const FAILURES: usize = 1;
 
 /// Standard deviations of the pose error over all directions, metres and radians: the accuracy of a calibrated arm and
@@ -293,7 +293,7 @@ impl Tries {
 }
 
 /// The grasp with a random pose error.
-fn perturbed(grasp: &Isometry3<f64>, rng: &mut impl Rng) -> Isometry3<f64> {
+pub(crate) fn perturbed(grasp: &Isometry3<f64>, rng: &mut impl Rng) -> Isometry3<f64> {
     // The deviation over all directions is √3 times that along one axis.
     let mut error =
         |deviation: f64| Vector3::from_fn(|_, _| -> f64 { StandardNormal.sample(rng) }) * (deviation / 3f64.sqrt());

@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use grasp::{DecodeParams, Grasp, RESOLUTION, Volume};
-use grasp_models::Options;
-use grasp_planner::{Gpd, HighestProposal, NetworkPlanner, PlanParams, Planner, Scene, Shaf};
+use grasp_models::{Network, Options};
+use grasp_planner::{Evaluator, Gpd, HighestProposal, NetworkPlanner, PlanParams, Planner, Scene, Shaf};
 use nalgebra::Isometry3;
 use rand_chacha::ChaCha8Rng;
 
@@ -94,6 +94,13 @@ pub enum PlannerSpec {
     HighestProposed(PathBuf),
     /// GPD: candidates scored by an ONNX classifier.
     Gpd(PathBuf),
+    /// An ONNX network, whose grasps are moved and scored by an ONNX evaluator.
+    Evaluated {
+        /// The evaluator.
+        evaluator: PathBuf,
+        /// The network.
+        network: PathBuf,
+    },
 }
 
 impl From<&str> for PlannerSpec {
@@ -104,6 +111,9 @@ impl From<&str> for PlannerSpec {
             Some(("grpc", address)) => Self::Server(address.to_owned()),
             Some(("shaf", path)) => Self::HighestProposed(PathBuf::from(path)),
             Some(("gpd", path)) => Self::Gpd(PathBuf::from(path)),
+            Some((evaluator, network)) if evaluator.ends_with(".onnx") => {
+                Self::Evaluated { evaluator: PathBuf::from(evaluator), network: PathBuf::from(network) }
+            }
             _ => Self::Network(PathBuf::from(text)),
         }
     }
@@ -134,6 +144,11 @@ impl PlannerSpec {
             Self::Network(path) => {
                 let (network, decode) = load(path)?;
                 local(Box::new(network), decode, false)
+            }
+            Self::Evaluated { evaluator, network } => {
+                let (network, evaluator) = (Network::load(network, options)?, Evaluator::load(evaluator, options)?);
+                let decode = DecodeParams { origin: network.metadata().voxel_origin, ..*params };
+                local(Box::new(NetworkPlanner::new(network, Some(evaluator))), decode, false)
             }
             Self::HighestProposed(path) => {
                 let (network, decode) = load(path)?;

@@ -26,7 +26,7 @@ pub struct Summary {
     pub gsr_interval: f64,
     /// Half the width of the 95 % interval of `dr`.
     pub dr_interval: f64,
-    /// Attempts that collided at the pre-grasp.
+    /// Failed attempts with a contact at the pre-grasp.
     pub blocked_at_pregrasp: usize,
     /// Empty grasps.
     pub closed_on_nothing: usize,

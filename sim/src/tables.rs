@@ -70,7 +70,7 @@ pub struct Condition {
     pub views: String,
     /// ε, the smallest quality of a grasp, in hundredths.
     pub epsilon: u8,
-    /// If no grasp reaches ε: whether the best one down to 0.5 is taken.
+    /// If no grasp reaches ε: whether the best grasp is executed if its quality is at least 0.5.
     pub forced: bool,
 }
 

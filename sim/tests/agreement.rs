@@ -68,8 +68,8 @@ fn labels_agree_with_mujoco() {
     let all: usize = table.iter().flatten().sum();
     let lifted = |ours: usize, theirs: usize| (ours == 2) == (theirs == 2);
     let cells = || (0..3).flat_map(|ours| (0..3).map(move |theirs| (ours, theirs)));
-    let sum = |wanted: &dyn Fn(usize, usize) -> bool| -> usize {
-        cells().filter(|&(ours, theirs)| wanted(ours, theirs)).map(|(ours, theirs)| table[ours][theirs]).sum()
+    let sum = |counts: &dyn Fn(usize, usize) -> bool| -> usize {
+        cells().filter(|&(ours, theirs)| counts(ours, theirs)).map(|(ours, theirs)| table[ours][theirs]).sum()
     };
     let agree = sum(&lifted) as f64 / all as f64;
     let closed = sum(&|ours, theirs| ours > 0 && theirs > 0);

@@ -7,7 +7,7 @@ use std::process::{Command, Output, Stdio};
 use std::thread::sleep;
 use std::time::Duration;
 
-use grasp_data::Dataset;
+use grasp_data::{Candidates, Dataset};
 use grasp_sim::export;
 use serde_json::Value;
 use tempfile::TempDir;
@@ -116,8 +116,8 @@ fn a_full_disk_is_reported_and_written_scenes_stay() {
     let command = format!("trap '' XFSZ; ulimit -f 1000; exec {SIM} {LABEL} --scenes 30 --out full");
     let output = Command::new("sh").args(["-c", &command]).current_dir(&desk.0).output().unwrap();
     assert!(!output.status.success());
-    let said = stderr(&output);
-    assert!(said.contains("full/scenes-00000.pack: File too large"), "{said}");
+    let error = stderr(&output);
+    assert!(error.contains("full/scenes-00000.pack: File too large"), "{error}");
     let kept = desk.scenes("full");
     assert!((1..30).contains(&kept.len()), "{} scenes", kept.len());
     desk.run(&format!("{LABEL} --scenes 30 --out full"));
@@ -293,11 +293,11 @@ fn the_first_failures_are_drawn_on_a_sheet() {
         assert!(output.status.success(), "{}", stderr(&output));
         (fs::read(desk.path(name)).unwrap(), stderr(&output))
     };
-    let (sheet, said) = bench("first.png");
+    let (sheet, log) = bench("first.png");
     // Each of the three rounds ends with two failures of the random planner. The sheet has three pictures per row.
     assert!(sheet.starts_with(b"\x89PNG"));
     assert_eq!((&sheet[16..20], &sheet[20..24]), (&1440u32.to_be_bytes()[..], &720u32.to_be_bytes()[..]));
-    assert_eq!(said.matches("first.png: seed 5, round").count(), 6, "{said}");
+    assert_eq!(log.matches("first.png: seed 5, round").count(), 6, "{log}");
     assert!(bench("second.png").0 == sheet, "the sheet does not depend on the scheduling of the rounds");
 }
 
@@ -343,8 +343,22 @@ fn scenes_are_observed_again() {
     // A data set of another simulator: its first scene differs.
     let setup = fs::read_to_string(desk.path("data/setup.json")).unwrap();
     fs::write(desk.path("data/setup.json"), setup.replace("\"seed\": 4", "\"seed\": 5")).unwrap();
-    let said = desk.refused("observe data --views side --out refused");
-    assert!(said.contains("another simulator"), "{said}");
+    let error = desk.refused("observe data --views side --out refused");
+    assert!(error.contains("another simulator"), "{error}");
+}
+
+#[test]
+fn candidates_of_a_network_are_patches() {
+    let desk = Desk::new();
+    let command = format!("candidates --network {NETWORK} --scenes 2 --candidates 12 --seed 3");
+    desk.run(&format!("{command} --out one.npz"));
+    desk.run(&format!("{command} --out other.npz"));
+    let [one, other] = ["one.npz", "other.npz"].map(|name| Candidates::read(&desk.path(name)).unwrap());
+    assert_eq!(one, other, "the same seed gives the same candidates");
+    assert_eq!((&*one.shape, one.len()), (&grasp::Patch::SHAPE[..], 24));
+    assert!(one.images.chunks(one.images.len() / 24).all(|patch| patch.iter().any(|&value| value > 0)));
+    let refused = desk.refused("candidates --evaluator x.onnx --scenes 1 --out x.npz");
+    assert!(refused.contains("--network"), "{refused}");
 }
 
 #[test]
@@ -356,8 +370,8 @@ fn conditions_of_the_tables_run_once() {
     let missing = |desk: &Desk| {
         let output = desk.command(tables).output().unwrap();
         assert!(output.status.success(), "{}", stderr(&output));
-        let said = stderr(&output);
-        let words: Vec<usize> = said.split_whitespace().filter_map(|word| word.parse().ok()).collect();
+        let log = stderr(&output);
+        let words: Vec<usize> = log.split_whitespace().filter_map(|word| word.parse().ok()).collect();
         (words[0], words[1])
     };
     let (first, all) = missing(&desk);
@@ -423,8 +437,8 @@ fn errors_name_the_cause() {
         ("label --scenes 1 --views side,anywhere:1 --out never".to_owned(), "`anywhere` is now `random`"),
         ("stats empty".to_owned(), "empty"),
     ] {
-        let said = desk.refused(&arguments);
-        assert!(said.contains(expected) && !said.contains("panicked"), "{arguments}: {said}");
+        let error = desk.refused(&arguments);
+        assert!(error.contains(expected) && !error.contains("panicked"), "{arguments}: {error}");
     }
     assert!(!desk.path("never").exists(), "no output is created after an error");
 
@@ -439,8 +453,8 @@ fn errors_name_the_cause() {
     fs::write(&scene, whole).unwrap();
     let table = fs::read_to_string(desk.path("half/grasps.csv")).unwrap();
     fs::write(desk.path("half/grasps.csv"), &table[..table.len() - 9]).unwrap();
-    let said = desk.refused("convert --from half --out third");
-    assert!(said.contains("half/grasps.csv, line 16"), "{said}");
+    let error = desk.refused("convert --from half --out third");
+    assert!(error.contains("half/grasps.csv, line 16"), "{error}");
     // Labelling again repairs it: the last scene is generated again.
     desk.run("label --scene pile --points 5 --scenes 3 --format processed --out half");
     assert_eq!(fs::read_to_string(desk.path("half/grasps.csv")).unwrap(), table);

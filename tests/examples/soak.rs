@@ -1,9 +1,9 @@
-//! Whether the server stays what it is, under more than it can do and for long.
+//! Checks that throughput, latency and memory of the server are stable under overload and over time.
 //!
-//! `make soak`, or `cargo run --release -p grasp-tests --example soak [MINUTES]` with `ORT_DYLIB_PATH` set. First a minute in
-//! which four times as many ask as can be answered, then, for 20 minutes unless told otherwise, callers who come by chance
-//! at 80 % of what it can do. The callers have a processor of their own, where there are two: what they take is no work of
-//! the server's. What other machines on the host took meanwhile is said of each minute. The last line is one JSON object.
+//! `make soak`, or `cargo run --release -p grasp-tests --example soak [MINUTES]` with `ORT_DYLIB_PATH` set. First a
+//! minute of Poisson arrivals at four times the capacity, then `MINUTES` (20 by default) at 80 % of it. With two
+//! or more processors, the callers have one of their own, so that they take no time from the server. Each minute's
+//! line includes the share of processor time that other machines on the host used. The last line is one JSON object.
 
 use std::fs;
 use std::io;
@@ -24,21 +24,21 @@ use tonic::transport::Channel;
 
 const ZOO: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo");
 const MINUTE: Duration = Duration::from_mins(1);
-/// How long the capacity is measured.
+/// Duration of the measurement of the capacity.
 const CAPACITY: Duration = Duration::from_secs(15);
-/// So many ask at the same time for it.
+/// Concurrent callers in that measurement.
 const CALLERS: usize = 4;
-/// What the overload is, in capacities.
+/// Rate of the overload, as a multiple of the capacity.
 const OVERLOAD: f64 = 4.0;
-/// What the soak is.
+/// Rate of the soak, as a share of the capacity.
 const SOAK: f64 = 0.8;
 
 #[tokio::main(flavor = "current_thread")]
 async fn main() -> anyhow::Result<()> {
-    ensure!(!cfg!(debug_assertions), "this measures: build it with --release");
+    ensure!(!cfg!(debug_assertions), "a debug build cannot be measured: build it with --release");
     let minutes: u32 = std::env::args().nth(1).map_or(Ok(20), |minutes| minutes.parse())?;
     let (ours, servers) = processors()?;
-    // A process begins on the processors of who starts it.
+    // A process inherits the CPU affinity of its parent.
     sched_setaffinity(None, &servers)?;
     let server = LocalServer::spawn(graspd(), ["--models", ZOO, "--log", "error"])?;
     sched_setaffinity(None, &ours)?;
@@ -57,7 +57,7 @@ async fn main() -> anyhow::Result<()> {
     let report = caller.load(Arrivals::Rate(OVERLOAD * capacity), MINUTE).await;
     let after = Use::of(&server)?;
     let only_overload = report.refused.keys().all(|&code| code == i32::from(Code::ResourceExhausted));
-    ensure!(only_overload, "other refusals than for want of room: {:?}", report.refused.keys());
+    ensure!(only_overload, "refusals with other codes than RESOURCE_EXHAUSTED: {:?}", report.refused.keys());
     let refused = report.refused.values().next().map_or(&[][..], Vec::as_slice);
     let goodput = report.throughput() / capacity;
     let [refusal_p50, refusal_p99] = [0.5, 0.99].map(|share| Report::quantile(refused, share).as_secs_f64() * 1e3);
@@ -110,7 +110,7 @@ async fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The last processor for the callers, the others for the server; the same one for both, where there is no other.
+/// The last processor for the callers, and the others for the server. A single processor is shared.
 fn processors() -> io::Result<(CpuSet, CpuSet)> {
     let mut servers = sched_getaffinity(None)?;
     let last = (0..CpuSet::MAX_CPU).rev().find(|&processor| servers.is_set(processor));
@@ -124,7 +124,7 @@ fn processors() -> io::Result<(CpuSet, CpuSet)> {
     Ok((ours, servers))
 }
 
-/// Asks with a message that is made once.
+/// A client with a request that is encoded once.
 struct Caller {
     client: GraspServiceClient<Channel>,
     request: DetectGraspsRequest,
@@ -141,7 +141,7 @@ impl Caller {
     }
 }
 
-/// What a process holds.
+/// Resources that a process uses.
 struct Use {
     megabytes: f64,
     files: usize,

@@ -72,7 +72,7 @@ class ClientTest(unittest.TestCase):
         return sorted((g.pose.position.x, g.pose.position.y, g.pose.position.z) for g in response.grasps)
 
     def test_the_grasps_are_where_the_blobs_are(self):
-        wanted = [[c * VOXEL_SIZE for c in centre] for centre in CENTRES]
+        expected = [[c * VOXEL_SIZE for c in centre] for centre in CENTRES]
         pb, values = self.pb, blobs()
         for volume in [
             self.volume(values, pb.DATA_TYPE_F32),
@@ -80,7 +80,7 @@ class ClientTest(unittest.TestCase):
             self.volume(np.rint(values * 255).astype(np.uint8), pb.DATA_TYPE_U8),
         ]:
             response = self.grasps.DetectGrasps(self.request(volume, request_id="from python"))
-            np.testing.assert_allclose(self.positions(response), wanted, atol=1e-9)
+            np.testing.assert_allclose(self.positions(response), expected, atol=1e-9)
             self.assertEqual((response.request_id, response.model, response.version), ("from python", "mirror", "1"))
             self.assertGreater(response.latency.total, 0)
 

@@ -135,10 +135,10 @@ class CppTest(unittest.TestCase):
         self.assertTrue(0 < sum(parts) <= total + 0.1 <= round_trip + 0.1, self.latency)
 
     def test_images_in_metres_and_millimetres_are_read(self):
-        wanted = self.grasps()[0, 2:5]
+        expected = self.grasps()[0, 2:5]
         for image in [depth_image().astype("<f4"), np.rint(depth_image() * 1e3).astype("<u2")]:
             np.save(self.folder / "depth.npy", image)
-            distances = np.linalg.norm(self.grasps(command=DETECT_IMAGE)[:, 2:5] - wanted, axis=1)
+            distances = np.linalg.norm(self.grasps(command=DETECT_IMAGE)[:, 2:5] - expected, axis=1)
             self.assertLess(distances.min(), 0.02, "millimetres are rounded")
 
     def test_grasps_are_in_the_frame_of_the_base(self):

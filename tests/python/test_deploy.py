@@ -92,7 +92,7 @@ class DockerfileTest(unittest.TestCase):
         self.assertIn("*", ignored)
         admitted = [line.removeprefix("!") for line in ignored if line.startswith("!")]
         members = tomllib.loads((ROOT / "Cargo.toml").read_text())["workspace"]["members"]
-        wanted = ["Cargo.toml", "Cargo.lock", *members]
+        expected = ["Cargo.toml", "Cargo.lock", *members]
         for stage, steps in self.stages.items():
             for copy in [rest for word, rest in steps if word == "COPY"]:
                 *sources, destination = [part for part in copy.split() if not part.startswith("--")]
@@ -100,8 +100,8 @@ class DockerfileTest(unittest.TestCase):
                 if origin:
                     self.assertIn(origin[1], list(self.stages)[: list(self.stages).index(stage)])
                 else:
-                    wanted += [source for source in sources if source != "."]
-        for path in wanted:
+                    expected += [source for source in sources if source != "."]
+        for path in expected:
             self.assertTrue(list(ROOT.glob(path)), path)
             self.assertTrue(any(path == line or path.startswith(f"{line}/") for line in admitted), f"{path} is ignored")
 

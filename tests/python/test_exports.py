@@ -31,14 +31,14 @@ class ExportTest(unittest.TestCase):
     def test_there_are_grasps(self):
         self.assertGreater(len(self.grasps), 1)
 
-    def test_csv_is_a_table(self):
+    def test_csv_files_are_tables(self):
         rows = list(csv.DictReader(self.files["csv"].splitlines()))
         for row, grasp in zip(rows, self.grasps, strict=True):
             self.assertEqual([float(row[axis]) for axis in "xyz"], grasp["position"])
             self.assertEqual([float(row[f"q{axis}"]) for axis in "xyzw"], grasp["orientation_xyzw"])
             self.assertEqual(float(row["width"]), grasp["width"])
 
-    def test_moveit_reads_a_list_of_grasps(self):
+    def test_moveit_files_are_lists_of_grasps(self):
         for found, grasp in zip(yaml.safe_load(self.files["moveit"]), self.grasps, strict=True):
             stamped = found["grasp_pose"]
             self.assertEqual(stamped["header"]["frame_id"], "base")
@@ -54,7 +54,7 @@ class ExportTest(unittest.TestCase):
                 np.testing.assert_allclose([distance * direction["vector"][axis] for axis in "xyz"], way, atol=1e-9)
                 self.assertLess(found[name]["min_distance"], distance)
 
-    def test_isaac_reads_its_format(self):
+    def test_isaac_files_have_the_fields_of_the_format(self):
         file = yaml.safe_load(self.files["isaac"])
         self.assertEqual((file["format"], file["format_version"]), ("isaac_grasp", "1.0"))
         self.assertEqual(file["object_frame_link"], "base")

@@ -59,14 +59,14 @@ class InferenceTest(unittest.TestCase):
         self.assertRegex(version, r"^[0-9.]+$")
         self.assertEqual((model.name, model.platform), (MODEL, "onnxruntime_onnx"))
         tensors = {tensor.name: (tensor.datatype, list(tensor.shape)) for tensor in [*model.inputs, *model.outputs]}
-        wanted = {name: ("FP32", [-1, channels, *EDGE]) for name, channels in {"tsdf": 1, **CHANNELS}.items()}
-        self.assertEqual(tensors, wanted)
+        expected = {name: ("FP32", [-1, channels, *EDGE]) for name, channels in {"tsdf": 1, **CHANNELS}.items()}
+        self.assertEqual(tensors, expected)
         config = self.client.get_model_config(MODEL, as_json=True)["config"]
         # The default length of the queue.
         self.assertEqual((config["name"], config["max_batch_size"], config["backend"]), (MODEL, 32, "onnxruntime"))
         dims = {one["name"]: (one["data_type"], one["dims"]) for one in [*config["input"], *config["output"]]}
-        wanted = {name: ("TYPE_FP32", [str(edge) for edge in shape[1:]]) for name, (_, shape) in wanted.items()}
-        self.assertEqual(dims, wanted)
+        expected = {name: ("TYPE_FP32", [str(edge) for edge in shape[1:]]) for name, (_, shape) in expected.items()}
+        self.assertEqual(dims, expected)
 
     def test_the_maps_are_valid(self):
         maps = self.maps(VOLUMES)
@@ -106,12 +106,12 @@ class InferenceTest(unittest.TestCase):
 
         for number in range(8):
             self.client.async_infer(MODEL, [tensor], callback, request_id=str(number))
-        numbers, wanted = set(), self.maps(VOLUMES)["quality"]
+        numbers, expected = set(), self.maps(VOLUMES)["quality"]
         for _ in range(8):
             result, error = answers.get(timeout=60)
             self.assertIsNone(error)
             numbers.add(int(result.get_response().id))
-            np.testing.assert_array_equal(result.as_numpy("quality"), wanted)
+            np.testing.assert_array_equal(result.as_numpy("quality"), expected)
         self.assertEqual(numbers, set(range(8)))
 
     def test_errors_have_their_status_code(self):

@@ -57,7 +57,7 @@ class LabelJobsTest(unittest.TestCase):
         for file in generator["files"]:
             self.assertTrue((DEPLOY / file).exists(), file)
 
-    def test_pods_label_what_one_machine_would(self):
+    def test_pods_generate_the_data_of_one_machine(self):
         job = yaml.safe_load((DEPLOY / "label.yaml").read_text())["spec"]
         (container,) = job["template"]["spec"]["containers"]
         environment = {entry["name"]: entry["value"] for entry in container["env"]}

@@ -72,10 +72,10 @@ class FilesTest(unittest.TestCase):
         self.promtool("check", "rules", "--lint-fatal", "rules.yml", "alerts.yml")
         self.promtool("check", "config", "--lint-fatal", "prometheus.yml")
 
-    def test_alerts_fire_when_they_should(self):
+    def test_the_rule_tests_pass(self):
         self.promtool("test", "rules", "tests.yml")
 
-    def test_every_alert_is_tested_both_ways(self):
+    def test_rule_tests_cover_every_alert_and_a_silent_case(self):
         silent, fired = False, set()
         for case in yaml.safe_load((RULES / "tests.yml").read_text())["tests"]:
             for test in case["promql_expr_test"]:
@@ -223,8 +223,8 @@ class MonitoringTest(unittest.TestCase):
         return eventually(expression, numbers)
 
     def test_graspd_counts_every_status_that_clients_can_cause(self):
-        wanted = {"OK", "RESOURCE_EXHAUSTED", "DEADLINE_EXCEEDED", "INVALID_ARGUMENT", "NOT_FOUND"}
-        eventually(f"{wanted}", lambda: self.outcomes >= wanted)
+        expected = {"OK", "RESOURCE_EXHAUSTED", "DEADLINE_EXCEEDED", "INVALID_ARGUMENT", "NOT_FOUND"}
+        eventually(f"{expected}", lambda: self.outcomes >= expected)
         counted = {series["metric"]["code"] for series in self.data("graspd_requests_total > 0")}
         self.assertLessEqual(counted, self.outcomes | {"CANCELLED"})
 
@@ -281,11 +281,11 @@ class MonitoringTest(unittest.TestCase):
 
     def test_variables_of_the_dashboard_have_values(self):
         choices = [variable for variable in dashboard()["templating"]["list"] if variable["type"] == "query"]
-        for variable, wanted in zip(choices, [self.http, self.model], strict=True):
+        for variable, expected in zip(choices, [self.http, self.model], strict=True):
             selector, label = re.fullmatch(r"label_values\((.+), (\w+)\)", variable["query"]["query"]).groups()
             self.assertEqual(variable["name"], label)
             there = lambda: self.query(f"label/{label}/values", **{"match[]": selector})
-            self.assertIn(wanted, eventually(selector, there))
+            self.assertIn(expected, eventually(selector, there))
 
     def test_the_autoscaler_receives_the_number_of_waiting_requests(self):
         adapter = yaml.safe_load((DEPLOY / "kubernetes/prometheus-adapter.yaml").read_text())

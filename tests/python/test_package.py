@@ -106,9 +106,9 @@ class DetectTest(ServerTest):
     def test_depth_images_give_the_grasps_of_their_volume(self):
         pose = graspd.Pose((0.4, 0.0, 1.1), (0.0, 0.0, 0.6, 0.8))
         workspace = graspd.Workspace(pose, size=0.3, frame_id="base", stamp=7)
-        wanted = self.client.detect(graspd.Volume(scene.volume(*CAMERAS), pose=pose), LOW)
+        expected = self.client.detect(graspd.Volume(scene.volume(*CAMERAS), pose=pose), LOW)
         found = self.client.detect_from_depth(views(), workspace, LOW)
-        np.testing.assert_allclose(positions(found), positions(wanted), atol=1e-6)
+        np.testing.assert_allclose(positions(found), positions(expected), atol=1e-6)
         self.assertEqual((found.frame_id, found.stamp), ("base", 7))
         self.assertTrue(found.latency.total > found.latency.fusion > 0)
 
@@ -320,9 +320,9 @@ class TrackTest(ServerTest):
         with self.client.track(workspace) as tracking:
             for seen, view in enumerate(views(cameras), 1):
                 kept = tracking.add([view], LOW if seen == 1 else None)
-                wanted = self.client.detect_from_depth(views(cameras[:seen]), workspace, LOW)
+                expected = self.client.detect_from_depth(views(cameras[:seen]), workspace, LOW)
                 self.assertTrue(kept.grasps)
-                np.testing.assert_allclose(positions(kept), positions(wanted), atol=1e-9)
+                np.testing.assert_allclose(positions(kept), positions(expected), atol=1e-9)
                 self.assertEqual((kept.frame_id, self.server.metric(TRACKED)), ("base", 1))
             self.assertEqual(tracking.add(options=replace(LOW, max_grasps=1)).grasps, kept.grasps[:1])
         self.wait_until_none_is_tracked()
@@ -515,8 +515,8 @@ class AsyncioTest(unittest.IsolatedAsyncioTestCase):
                 await tracking.add([replace(views()[0], k=np.eye(3))])
             one = await tracking.add(views()[:1], LOW)
             both = await tracking.add(views()[1:])
-            wanted = await self.client.detect_from_depth(views(), options=LOW)
-            self.assertEqual((one.frame_id, both.grasps), ("base", wanted.grasps))
+            expected = await self.client.detect_from_depth(views(), options=LOW)
+            self.assertEqual((one.frame_id, both.grasps), ("base", expected.grasps))
             await asyncio.sleep(1.2)
             for _ in range(2):
                 with self.assertRaises(graspd.Aborted):
@@ -548,11 +548,11 @@ class PackageTest(ServerTest):
         self.assertIn("workspace.size is wrong: workspace.size is -1, must be above 0", output)
         self.run_python("-m", "mypy", "--strict", "--cache-dir", self.folder / "cache", example)
 
-    def test_the_types_are_right(self):
+    def test_mypy_accepts_the_types(self):
         config = ["--config-file", PACKAGE / "pyproject.toml", "--cache-dir", self.folder / "cache"]
         self.run_python("-m", "mypy", *config, Path(INSTALLED.name) / "graspd")
 
-    def test_a_source_distribution_builds_anywhere(self):
+    def test_a_source_distribution_installs_the_same_files(self):
         build = [sys.executable, "-m", "hatchling", "build", "--target", "sdist", "--directory", self.folder]
         subprocess.run(build, cwd=PACKAGE, check=True, capture_output=True)
         (archive,) = self.folder.glob("graspd-*.tar.gz")
@@ -586,12 +586,12 @@ class WireTest(unittest.TestCase):
         for field in [None, "options.model"]:
             error = grasp_pb2.Error(code=grpc.StatusCode.NOT_FOUND.value[0], message="not found", field=field)
             actual = wire.outcome(grasp_pb2.DetectGraspsStreamResponse(request_id="mine", error=error))
-            wanted = graspd.NotFound(grpc.StatusCode.NOT_FOUND, error.message, field, request_id="mine")
-            self.assertEqual((type(actual), vars(actual)), (type(wanted), vars(wanted)))
+            expected = graspd.NotFound(grpc.StatusCode.NOT_FOUND, error.message, field, request_id="mine")
+            self.assertEqual((type(actual), vars(actual)), (type(expected), vars(expected)))
 
 
 class PoseTest(unittest.TestCase):
-    def test_a_matrix_and_back(self):
+    def test_matrices_round_trip(self):
         rotations = Rotation.random(1000, rng=1).as_matrix().tolist()
         rotations += Rotation.from_rotvec(np.pi * np.vstack([np.eye(3), [0.6, 0.8, 0.0]])).as_matrix().tolist()
         for rotation in [np.eye(3), *rotations]:

@@ -1,4 +1,4 @@
-"""The second simulator, sim/pybullet, and what its documents tell people to type.
+"""Tests the second simulator, sim/pybullet, and the commands in its documents.
 
     GRASPD=target/release/graspd GRASP_SIM=target/release/grasp-sim GRASPD_MODELS=models/zoo \\
     ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
@@ -31,7 +31,7 @@ without_pybullet = unittest.skipUnless(
 if HAS_PYBULLET:
     INSTALLED = tempfile.TemporaryDirectory()
     atexit.register(INSTALLED.cleanup)
-    # As a user would, but with the packages that are here.
+    # As in the documents, with the dependencies that are already installed.
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-build-isolation"]
     subprocess.run([*pip, "--target", INSTALLED.name, ROOT / "client/python"], check=True)
     sys.path[:0] = [INSTALLED.name, str(SIMULATOR)]
@@ -68,23 +68,23 @@ class CubeTest(unittest.TestCase):
         attempt = self.world.execute(Pose((0.15, 0.15, 0.12), DOWN))
         self.assertEqual((attempt.outcome, attempt.object, attempt.short_by), ("lifted", "cube", 0.0))
         self.assertTrue(attempt.success and attempt.rose and not attempt.touched)
-        # Bullet's margins are between them.
+        # Bullet adds collision margins to the cube and the fingers.
         self.assertAlmostEqual(attempt.opening, 0.04, delta=0.003)
         self.assertAlmostEqual(attempt.rise, 0.1, delta=0.005)
         self.assertEqual(self.world.objects, {})
 
-    def test_a_hand_that_meets_the_cube_is_blocked_where_that_counts(self):
+    def test_contact_on_the_approach_fails_only_if_forbidden(self):
         on_the_cube = Pose((0.15, 0.195, 0.12), DOWN)
         state = self.world.save()
         forbidden = self.world.execute(on_the_cube, allow_contact=False, remove=False)
         self.assertEqual((forbidden.outcome, forbidden.success), ("blocked_on_approach", False))
-        # Its top is 2 cm above where the fingertips shall go.
+        # The top of the cube is 2 cm above the fingertips of the grasp.
         self.assertAlmostEqual(forbidden.short_by, 0.02, delta=0.004)
         self.world.restore(state)
         allowed = self.world.execute(on_the_cube, remove=False)
         self.assertEqual((allowed.outcome, allowed.short_by), ("closed_on_nothing", forbidden.short_by))
 
-    def test_other_grasps_fail_as_they_should(self):
+    def test_failed_grasps_have_their_outcome(self):
         state = self.world.save()
         for pose, outcome in [
             (Pose((0.25, 0.25, 0.12), DOWN), "closed_on_nothing"),
@@ -95,7 +95,7 @@ class CubeTest(unittest.TestCase):
             self.assertEqual((attempt.outcome, attempt.rose), (outcome, False))
             self.world.restore(state)
 
-    def test_a_state_that_is_restored_gives_the_same_again(self):
+    def test_a_restored_state_gives_the_same_attempt(self):
         state = self.world.save()
         attempts = []
         for _ in range(2):
@@ -104,7 +104,7 @@ class CubeTest(unittest.TestCase):
         self.assertEqual(*attempts)
         self.assertTrue(attempts[0].rose)
 
-    def test_the_camera_sees_the_cube_where_it_is(self):
+    def test_the_cube_is_observed_at_its_position(self):
         for views in [camera.side(), camera.side(np.pi / 2), camera.circle(2)]:
             for view in camera.observe(self.world, views):
                 seen = camera.points(view)[camera.is_within_reach(camera.points(view))]
@@ -117,7 +117,7 @@ class CubeTest(unittest.TestCase):
         self.world.clear()
         self.assertFalse(camera.sees_anything(camera.observe(self.world, camera.side())))
 
-    def test_chance_grasps_what_is_seen(self):
+    def test_random_grasps_are_near_observed_points(self):
         views = camera.observe(self.world, camera.side())
         planner = Random(np.random.default_rng(1))
         for _ in range(20):
@@ -127,7 +127,7 @@ class CubeTest(unittest.TestCase):
         self.world.clear()
         self.assertEqual(planner.plan(camera.observe(self.world, camera.side())).grasps, [])
 
-    def test_mistakes_are_told(self):
+    def test_invalid_urdf_files_raise_errors(self):
         with self.assertRaisesRegex(FileNotFoundError, "nowhere.urdf not found"):
             self.world.add("nowhere.urdf", Pose())
         wrong = self.urdf.with_name("wrong.urdf")
@@ -138,13 +138,13 @@ class CubeTest(unittest.TestCase):
 
 @without_pybullet
 class FiguresTest(unittest.TestCase):
-    def test_intervals_hold_the_share(self):
+    def test_intervals_contain_the_share(self):
         self.assertEqual(score.wilson(0, 0), (0.0, 1.0))
         low, high = score.wilson(50, 100)
         self.assertAlmostEqual(low, 0.404, delta=1e-3)
         self.assertAlmostEqual(high, 0.596, delta=1e-3)
 
-    def test_grasps_are_shaken_by_as_much_as_asked(self):
+    def test_pose_errors_have_the_requested_size(self):
         rng = np.random.default_rng(1)
         grasp = Pose((0.1, 0.2, 0.3), DOWN)
         self.assertEqual(replay.shaken(grasp, (0.0, 0.0), rng), grasp)
@@ -163,7 +163,7 @@ class CommandTest(unittest.TestCase):
         cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
         (cls.folder / "sim").symlink_to(ROOT / "sim")
         (cls.folder / "bin").mkdir()
-        # Documents may set PYTHONPATH themselves; the package is found beside that.
+        # The documents may set PYTHONPATH, so the folder of the package is added to it.
         for name, variable, program in [
             ("grasp-sim", "", os.path.abspath(os.environ["GRASP_SIM"])),
             ("python3", f'PYTHONPATH="$PYTHONPATH:{INSTALLED.name}" ', sys.executable),
@@ -176,7 +176,7 @@ class CommandTest(unittest.TestCase):
 
     @classmethod
     def run_sh(cls, code):
-        """What it prints."""
+        """Runs a command and returns its output."""
         path = f"{cls.folder / 'bin'}{os.pathsep}{os.environ['PATH']}"
         environment = {**os.environ, "PATH": path, "PYTHONPATH": "", "PYTHONDONTWRITEBYTECODE": "1"}
         command = ["sh", "-euc", code]
@@ -189,7 +189,7 @@ class CommandTest(unittest.TestCase):
         return json.loads(printed.splitlines()[-1])
 
     def blocks(self, path):
-        """Language and text of each, but for what would fetch packages."""
+        """Language and text of each code block, except those that install packages."""
         for language, code in re.findall(r"^```(\w*)\n(.*?)^```$", path.read_text(), re.MULTILINE | re.DOTALL):
             if not code.startswith("pip install"):
                 yield language, code
@@ -231,7 +231,7 @@ class CommandTest(unittest.TestCase):
         self.assertEqual(len(list((self.folder / "pictures").glob("packed-3-*.png"))), len(attempts))
         self.assertTrue(all(attempt["quality"] >= 0.5 and attempt["round"] < 2 for attempt in attempts))
 
-    def test_figures_have_the_names_of_the_first_simulator(self):
+    def test_figures_have_the_same_names_as_in_grasp_sim(self):
         flags = "--objects objects --planner random --rounds 1 --attempts"
         first = self.last(self.run_sh(f"grasp-sim bench {flags} first.jsonl"))
         second = self.last(self.run_sh(f"python3 sim/pybullet/clear.py {flags} second.jsonl"))
@@ -240,7 +240,7 @@ class CommandTest(unittest.TestCase):
         ours, theirs = (set(json.loads(file.read_text().splitlines()[0])) for file in files)
         self.assertLessEqual(ours, theirs)
 
-    def test_tables_have_a_column_for_it(self):
+    def test_tables_have_columns_for_pybullet(self):
         (self.folder / "zoo").mkdir()
         (self.folder / "zoo/vgn-packed.onnx").symlink_to(Path(os.environ["GRASPD_MODELS"], "vgn-packed.onnx").resolve())
         python, graspd = self.folder / "bin/python3", os.path.abspath(os.environ["GRASPD"])
@@ -257,18 +257,18 @@ class CommandTest(unittest.TestCase):
         self.assertIn("| packed GSR %, rapier | packed GSR %, PyBullet | published |", text)
         self.assertIn("| packed, rapier | packed, PyBullet | pile, rapier | pile, PyBullet |", text)
 
-    def test_mistakes_are_told(self):
-        for arguments, wanted in [
+    def test_invalid_arguments_are_errors(self):
+        for arguments, expected in [
             ("--objects bin", "--objects is bin: it has no .urdf file"),
             ("--objects objects --views top", "must be side, side:DEGREES"),
             ("--objects objects --planner grpc", "must be random or grpc:HOST:PORT"),
             ("--objects objects --threshold 2", "must be greater than 0 and at most 1"),
             ("--objects objects --hand no.urdf", "no.urdf not found"),
         ]:
-            with self.subTest(arguments), self.assertRaisesRegex(AssertionError, re.escape(wanted)):
+            with self.subTest(arguments), self.assertRaisesRegex(AssertionError, re.escape(expected)):
                 self.run_sh(f"python3 sim/pybullet/clear.py --rounds 1 {arguments}")
 
-    def test_what_the_readme_says_is_true(self):
+    def test_the_commands_of_the_readme_work(self):
         printed = [self.run_sh(code) for language, code in self.blocks(SIMULATOR / "README.md") if language == "sh"]
         report = self.last(printed[-1])
         for label in ["success_kept", "failure_kept"]:
@@ -276,7 +276,7 @@ class CommandTest(unittest.TestCase):
             low, high = report[label]["interval"]
             self.assertTrue(low <= report[label]["percent"] <= high)
         self.assertEqual(report["scenes"], 2)
-        # Where contacts are allowed, what was executed counts before the label.
+        # With allowed contacts, the executed outcome takes precedence over the label.
         scenes = [json.loads(line) for line in (self.folder / "labels.jsonl").read_text().splitlines()]
         for scene in scenes:
             for trial in scene["trials"]:
@@ -287,7 +287,7 @@ class CommandTest(unittest.TestCase):
         self.assertEqual([self.last(executed)[label]["n"] for label in ["success_kept", "failure_kept"]], [3, 0])
         self.assertEqual(len((self.folder / "records.jsonl").read_text().splitlines()), 3)
 
-    def test_what_own_scene_says_is_true(self):
+    def test_the_commands_of_own_scene_work(self):
         server = self.enterContext(Server())
         blocks = list(self.blocks(ROOT / "docs/own-scene.md"))
         printed = []
@@ -302,7 +302,7 @@ class CommandTest(unittest.TestCase):
         self.assertEqual(self.last(cleared)["rounds"], 2)
         self.assertTrue(list((self.folder / "pictures").glob("packed-1-*.png")))
 
-    def test_the_types_are_right(self):
+    def test_mypy_accepts_the_types(self):
         self.run_sh(f"python3 -m mypy --strict --cache-dir {self.folder / 'cache'} sim/pybullet")
 
 

@@ -1,6 +1,6 @@
-//! What the end-to-end tests share: the programs under test, models whose answers are known, volumes, a running server.
+//! Shared parts of the end-to-end tests: the programs under test, models with known outputs, volumes, a running server.
 //!
-//! The tests are in `tests/`, one file for each behaviour. They need ONNX Runtime: run them by `make test`.
+//! The tests are in `tests/`, one file for each behaviour. They need ONNX Runtime: run them with `make test`.
 
 mod binaries;
 mod models;

@@ -6,22 +6,23 @@ use grasp_models::onnx::{
     AttributeProto, Dimension, GraphProto, ModelProto, NodeProto, OperatorSetIdProto, TensorProto, ValueInfoProto,
 };
 
-/// Voxels along an edge of what the test models read.
+/// Resolution of the test models' volumes.
 pub const RESOLUTION: usize = 16;
 
-/// The width that they predict everywhere, voxels.
+/// The width that the test models predict at every voxel, voxels.
 pub const WIDTH: f32 = 5.0;
 
-/// ONNX's numbers for the element types.
+/// Element types in ONNX.
 const FLOAT: i64 = 1;
 const INT64: i64 = 7;
 
 /// Channels of the convolutions that make a model slow.
 const CHANNELS: i64 = 16;
 
-/// A network whose answer is known: the quality is the volume itself, every grasp is upright and [`WIDTH`] wide.
+/// A network with known outputs: the quality is the volume itself, every rotation is the identity by default, and every
+/// width is [`WIDTH`].
 ///
-/// It has the signature of every grasp network, and runs in microseconds unless it is told to be slow.
+/// It has the inputs and outputs of every grasp network, and runs in microseconds without `convolutions`.
 #[derive(Clone, Debug)]
 pub struct TestModel {
     name: String,
@@ -52,58 +53,58 @@ impl TestModel {
         }
     }
 
-    /// Another version of it.
+    /// Sets the version.
     #[must_use]
     pub fn version(self, version: &str) -> Self {
         Self { version: version.to_owned(), ..self }
     }
 
-    /// For other volumes.
+    /// Sets the resolution of the volumes.
     #[must_use]
     pub fn resolution(self, resolution: usize) -> Self {
         Self { resolution, ..self }
     }
 
-    /// Slows it by this many convolutions, of about 0.1 GFLOP each at [`RESOLUTION`], that change nothing.
+    /// Adds this many convolutions, of about 0.1 GFLOP each at [`RESOLUTION`], that do not change the outputs.
     #[must_use]
     pub fn convolutions(self, convolutions: usize) -> Self {
         Self { convolutions, ..self }
     }
 
-    /// Its quaternions are 0 where the volume is at least `value`: a grasp there is none.
+    /// Sets the quaternion to 0, which is invalid, where the volume is at least `value`.
     #[must_use]
     pub fn breaks_at(self, value: f32) -> Self {
         Self { breaks_at: Some(value), ..self }
     }
 
-    /// Every grasp has this orientation, a unit quaternion x, y, z, w.
+    /// Sets the rotation at every voxel, a unit quaternion x, y, z, w.
     #[must_use]
     pub fn rotation(self, rotation: [f32; 4]) -> Self {
         Self { rotation, ..self }
     }
 
-    /// It was trained with a camera at this angle about the vertical, degrees.
+    /// Sets the azimuth of the camera in training, degrees about the vertical.
     #[must_use]
     pub fn camera_azimuth(self, degrees: f64) -> Self {
         Self { camera_azimuth: Some(degrees), ..self }
     }
 
-    /// ONNX Runtime fails in the middle of a batch in which any voxel is 0.
+    /// ONNX Runtime fails on batches with any voxel of value 0.
     #[must_use]
     pub fn fails_at_zero(self) -> Self {
         Self { fails_at_zero: true, ..self }
     }
 
-    /// Adds a large number to the volume and takes it off again, so that in bf16 little of the quality is left.
+    /// Adds a large number to the volume and subtracts it again, so that in bf16 the quality is inaccurate.
     #[must_use]
     pub fn needs_fp32(self) -> Self {
         Self { needs_fp32: true, ..self }
     }
 
-    /// Writes it into a folder.
+    /// Writes the model into a folder.
     ///
     /// # Panics
-    /// When it cannot be written.
+    /// If it cannot be written.
     pub fn write(&self, folder: &Path) {
         let path = folder.join(format!("{}-{}.onnx", self.name, self.version));
         self.build().write(&path).expect("the temporary folder can be written");
@@ -139,7 +140,7 @@ impl TestModel {
             delay = convolution(&mut graph, &delay, "delay", CHANNELS, 1);
         }
         if self.fails_at_zero {
-            // An index that exists only where no voxel is 0.
+            // The index is 1, out of range, if a voxel is 0.
             graph.initializer.push(TensorProto::from_f32("only", &[1], &[0.0]));
             constant(&mut graph, "low", 0.01);
             node(&mut graph, "ReduceMin", &["tsdf"], "least", vec![AttributeProto::int("keepdims", 0)]);
@@ -149,7 +150,7 @@ impl TestModel {
             node(&mut graph, "Add", &[&delay, "nothing"], "delay_or_failure", vec![]);
             delay = "delay_or_failure".to_owned();
         }
-        let volume = if self.needs_fp32 { there_and_back(&mut graph, "tsdf") } else { "tsdf" };
+        let volume = if self.needs_fp32 { offset_and_restored(&mut graph, "tsdf") } else { "tsdf" };
         node(&mut graph, "Add", &[volume, &delay], "quality", vec![]);
 
         let mut model = ModelProto {
@@ -166,6 +167,7 @@ impl TestModel {
             voxel_size: grasp::WORKSPACE_SIZE / self.resolution as f64,
             voxel_origin: grasp::VoxelOrigin::Corner,
             camera_azimuth: self.camera_azimuth,
+            network: None,
             provenance: BTreeMap::from([("data".to_owned(), "none".to_owned())]),
         };
         metadata.write_to(&mut model);
@@ -179,7 +181,7 @@ impl TestModel {
     }
 }
 
-/// Weights of 0: all the work, and zeros out.
+/// A convolution with weights of 0: it takes its time, and its output is 0.
 fn convolution(graph: &mut GraphProto, input: &str, output: &str, inputs: i64, outputs: i64) -> String {
     let weight = format!("{output}.weight");
     let values = vec![0.0; (outputs * inputs * 125) as usize];
@@ -189,15 +191,15 @@ fn convolution(graph: &mut GraphProto, input: &str, output: &str, inputs: i64, o
     output.to_owned()
 }
 
-/// Changes nothing, but what is lost where numbers between 2^16 and 2^17 are rounded. Providers see through sums, not
-/// through convolutions.
-fn there_and_back(graph: &mut GraphProto, input: &str) -> &'static str {
+/// The identity, except for the rounding of numbers between 2^16 and 2^17. It uses convolutions, because providers
+/// simplify sums.
+fn offset_and_restored(graph: &mut GraphProto, input: &str) -> &'static str {
     for (name, scale, offset) in [("there", 256.0, 65_536.0), ("back", 1.0 / 256.0, -256.0)] {
         graph.initializer.push(TensorProto::from_f32(&format!("{name}.weight"), &[1; 5], &[scale]));
         graph.initializer.push(TensorProto::from_f32(&format!("{name}.bias"), &[1], &[offset]));
     }
     node(graph, "Conv", &[input, "there.weight", "there.bias"], "there", vec![]);
-    // A number that is not negative, so this is nothing but an end to what can be fused.
+    // The identity, since its input is never negative. It prevents the fusion of the convolutions.
     node(graph, "Relu", &["there"], "between", vec![]);
     node(graph, "Conv", &["between", "back.weight", "back.bias"], "back", vec![]);
     "back"

@@ -1,4 +1,4 @@
-//! A block on a table, and what a camera sees of it.
+//! A synthetic scene: a block on a table, and its depth images.
 
 use grasp::Intrinsics;
 use grasp_client::{Depth, DepthView, Extrinsics};
@@ -7,14 +7,14 @@ use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 /// Height of the table, metres.
 pub const TABLE: f64 = 0.05;
 
-/// The camera: small images do.
+/// The intrinsics of the camera, with small images for speed.
 pub const CAMERA: Intrinsics = Intrinsics { width: 160, height: 120, fx: 135.0, fy: 135.0, cx: 79.5, cy: 59.5 };
 
 /// A block that stands on the table in the middle of the workspace: the corners of its box, metres.
 pub const BLOCK: [[f64; 3]; 2] = [[0.13, 0.11, TABLE], [0.17, 0.19, 0.15]];
 
-/// A camera on a hemisphere about the workspace, at an angle off the vertical and an azimuth, degrees, looking at its
-/// middle: `T_camera_task`.
+/// `T_camera_task` of a camera that looks at the middle of the workspace from 0.6 m. `polar` is the angle from the
+/// vertical, `azimuth` that about it, degrees.
 #[must_use]
 pub fn camera(polar: f64, azimuth: f64) -> Isometry3<f64> {
     let middle = Point3::new(0.15, 0.15, 0.08);
@@ -27,7 +27,7 @@ pub fn camera(polar: f64, azimuth: f64) -> Isometry3<f64> {
     Isometry3::from_parts(Translation3::from(eye.coords), rotation).inverse()
 }
 
-/// What it sees of the block and the table: metres along its optical axis.
+/// The depth image of the camera: metres along its optical axis, 0 without a reading.
 #[must_use]
 pub fn depth(camera_from_task: &Isometry3<f64>) -> Vec<f32> {
     let task_from_camera = camera_from_task.inverse();
@@ -49,7 +49,7 @@ pub fn depth(camera_from_task: &Isometry3<f64>) -> Vec<f32> {
     (0..CAMERA.width * CAMERA.height).map(pixel).collect()
 }
 
-/// The same as a client sends it.
+/// The depth image as a client sends it.
 #[must_use]
 pub fn view(camera_from_task: &Isometry3<f64>) -> DepthView {
     let Intrinsics { width, height, fx, fy, cx, cy } = CAMERA;

@@ -9,7 +9,7 @@ use tonic::transport::Channel;
 
 use crate::{TestModel, graspd};
 
-/// A graspd with models of its own, for one test.
+/// A graspd with its own folder of models, for one test.
 pub struct Server {
     process: LocalServer,
     models: TempDir,
@@ -19,30 +19,30 @@ impl Server {
     /// Runs graspd with these models and flags, and returns once it is ready.
     ///
     /// # Panics
-    /// When it does not get ready.
+    /// If graspd does not become ready.
     #[must_use]
     pub fn run(models: &[TestModel], args: &[&str]) -> Self {
         let mut server = Self::start(models, args);
-        server.wait_ready().expect("graspd gets ready");
+        server.wait_ready().expect("graspd becomes ready");
         server
     }
 
-    /// Like [`run`](Self::run), but while it still warms up.
+    /// Like [`run`](Self::run), but returns during the warm-up.
     ///
     /// # Panics
-    /// When it does not start.
+    /// If graspd does not start.
     #[must_use]
     pub fn start(models: &[TestModel], args: &[&str]) -> Self {
         assert!(
             std::env::var_os("ORT_DYLIB_PATH").is_some(),
             "ORT_DYLIB_PATH is not set: run the tests by `make test`"
         );
-        let folder = tempfile::tempdir().expect("there is room for temporary files");
+        let folder = tempfile::tempdir().expect("a temporary folder can be created");
         for model in models {
             model.write(folder.path());
         }
-        let path = folder.path().to_str().expect("temporary folders have plain names").to_owned();
-        // The test models' answers are known to the last bit on the CPU.
+        let path = folder.path().to_str().expect("the path of a temporary folder is UTF-8").to_owned();
+        // On ONNX Runtime's `cpu` the outputs of the test models are known to the last bit.
         let provider: &[&str] = if args.contains(&"--provider") { &[] } else { &["--provider", "cpu"] };
         let fixed = ["--models", &path, "--threads", "1"].into_iter();
         let args = fixed.chain(provider.iter().copied()).chain(args.iter().copied());
@@ -50,27 +50,27 @@ impl Server {
         Self { process, models: folder }
     }
 
-    /// A client of the library under test.
+    /// A client of `grasp-client`, connected to this server.
     ///
     /// # Panics
-    /// When the server is not there.
+    /// If the server does not accept the connection.
     pub async fn client(&self) -> Client {
         Client::connect(self.grpc().to_string()).await.expect("graspd listens")
     }
 
-    /// A connection for what the client library cannot say.
+    /// A connection for requests that the client library cannot send.
     ///
     /// # Panics
-    /// When the server is not there.
+    /// If the server does not accept the connection.
     pub async fn channel(&self) -> Channel {
         let endpoint = Channel::from_shared(format!("http://{}", self.grpc())).expect("an address is a URI");
         endpoint.connect().await.expect("graspd listens")
     }
 
-    /// The generated client.
+    /// The client that is generated from the .proto file.
     ///
     /// # Panics
-    /// When the server is not there.
+    /// If the server does not accept the connection.
     pub async fn raw(&self) -> GraspServiceClient<Channel> {
         GraspServiceClient::new(self.channel().await)
     }
@@ -78,16 +78,16 @@ impl Server {
     /// The status and the body of an HTTP page.
     ///
     /// # Panics
-    /// When there is no answer.
+    /// If there is no response.
     #[must_use]
     pub fn get(&self, path: &str) -> (u16, String) {
         get(self.http(), path)
     }
 
-    /// The value of one metric, as [`metric`] has it.
+    /// The value of one metric, as in [`metric`].
     ///
     /// # Panics
-    /// When the metrics cannot be read.
+    /// If the metrics cannot be read.
     #[must_use]
     pub fn metric(&self, series: &str) -> f64 {
         metric(self.http(), series)
@@ -96,7 +96,7 @@ impl Server {
     /// Waits until a metric has a value.
     ///
     /// # Panics
-    /// When it has not got it within a minute.
+    /// If the metric does not have the value within a minute.
     pub async fn wait_for(&self, series: &str, value: f64) {
         for _ in 0..6000 {
             if self.metric(series) == value {
@@ -107,17 +107,18 @@ impl Server {
         panic!("{series} is {}, not {value}", self.metric(series));
     }
 
-    /// The folder of its models.
+    /// The folder of the models.
     #[must_use]
     pub fn models(&self) -> &std::path::Path {
         self.models.path()
     }
 }
 
-/// The value of one metric of a graspd, 0 as long as it has none; `series` as Prometheus writes it, labels in their order.
+/// The value of one metric of a graspd, or 0 if it does not exist. `series` is in Prometheus' notation, with sorted
+/// labels.
 ///
 /// # Panics
-/// When the metrics cannot be read.
+/// If the metrics cannot be read.
 #[must_use]
 pub fn metric(http: SocketAddr, series: &str) -> f64 {
     let (status, text) = get(http, "/metrics");
@@ -128,37 +129,38 @@ pub fn metric(http: SocketAddr, series: &str) -> f64 {
 
 fn get(http: SocketAddr, path: &str) -> (u16, String) {
     let mut stream = TcpStream::connect(http).expect("graspd listens");
-    write!(stream, "GET {path} HTTP/1.1\r\nHost: graspd\r\nConnection: close\r\n\r\n").expect("it reads");
+    write!(stream, "GET {path} HTTP/1.1\r\nHost: graspd\r\nConnection: close\r\n\r\n")
+        .expect("the request can be written");
     let mut response = String::new();
-    stream.read_to_string(&mut response).expect("it answers");
-    let (head, body) = response.split_once("\r\n\r\n").expect("a head and a body");
+    stream.read_to_string(&mut response).expect("the response can be read");
+    let (head, body) = response.split_once("\r\n\r\n").expect("a response has a head and a body");
     let status = head.split(' ').nth(1).and_then(|status| status.parse().ok());
-    (status.expect("a status line"), body.to_owned())
+    (status.expect("a response has a status line"), body.to_owned())
 }
 
-/// The memory that a process has in use.
+/// The resident memory of a process, bytes.
 ///
 /// # Panics
-/// When it does not run, or not on Linux.
+/// If the process has ended, or if the system is not Linux.
 #[must_use]
 pub fn resident_bytes(process: u32) -> u64 {
     memory(process, "VmRSS:")
 }
 
-/// The most memory that a process ever had in use.
+/// The largest resident memory that a process has had, bytes.
 ///
 /// # Panics
-/// When it does not run, or not on Linux.
+/// If the process has ended, or if the system is not Linux.
 #[must_use]
 pub fn peak_bytes(process: u32) -> u64 {
     memory(process, "VmHWM:")
 }
 
 fn memory(process: u32, field: &str) -> u64 {
-    let status = std::fs::read_to_string(format!("/proc/{process}/status")).expect("the process runs, on Linux");
+    let status = std::fs::read_to_string(format!("/proc/{process}/status")).expect("the process runs on Linux");
     let value = status.lines().find_map(|line| line.strip_prefix(field));
     let kilobytes = value.and_then(|value| value.trim().strip_suffix(" kB")?.parse::<u64>().ok());
-    kilobytes.expect("a number of kB") * 1024
+    kilobytes.expect("the field is a number of kB") * 1024
 }
 
 impl Deref for Server {

@@ -3,10 +3,10 @@ use nalgebra::Isometry3;
 
 use crate::WIDTH;
 
-/// Free space (0.6) with a block of 5³ voxels of 1 around each of `centres`, which is where a test model sees a grasp.
+/// Free space (0.6) with a block of 5³ voxels of value 1 around each of `centres`. A test model has a grasp at each.
 ///
 /// # Panics
-/// When a block does not fit.
+/// If a block exceeds the volume.
 #[must_use]
 pub fn blobs(resolution: usize, pose: Isometry3<f64>, centres: &[[usize; 3]]) -> Volume {
     let mut values = vec![0.6; resolution.pow(3)];
@@ -23,7 +23,7 @@ pub fn blobs(resolution: usize, pose: Isometry3<f64>, centres: &[[usize; 3]]) ->
     Volume::new(resolution, voxel_size, pose, values).expect("0.6 and 1 are values of a volume")
 }
 
-/// What a test model must answer, computed without any server.
+/// The decoded outputs of a test model, computed without a server.
 ///
 /// # Panics
 /// Never: the maps fit the volume.

@@ -33,7 +33,7 @@ fn write<T: npyz::AutoSerialize>(path: &Path, order: npyz::Order, values: impl I
     writer.finish().unwrap();
 }
 
-/// The volume in every form that is read.
+/// The volume in every file format that is supported.
 fn files() -> (TempDir, Vec<PathBuf>) {
     let folder = tempfile::tempdir().unwrap();
     let path = |name| folder.path().join(name);
@@ -66,7 +66,7 @@ fn text(bytes: &[u8]) -> &str {
 }
 
 #[test]
-fn detect_reads_every_form_and_prints_the_same() {
+fn detect_gives_the_same_grasps_for_every_file_format() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let (_folder, files) = files();
     for file in files {
@@ -100,7 +100,7 @@ fn detect_prints_a_table_with_the_latency_of_each_stage() {
 }
 
 #[test]
-fn models_and_health_say_what_there_is() {
+fn models_and_health_are_printed() {
     let server = Server::run(&[TestModel::new("mirror"), TestModel::new("other").version("2.1")], &[]);
     let output = run(&server, &["models"]);
     assert!(text(&output.stdout).contains("mirror") && text(&output.stdout).contains("2.1"));
@@ -117,7 +117,7 @@ fn models_and_health_say_what_there_is() {
 }
 
 #[test]
-fn mistakes_are_explained() {
+fn errors_name_the_file_the_field_or_the_server() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let (folder, files) = files();
     let refused = |args: &[&str]| {
@@ -139,9 +139,9 @@ fn mistakes_are_explained() {
     assert!(error.contains("volume.voxel_size is 7.5, must be 0.01875 m"), "{error}");
 }
 
-/// Flags that cannot be given together, or not alone.
+/// Flags that exclude each other, or that require another flag.
 #[test]
-fn wrong_combinations_are_refused_before_anything_is_read() {
+fn invalid_combinations_of_flags_are_refused_before_files_are_read() {
     let refused = |flags: &str| {
         let output = Command::new(grasp()).arg("detect").args(flags.split(' ')).output().unwrap();
         assert_eq!(output.status.code(), Some(2), "{flags}");
@@ -156,7 +156,7 @@ fn wrong_combinations_are_refused_before_anything_is_read() {
 }
 
 #[tokio::test]
-async fn the_library_names_the_field_that_is_wrong() {
+async fn errors_of_the_client_library_name_the_field() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let client = Client::connect(server.grpc().to_string()).await.unwrap();
     let wrong =
@@ -191,7 +191,7 @@ fn pose(value: &Value) -> Isometry3<f64> {
 }
 
 #[test]
-fn the_hand_its_frame_and_its_ways_are_asked_for() {
+fn flags_set_the_hand_its_frame_the_pre_grasp_and_the_retreat() {
     let server = Server::run(&[TestModel::new("mirror").rotation([0.6, 0.0, 0.0, 0.8])], &[]);
     let (folder, files) = files();
     let file = files[0].to_str().unwrap();
@@ -227,7 +227,7 @@ fn the_hand_its_frame_and_its_ways_are_asked_for() {
 }
 
 #[test]
-fn what_cannot_be_answered_ends_no_watch_and_a_camera_that_moves_is_noticed() {
+fn watch_continues_after_a_refusal_and_detects_changed_poses() {
     let server = Server::run(&[TestModel::new("mirror").resolution(40)], &[]);
     let folder = tempfile::tempdir().unwrap();
     depth_files(folder.path());
@@ -236,14 +236,14 @@ fn what_cannot_be_answered_ends_no_watch_and_a_camera_that_moves_is_noticed() {
         let rows = |pose: &Isometry3<f64>| {
             pose.to_homogeneous().row_iter().map(|row| row.iter().copied().collect()).collect::<Vec<Vec<f64>>>()
         };
-        // Into place at once, as graspd's models are.
+        // The rename replaces the file atomically, so that `watch` never reads an incomplete file.
         std::fs::write(path("new.json"), serde_json::json!(poses.iter().map(rows).collect::<Vec<_>>()).to_string())
             .unwrap();
         std::fs::rename(path("new.json"), path("poses.json")).unwrap();
     };
-    let stand = [camera(30.0, -90.0), camera(45.0, 60.0)];
-    // They look the other way.
-    poses(stand.map(|pose| Isometry3::rotation(Vector3::x() * std::f64::consts::PI) * pose));
+    let valid = [camera(30.0, -90.0), camera(45.0, 60.0)];
+    // The cameras point away from the scene.
+    poses(valid.map(|pose| Isometry3::rotation(Vector3::x() * std::f64::consts::PI) * pose));
     let mut watch = Command::new(grasp())
         .args(["watch", &path("m0.npy"), &path("m1.npy"), "--intrinsics", &path("k.npy")])
         .args(["--camera-from-task", &path("poses.json"), "--json", "--threshold", "0.6"])
@@ -253,11 +253,11 @@ fn what_cannot_be_answered_ends_no_watch_and_a_camera_that_moves_is_noticed() {
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    let mut complaint = String::new();
-    BufReader::new(watch.stderr.as_mut().unwrap()).read_line(&mut complaint).unwrap();
-    assert!(complaint.contains("views[0]: camera at") && complaint.contains("waiting"), "{complaint}");
-    // The images stay the same; that the camera stands elsewhere is what changes.
-    poses(stand);
+    let mut warning = String::new();
+    BufReader::new(watch.stderr.as_mut().unwrap()).read_line(&mut warning).unwrap();
+    assert!(warning.contains("views[0]: camera at") && warning.contains("waiting"), "{warning}");
+    // The images stay the same; only the poses change.
+    poses(valid);
     let output = watch.wait_with_output().unwrap();
     assert!(output.status.success());
     let answer: Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -265,7 +265,7 @@ fn what_cannot_be_answered_ends_no_watch_and_a_camera_that_moves_is_noticed() {
 }
 
 #[test]
-fn nobody_has_to_read_to_the_end() {
+fn a_closed_stdout_is_not_an_error() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let (_folder, files) = files();
     let file = files[0].to_str().unwrap();
@@ -284,7 +284,7 @@ fn nobody_has_to_read_to_the_end() {
 }
 
 #[test]
-fn a_benchmark_says_how_long_answers_took_and_what_was_refused() {
+fn bench_reports_latency_throughput_and_refusals() {
     let (_folder, files) = files();
     let server = Server::run(&[TestModel::new("slow").convolutions(20)], &["--queue", "1"]);
     let bench = |flags: &[&str]| -> Value {
@@ -300,14 +300,14 @@ fn a_benchmark_says_how_long_answers_took_and_what_was_refused() {
     let alone = bench(&["--seconds", "0.5"]);
     assert!(alone["outcomes"]["answered"]["calls"].as_u64().unwrap() > 0, "{alone}");
     assert!(alone["answers_per_second"].as_f64().unwrap() > 0.0);
-    assert_eq!(alone["outcomes"].as_object().unwrap().len(), 1, "nobody is refused: {alone}");
+    assert_eq!(alone["outcomes"].as_object().unwrap().len(), 1, "no request is refused: {alone}");
     let crowd = bench(&["--seconds", "0.5", "--callers", "8"]);
     assert!(crowd["outcomes"]["ResourceExhausted"]["calls"].as_u64().unwrap() > 0, "{crowd}");
     let steady = bench(&["--seconds", "0.5", "--rate", "20"]);
     assert!(steady["outcomes"]["answered"]["p50_seconds"].as_f64().unwrap() > 0.0, "{steady}");
 }
 
-/// What the CLI reads of a depth camera, in every form: the images' names, and the flags that say how they were taken.
+/// Depth images of two cameras in each supported format: paths of the images, and flags with intrinsics and poses.
 fn depth_files(folder: &Path) -> Vec<Vec<String>> {
     let path = |name: &str| folder.join(name).to_str().unwrap().to_owned();
     let cameras = [camera(30.0, -90.0), camera(45.0, 60.0)];
@@ -361,13 +361,13 @@ fn depth_files(folder: &Path) -> Vec<Vec<String>> {
     ]
 }
 
-/// With words between the file and the flags.
+/// The arguments `first`, then `more`.
 fn command<'a>(first: &[&'a str], more: &'a [String]) -> Vec<&'a str> {
     first.iter().copied().chain(more.iter().map(String::as_str)).collect()
 }
 
 #[test]
-fn depth_images_are_read_in_every_form() {
+fn depth_images_are_read_in_every_format() {
     let server = Server::run(&[TestModel::new("mirror").resolution(40)], &[]);
     let folder = tempfile::tempdir().unwrap();
     let mut found = Vec::new();
@@ -388,7 +388,7 @@ fn depth_images_are_read_in_every_form() {
     assert!(text(&output.stderr).contains("2 poses in the file for 1 images"), "{}", text(&output.stderr));
 }
 
-/// What the same cameras see as point clouds: in the cameras' own frames, and in that of the task.
+/// Point clouds of the same cameras: in the frames of the cameras, and in the task frame.
 fn cloud_files(folder: &Path) -> [Vec<String>; 2] {
     let path = |name: &str| folder.join(name).to_str().unwrap().to_owned();
     let cameras = [camera(30.0, -90.0), camera(45.0, 60.0)].map(|pose| pose.inverse());
@@ -409,7 +409,7 @@ fn cloud_files(folder: &Path) -> [Vec<String>; 2] {
             .unwrap();
         writer.finish().unwrap();
 
-        // As numpy writes `np.stack([x, y, z]).T`.
+        // The memory order in which NumPy saves `np.stack([x, y, z]).T`.
         let name = path(&format!("placed{index}.npz"));
         let mut archive = npyz::npz::NpzWriter::create(&name).unwrap();
         for (array, shape) in [("colors", [1, 3]), ("points", shape)] {
@@ -429,7 +429,7 @@ fn cloud_files(folder: &Path) -> [Vec<String>; 2] {
 }
 
 #[test]
-fn point_clouds_are_read_in_every_form() {
+fn point_clouds_are_read_in_every_format() {
     let server = Server::run(&[TestModel::new("mirror").resolution(40)], &[]);
     let folder = tempfile::tempdir().unwrap();
     let clouds = cloud_files(folder.path());
@@ -441,7 +441,7 @@ fn point_clouds_are_read_in_every_form() {
         assert!(reply["latency_seconds"]["fusion"].as_f64().unwrap() > 0.0);
         reply["grasps"].as_array().unwrap().len()
     });
-    // Points on the border between two pixels fall to either side.
+    // Points on the border between two pixels may be assigned to either.
     assert!(found[0] > 5 && found[0].abs_diff(found[1]) <= 1 + found[0] / 4, "{found:?}");
 
     let refused = |args: &[&str]| {
@@ -451,30 +451,30 @@ fn point_clouds_are_read_in_every_form() {
     };
     let [own, _] = &clouds;
     let (cloud, poses) = (own[2].as_str(), own[5].as_str());
-    let here = ["--camera-position", "0,0,0"];
+    let origin = ["--camera-position", "0,0,0"];
     let error = refused(&["detect", cloud]);
     assert!(error.contains("a volume must be N×N×N; for a point cloud add --camera-position"), "{error}");
-    let error = refused(&[&["detect", cloud][..], &here, &["--frame-from-cloud", poses]].concat());
+    let error = refused(&[&["detect", cloud][..], &origin, &["--frame-from-cloud", poses]].concat());
     assert!(error.contains("2 poses in the file for 1 point clouds"), "{error}");
-    let error = refused(&[&["detect", cloud][..], &here, &here].concat());
+    let error = refused(&[&["detect", cloud][..], &origin, &origin].concat());
     assert!(error.contains("is given 2 times for 1 point clouds"), "{error}");
     let error = refused(&[&["detect", cloud][..], &["--camera-position", "0.1,0.1,0.1"]].concat());
     assert!(error.contains("views[0]") && error.contains("check camera_position"), "{error}");
     let (_folder, volumes) = files();
-    let error = refused(&[&["detect", volumes[0].to_str().unwrap()][..], &here].concat());
+    let error = refused(&[&["detect", volumes[0].to_str().unwrap()][..], &origin].concat());
     assert!(error.contains("a point cloud must be N×3"), "{error}");
 }
 
 #[test]
-fn grasps_are_written_as_others_read_them() {
+fn grasps_are_exported_as_csv_moveit_and_isaac_files() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let (folder, files) = files();
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
-    let forms = ["--csv", "--moveit", "--isaac"].map(|flag| (flag, path(flag)));
+    let formats = ["--csv", "--moveit", "--isaac"].map(|flag| (flag, path(flag)));
     let mut args = vec!["detect", files[0].to_str().unwrap(), "--frame-id", "base", "--collision", "flag"];
-    args.extend(forms.iter().flat_map(|(flag, path)| [*flag, path]));
+    args.extend(formats.iter().flat_map(|(flag, path)| [*flag, path]));
     assert!(run(&server, &args).status.success());
-    let [csv, moveit, isaac] = forms.map(|(_, path)| std::fs::read_to_string(path).unwrap());
+    let [csv, moveit, isaac] = formats.map(|(_, path)| std::fs::read_to_string(path).unwrap());
     let lines: Vec<&str> = csv.lines().collect();
     assert_eq!(lines.len(), 3);
     assert!(lines[0].starts_with("quality,width,x,y,z,qx,qy,qz,qw,"), "{csv}");
@@ -485,7 +485,7 @@ fn grasps_are_written_as_others_read_them() {
 }
 
 #[test]
-fn what_was_seen_is_drawn_and_recorded() {
+fn view_writes_pictures_and_recordings() {
     let server = Server::run(&[TestModel::new("mirror").resolution(40)], &[]);
     let folder = tempfile::tempdir().unwrap();
     let images = depth_files(folder.path()).remove(0);
@@ -504,7 +504,7 @@ fn what_was_seen_is_drawn_and_recorded() {
         let count = |is: fn([i16; 3]) -> bool| {
             pixels.as_chunks().0.iter().filter(|pixel: &&[u8; 3]| is(pixel.map(i16::from))).count()
         };
-        // Yellow and green grippers before a grey surface, and the axes x and z, which alone are red and blue.
+        // Grippers are yellow or green, the surface is grey; only the x axis is red and only the z axis is blue.
         assert!(count(|[red, green, blue]| green - blue > 60 && green + 60 > red) > 500);
         assert!(count(|[red, green, blue]| red - green > 80 && red - blue > 80) > 100);
         assert!(count(|[red, green, blue]| blue - red > 80 && blue - green > 60) > 100);
@@ -524,7 +524,7 @@ fn what_was_seen_is_drawn_and_recorded() {
 }
 
 #[test]
-fn a_file_is_watched() {
+fn watch_detects_again_when_the_file_changes() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let (_folder, files) = files();
     let watched = files[0].to_str().unwrap();
@@ -534,7 +534,7 @@ fn a_file_is_watched() {
         .stdout(Stdio::piped())
         .spawn()
         .unwrap();
-    // Again and again, for it may not have looked yet.
+    // Repeated writes, because `watch` may not have read the file yet.
     while watch.try_wait().unwrap().is_none() {
         write(&files[0], npyz::Order::C, volume().values().iter().copied());
         std::thread::sleep(std::time::Duration::from_millis(100));

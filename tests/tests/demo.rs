@@ -1,4 +1,4 @@
-//! `make demo` with the models that are shipped.
+//! `make demo` with the shipped models.
 
 use std::fs;
 use std::path::Path;
@@ -7,7 +7,7 @@ use std::process::Command;
 use grasp_tests::{grasp_sim, graspd};
 
 #[test]
-fn the_demo_detects_executes_draws_and_stops_its_server() {
+fn the_demo_detects_executes_and_draws_grasps_and_stops_its_server() {
     let picture = tempfile::tempdir().unwrap();
     let picture = picture.path().join("demo.png");
     let zoo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo");
@@ -16,8 +16,8 @@ fn the_demo_detects_executes_draws_and_stops_its_server() {
     let output = command.arg("--picture").arg(&picture).output().unwrap();
     let (stdout, stderr) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert!(output.status.success(), "{stdout}{stderr}");
-    for said in ["grasps from vgn-packed", "latency: queue", "the best one, executed:", "graspd stopped cleanly"] {
-        assert!(stdout.contains(said), "`{said}` is missing from:\n{stdout}");
+    for expected in ["grasps from vgn-packed", "latency: queue", "the best one, executed:", "graspd stopped cleanly"] {
+        assert!(stdout.contains(expected), "`{expected}` is missing from:\n{stdout}");
     }
     assert!(fs::read(&picture).unwrap().starts_with(b"\x89PNG"));
 }

@@ -1,5 +1,6 @@
-//! Depth images and point clouds are answered as the volume that they make; what is wrong with them is told.
+//! Requests with depth images or point clouds: grasps are those of the fused volume, and errors name the field.
 
+use std::path::Path;
 use std::time::Duration;
 
 use grasp::{DepthImage, Fusion, RESOLUTION as PAPERS, Volume, WORKSPACE_SIZE};
@@ -16,11 +17,11 @@ fn low() -> Options {
     Options { detect: DetectOptions { threshold: Some(0.6), ..DetectOptions::default() }, ..Options::default() }
 }
 
-fn asking(detect: DetectOptions) -> Options {
+fn with_options(detect: DetectOptions) -> Options {
     Options { detect, ..Options::default() }
 }
 
-/// What the server should fuse.
+/// The volume that the server must fuse.
 fn fused(cameras: &[Isometry3<f64>], resolution: usize, pose: Isometry3<f64>) -> Volume {
     let mut fusion = Fusion::new(resolution, WORKSPACE_SIZE);
     for camera in cameras {
@@ -29,11 +30,14 @@ fn fused(cameras: &[Isometry3<f64>], resolution: usize, pose: Isometry3<f64>) ->
     fusion.volume(pose).unwrap()
 }
 
-fn assert_same(got: &[Proposal], wanted: &[Proposal]) {
-    assert!(!wanted.is_empty() && got.len() == wanted.len(), "{} instead of {}", got.len(), wanted.len());
-    for (got, wanted) in got.iter().zip(wanted) {
-        assert!((got.pose.translation.vector - wanted.pose.translation.vector).norm() < 1e-9, "{got:?} {wanted:?}");
-        assert!((got.quality - wanted.quality).abs() < 1e-5, "{got:?} {wanted:?}");
+fn assert_same(actual: &[Proposal], expected: &[Proposal]) {
+    assert!(!expected.is_empty() && actual.len() == expected.len(), "{} not {}", actual.len(), expected.len());
+    for (actual, expected) in actual.iter().zip(expected) {
+        assert!(
+            (actual.pose.translation.vector - expected.pose.translation.vector).norm() < 1e-9,
+            "{actual:?} {expected:?}"
+        );
+        assert!((actual.quality - expected.quality).abs() < 1e-5, "{actual:?} {expected:?}");
     }
 }
 
@@ -51,25 +55,25 @@ fn refusal(outcome: Result<Detection, Error>) -> (Code, String) {
 }
 
 #[tokio::test]
-async fn depth_is_answered_like_the_volume_that_it_makes() {
+async fn depth_images_give_the_grasps_of_the_fused_volume() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let client = server.client().await;
     let pose = Isometry3::new(Vector3::new(0.4, -0.2, 1.1), Vector3::new(0.0, 0.0, 2.0));
     let workspace = Workspace { pose, size: Some(0.3) };
     let cameras = [camera(30.0, -90.0), camera(45.0, 60.0)];
-    let wanted = client.detect(&fused(&cameras, RESOLUTION, pose), low()).await.unwrap();
+    let expected = client.detect(&fused(&cameras, RESOLUTION, pose), low()).await.unwrap();
 
     let metres = cameras.map(|camera| view(&camera));
     let frame_id = "panda_link0".to_owned();
     let options = Options { frame_id, ..low() };
     let detection = client.detect_from_depth(&metres, &workspace, options).await.unwrap();
-    assert_same(&detection.grasps, &wanted.grasps);
+    assert_same(&detection.grasps, &expected.grasps);
     assert_eq!((detection.frame_id.as_str(), detection.model.as_str()), ("panda_link0", "mirror"));
     assert!(detection.latency.fusion > 0.0 && detection.latency.total > detection.latency.fusion);
     let count = "graspd_stage_duration_seconds_count{model=\"mirror 1\",stage=\"fusion\"}";
-    assert_eq!(server.metric(count), 1.0, "a finished volume was not fused");
+    assert_eq!(server.metric(count), 1.0, "a volume in the request is not fused");
 
-    // As hand-eye calibration gives the poses, in the millimetres of a driver.
+    // Poses as from a hand-eye calibration, depth in millimetres as from a camera driver.
     let millimetres = cameras.map(|camera| DepthView {
         depth: Depth::Millimetres(depth(&camera).iter().map(|metres| (metres * 1e3).round() as u16).collect()),
         extrinsics: Extrinsics::FrameFromCamera(pose * camera.inverse()),
@@ -81,37 +85,37 @@ async fn depth_is_answered_like_the_volume_that_it_makes() {
 }
 
 #[tokio::test]
-async fn a_network_that_wants_its_camera_on_one_side_has_it_there() {
+async fn the_grid_is_rotated_to_the_camera_azimuth_of_the_network() {
     let turned = TestModel::new("turned").camera_azimuth(-60.0);
     let server = Server::run(&[TestModel::new("mirror"), turned], &[]);
     let client = server.client().await;
     let pose = Isometry3::new(Vector3::new(0.4, -0.2, 1.1), Vector3::new(0.0, 0.0, 2.0));
     let workspace = Workspace { pose, size: None };
     let eye = camera(40.0, -90.0);
-    let options = || asking(DetectOptions { model: "turned".to_owned(), ..low().detect });
+    let options = || with_options(DetectOptions { model: "turned".to_owned(), ..low().detect });
     let detection = client.detect_from_depth(&[view(&eye)], &workspace, options()).await.unwrap();
 
-    // The cube turns about its middle by -30°, which brings the camera to -60° in it.
+    // The grid is rotated by -30° about its centre, so that the camera is at -60° in the frame of the grid.
     let middle = Isometry3::translation(0.15, 0.15, 0.0);
     let turn = Isometry3::rotation(Vector3::z() * -30_f64.to_radians());
-    let task_from_cube = middle * turn * middle.inverse();
-    let volume = fused(&[eye * task_from_cube], RESOLUTION, pose * task_from_cube);
-    // Of what is seen in its corners only that is told which lies in the cube that was asked about.
+    let task_from_grid = middle * turn * middle.inverse();
+    let volume = fused(&[eye * task_from_grid], RESOLUTION, pose * task_from_grid);
+    // Grasps in the corners of the rotated grid are dropped if they are outside the requested workspace.
     let all = client.detect(&volume, options()).await.unwrap().grasps;
     let between = |grasp: &Proposal| pose.inverse() * grasp.pose * Point3::new(0.0, 0.0, grasp::FINGER_DEPTH);
     let inside = |grasp: &&Proposal| between(grasp).iter().all(|c| (0.0..=WORKSPACE_SIZE).contains(c));
-    let wanted: Vec<Proposal> = all.iter().filter(inside).cloned().collect();
-    assert!(detection.grasps.len() >= wanted.len() && !wanted.is_empty());
-    for grasp in &wanted {
+    let expected: Vec<Proposal> = all.iter().filter(inside).cloned().collect();
+    assert!(detection.grasps.len() >= expected.len() && !expected.is_empty());
+    for grasp in &expected {
         let near = |other: &Proposal| (other.pose.translation.vector - grasp.pose.translation.vector).norm() < 1e-9;
         assert!(detection.grasps.iter().any(near), "{grasp:?} is missing");
     }
-    assert!(detection.grasps.iter().all(|grasp| inside(&grasp)), "outside of the workspace");
+    assert!(detection.grasps.iter().all(|grasp| inside(&grasp)), "a grasp is outside the workspace");
 
     let models = client.list_models().await.unwrap();
     let azimuth = |name: &str| models.iter().find(|model| model.name == name).unwrap().camera_azimuth;
     assert_eq!((azimuth("mirror"), azimuth("turned")), (None, Some(-60.0)));
-    // A volume that was turned for one network is none for another.
+    // A tracked volume that is rotated for one network cannot be used by another.
     let mut tracking = client.track(workspace).await.unwrap();
     tracking.add(&[view(&eye)], options()).await.unwrap();
     let (code, message) = refusal(tracking.add(&[], low()).await);
@@ -120,7 +124,7 @@ async fn a_network_that_wants_its_camera_on_one_side_has_it_there() {
 }
 
 #[tokio::test]
-async fn points_are_answered_like_the_depth_that_they_were_seen_in() {
+async fn point_clouds_give_grasps_in_the_workspace() {
     let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS)], &[]);
     let client = server.client().await;
     let pose = camera(35.0, -60.0);
@@ -130,7 +134,7 @@ async fn points_are_answered_like_the_depth_that_they_were_seen_in() {
         let z = f64::from(depth);
         [(u - CAMERA.cx) / CAMERA.fx * z, (v - CAMERA.cy) / CAMERA.fy * z, z].map(|c| c as f32)
     });
-    // In the camera's own frame, as a driver publishes them.
+    // In the frame of the camera, as drivers publish point clouds.
     let cloud = CloudView {
         points: pixels.chain([[f32::NAN; 3]]).collect(),
         frame_from_cloud: pose.inverse(),
@@ -138,7 +142,7 @@ async fn points_are_answered_like_the_depth_that_they_were_seen_in() {
     };
     let network = client.detect_from_cloud(std::slice::from_ref(&cloud), &Workspace::default(), low()).await.unwrap();
     assert!(!network.grasps.is_empty() && network.latency.fusion > 0.0);
-    let shaf = || asking(DetectOptions { model: "shaf".to_owned(), ..DetectOptions::default() });
+    let shaf = || with_options(DetectOptions { model: "shaf".to_owned(), ..DetectOptions::default() });
     let detection =
         client.detect_from_cloud(std::slice::from_ref(&cloud), &Workspace::default(), shaf()).await.unwrap();
     assert!(!detection.grasps.is_empty(), "{:?}", detection.dropped);
@@ -151,7 +155,7 @@ async fn points_are_answered_like_the_depth_that_they_were_seen_in() {
 }
 
 #[tokio::test]
-async fn what_is_wrong_with_a_view_is_told() {
+async fn invalid_views_are_refused_with_the_field_and_the_value() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let client = server.client().await;
     let pose = camera(30.0, -90.0);
@@ -160,7 +164,7 @@ async fn what_is_wrong_with_a_view_is_told() {
     let refused = async |view: DepthView, begins: &str| {
         let (code, message) = refusal(client.detect_from_depth(&[good(), view], &workspace, low()).await);
         assert!(code == Code::InvalidArgument && message.starts_with(begins), "{code:?}: {message}");
-        assert!(client.detect_from_depth(&[good()], &workspace, low()).await.is_ok(), "the connection goes on");
+        assert!(client.detect_from_depth(&[good()], &workspace, low()).await.is_ok(), "the connection stays usable");
     };
 
     let millimetres = depth(&pose).iter().map(|metres| metres * 1e3).collect();
@@ -204,7 +208,7 @@ async fn what_is_wrong_with_a_view_is_told() {
     )
     .await;
     refused(&[good()], Workspace { size: Some(-1.0), ..workspace }, "workspace.size is -1, must be above 0").await;
-    // Above everything, in front of the camera.
+    // A workspace above the scene, in front of the camera.
     let above = Workspace { pose: Isometry3::translation(0.0, 0.0, 0.25), size: None };
     let hand_eye = Extrinsics::FrameFromCamera(pose.inverse());
     let elsewhere = DepthView { extrinsics: hand_eye, ..good() };
@@ -212,7 +216,7 @@ async fn what_is_wrong_with_a_view_is_told() {
 }
 
 #[tokio::test]
-async fn planners_without_a_network_answer_by_their_names() {
+async fn planners_without_a_network_are_selected_by_name() {
     let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS)], &[]);
     let classifiers = server.models().join("classifiers");
     std::fs::create_dir(&classifiers).unwrap();
@@ -222,50 +226,93 @@ async fn planners_without_a_network_answer_by_their_names() {
     server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
     let client = server.client().await;
     let names: Vec<_> = client.list_models().await.unwrap().into_iter().map(|model| model.name).collect();
-    assert_eq!(names, ["mirror", "gpd", "shaf"], "a network is the default");
+    assert_eq!(names, ["mirror", "gpd", "shaf"], "the network is the default, so it comes first");
 
     let cameras = [camera(30.0, -90.0), camera(40.0, 90.0)];
     let views = cameras.map(|camera| view(&camera));
     let volume = fused(&cameras, PAPERS, Isometry3::identity());
     for planner in ["gpd", "shaf"] {
-        let options = || asking(DetectOptions { model: planner.to_owned(), ..DetectOptions::default() });
+        let options = || with_options(DetectOptions { model: planner.to_owned(), ..DetectOptions::default() });
         let seen = client.detect_from_depth(&views, &Workspace::default(), options()).await.unwrap();
         assert!(!seen.grasps.is_empty() && seen.model == planner, "{planner}: {:?}", seen.dropped);
         assert!(seen.grasps.is_sorted_by(|a, b| a.quality >= b.quality));
         seen.grasps.iter().for_each(assert_at_the_block);
         let again = client.detect_from_depth(&views, &Workspace::default(), options()).await.unwrap();
         assert_same(&again.grasps, &seen.grasps);
-        // From the volume alone it is seen less finely, but seen.
+        // A volume has a coarser surface than depth images, but it suffices for grasps.
         let coarse = client.detect(&volume, options()).await.unwrap();
         assert!(!coarse.grasps.is_empty(), "{planner}: {:?}", coarse.dropped);
     }
-    // What the classifier doubts comes to who asks for it.
-    let doubted = async |threshold| {
+    // Grasps with a quality below 0.5 are returned only for a lower threshold.
+    let has_low_quality = async |threshold| {
         let detect = DetectOptions {
             model: "gpd".to_owned(),
             threshold: Some(threshold),
             max_grasps: 1000,
             ..DetectOptions::default()
         };
-        let detection = client.detect_from_depth(&views, &Workspace::default(), asking(detect)).await.unwrap();
+        let detection = client.detect_from_depth(&views, &Workspace::default(), with_options(detect)).await.unwrap();
         detection.grasps.iter().any(|grasp| grasp.quality < 0.5)
     };
-    assert_eq!((doubted(0.5).await, doubted(0.001).await), (false, true));
-    // Nothing lies on a table that is said to be as high as the block.
+    assert_eq!((has_low_quality(0.5).await, has_low_quality(0.001).await), (false, true));
+    // A table height above the block leaves no points to grasp.
     let table = Some(pb::CollisionCheck { mode: 0, table_height: Some(0.2) });
     let detect = DetectOptions { model: "shaf".to_owned(), collision: table, ..DetectOptions::default() };
-    let none = client.detect_from_depth(&views, &Workspace::default(), asking(detect)).await.unwrap();
+    let none = client.detect_from_depth(&views, &Workspace::default(), with_options(detect)).await.unwrap();
     assert!(none.grasps.is_empty() && none.dropped.as_ref().unwrap().mask > 1000, "{:?}", none.dropped);
     let own =
         pb::Gripper { max_opening: 0.03, finger_depth: 0.05, finger_width: 0.01, finger_breadth: 0.02, palm: None };
     let detect = DetectOptions { model: "shaf".to_owned(), gripper: Some(own), ..DetectOptions::default() };
-    let narrow = client.detect_from_depth(&views, &Workspace::default(), asking(detect)).await.unwrap();
+    let narrow = client.detect_from_depth(&views, &Workspace::default(), with_options(detect)).await.unwrap();
     let widest = narrow.grasps.iter().map(|grasp| grasp.width).fold(0.0, f64::max);
-    assert!(widest <= 0.02, "a hand that opens to 3 cm takes nothing of {widest} m");
+    assert!(widest <= 0.02, "a grasp of {widest} m for a hand with an opening of 3 cm");
 }
 
 #[tokio::test]
-async fn a_planner_stops_when_nobody_waits() {
+async fn an_evaluator_scores_the_grasps_of_its_network() {
+    let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS)], &[]);
+    let zoo = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo"));
+    let evaluators = server.models().join("evaluators");
+    std::fs::create_dir(&evaluators).unwrap();
+    std::fs::copy(zoo.join("evaluators/graspd-packed.onnx"), evaluators.join("graspd-packed.onnx")).unwrap();
+    server.reload().unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 1.0).await;
+    let client = server.client().await;
+    let names = async || {
+        let models = client.list_models().await.unwrap();
+        models.into_iter().map(|model| model.name).collect::<Vec<_>>()
+    };
+    assert_eq!(names().await, ["mirror", "shaf"], "the evaluator is not served without its network");
+    let network = server.models().join("vgn-packed.onnx");
+    std::fs::copy(zoo.join("vgn-packed.onnx"), &network).unwrap();
+    server.reload().unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
+    assert_eq!(names().await, ["mirror", "graspd-packed", "vgn-packed", "shaf"]);
+    let models = client.list_models().await.unwrap();
+    assert!(models[1].provenance["network"].starts_with("vgn-packed 3, sha256 "), "{:?}", models[1].provenance);
+    assert_eq!((models[1].resolution, models[1].threshold), (40, 0.5));
+
+    let views = [camera(30.0, -90.0), camera(40.0, 90.0)].map(|camera| view(&camera));
+    let detect = async |model: &str| {
+        let detect = DetectOptions { model: model.to_owned(), threshold: Some(0.01), ..DetectOptions::default() };
+        client.detect_from_depth(&views, &Workspace::default(), with_options(detect)).await.unwrap().grasps
+    };
+    let evaluated = detect("graspd-packed").await;
+    assert!(!evaluated.is_empty() && evaluated.is_sorted_by(|a, b| a.quality >= b.quality));
+    evaluated.iter().for_each(assert_at_the_block);
+    assert_same(&detect("graspd-packed").await, &evaluated);
+    let qualities = |grasps: &[Proposal]| grasps.iter().map(|grasp| grasp.quality).collect::<Vec<_>>();
+    assert_ne!(qualities(&detect("vgn-packed").await), qualities(&evaluated));
+
+    // After the removal of the network's file the loaded evaluator stays.
+    std::fs::remove_file(&network).unwrap();
+    server.reload().unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 2.0).await;
+    assert_eq!(names().await, ["mirror", "graspd-packed", "shaf"]);
+}
+
+#[tokio::test]
+async fn planning_stops_when_the_deadline_passes() {
     let server = Server::run(&[TestModel::new("mirror")], &["--workers", "1"]);
     let client = server.client().await;
     let checkered = |resolution: usize| {
@@ -277,28 +324,28 @@ async fn a_planner_stops_when_nobody_waits() {
         let values = (0..resolution.pow(3)).map(value).collect();
         Volume::new(resolution, voxel_size, Isometry3::identity(), values).unwrap()
     };
-    // A hand that reaches everywhere has everything in its way.
+    // A hand as large as the workspace collides everywhere, so that planning takes minutes.
     let large =
         pb::Gripper { max_opening: 0.5, finger_depth: 0.5, finger_width: 0.01, finger_breadth: 0.5, palm: None };
     let shaf = |gripper| DetectOptions { model: "shaf".to_owned(), gripper, ..DetectOptions::default() };
-    let hurried = Options { timeout: Some(Duration::from_millis(500)), ..asking(shaf(Some(large))) };
-    let late = client.detect(&checkered(100), hurried).await;
-    // The client's own timer may be faster, which calls it cancelled.
+    let short = Options { timeout: Some(Duration::from_millis(500)), ..with_options(shaf(Some(large))) };
+    let late = client.detect(&checkered(100), short).await;
+    // If the client's own timer ends the call first, the code is CANCELLED.
     let late = late.err().and_then(|error| error.code());
     assert!(matches!(late, Some(Code::DeadlineExceeded | Code::Cancelled)), "{late:?}");
-    // What nobody waits for would take minutes, and there is one session.
+    // There is one session: if the first request were still planned, this one would exceed its deadline.
     let volume = fused(&[camera(30.0, -90.0), camera(40.0, 90.0)], PAPERS, Isometry3::identity());
-    let patient = Options { timeout: Some(Duration::from_secs(20)), ..asking(shaf(None)) };
-    assert!(!client.detect(&volume, patient).await.unwrap().grasps.is_empty());
+    let long = Options { timeout: Some(Duration::from_secs(20)), ..with_options(shaf(None)) };
+    assert!(!client.detect(&volume, long).await.unwrap().grasps.is_empty());
 
-    let finer = client.detect(&checkered(101), asking(shaf(None))).await.unwrap_err().to_string();
+    let finer = client.detect(&checkered(101), with_options(shaf(None))).await.unwrap_err().to_string();
     assert!(finer.contains("volume.resolution is 101, supported: at most 100 (shaf 1)"), "{finer}");
 }
 
-async fn asked_with(client: &Client, detect: DetectOptions) -> Detection {
+async fn detect_with(client: &Client, detect: DetectOptions) -> Detection {
     let views = [camera(30.0, -90.0), camera(40.0, 90.0)].map(|camera| view(&camera));
     let detect = DetectOptions { threshold: Some(0.6), ..detect };
-    client.detect_from_depth(&views, &Workspace::default(), asking(detect)).await.unwrap()
+    client.detect_from_depth(&views, &Workspace::default(), with_options(detect)).await.unwrap()
 }
 
 fn vector(x: f64, y: f64, z: f64) -> Option<pb::Vector3> {
@@ -306,69 +353,76 @@ fn vector(x: f64, y: f64, z: f64) -> Option<pb::Vector3> {
 }
 
 #[tokio::test]
-async fn what_is_asked_of_the_grasps_is_kept() {
-    // Straight down, half a turn about x.
+async fn region_approach_and_minimum_height_are_enforced() {
+    // Grasps from above: rotated by 180° about x.
     let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS).rotation([1.0, 0.0, 0.0, 0.0])], &[]);
     let client = server.client().await;
-    let all = asked_with(&client, DetectOptions::default()).await.grasps;
+    let all = detect_with(&client, DetectOptions::default()).await.grasps;
     let tips = |grasp: &Proposal| grasp.pose * Point3::new(0.0, 0.0, 0.05);
 
     let region = pb::Box { min: vector(0.1, 0.0, 0.0), max: vector(0.2, 0.15, 0.3) };
     let detection =
-        asked_with(&client, DetectOptions { region: Some(region), explain: true, ..DetectOptions::default() }).await;
+        detect_with(&client, DetectOptions { region: Some(region), explain: true, ..DetectOptions::default() }).await;
     assert!(!detection.grasps.is_empty() && detection.grasps.len() < all.len());
     assert!(detection.grasps.iter().all(|g| (0.1..=0.2).contains(&tips(g).x) && tips(g).y <= 0.15));
     assert!(detection.dropped.unwrap().region > 0);
 
     let cone = |z| Some(pb::Cone { axis: vector(0.0, 0.0, z), angle: 0.2 });
     assert_same(
-        &asked_with(&client, DetectOptions { approach: cone(-3.0), ..DetectOptions::default() }).await.grasps,
+        &detect_with(&client, DetectOptions { approach: cone(-3.0), ..DetectOptions::default() }).await.grasps,
         &all,
     );
-    let up = asked_with(&client, DetectOptions { approach: cone(3.0), ..DetectOptions::default() }).await;
-    assert!(up.grasps.is_empty() && up.dropped.is_some_and(|dropped| dropped.approach > 0), "an empty answer says why");
+    let up = detect_with(&client, DetectOptions { approach: cone(3.0), ..DetectOptions::default() }).await;
+    assert!(
+        up.grasps.is_empty() && up.dropped.is_some_and(|dropped| dropped.approach > 0),
+        "an empty reply has the reason"
+    );
 
     let high =
-        asked_with(&client, DetectOptions { min_height: Some(0.12), explain: true, ..DetectOptions::default() }).await;
+        detect_with(&client, DetectOptions { min_height: Some(0.12), explain: true, ..DetectOptions::default() }).await;
     assert!(high.grasps.iter().all(|g| tips(g).z >= 0.1199) && high.dropped.unwrap().height > 0);
 
-    assert!(all.iter().all(|grasp| grasp.collides.is_none()), "nobody asked");
+    assert!(all.iter().all(|grasp| grasp.collides.is_none()), "collisions are checked only on request");
 }
 
 #[tokio::test]
-async fn hands_that_would_meet_something_are_marked_or_dropped() {
-    // Sideways, along x.
+async fn colliding_grasps_are_flagged_or_dropped() {
+    // Horizontal grasps along x.
     let half = std::f32::consts::FRAC_1_SQRT_2;
     let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS).rotation([0.0, half, 0.0, half])], &[]);
     let client = server.client().await;
-    // A hand without a palm, lest all of them meet the table.
+    // A hand without a palm, so that not every grasp collides with the table.
     let (max_opening, finger_depth, finger_width, finger_breadth) = (0.08, 0.05, 0.01, 0.02);
     let gripper = Some(pb::Gripper { max_opening, finger_depth, finger_width, finger_breadth, palm: None });
-    let asked_with = async |client: &Client, detect| asked_with(client, DetectOptions { gripper, ..detect }).await;
-    let all = asked_with(&client, DetectOptions::default()).await.grasps;
+    let detect_with = async |client: &Client, detect| detect_with(client, DetectOptions { gripper, ..detect }).await;
+    let all = detect_with(&client, DetectOptions::default()).await.grasps;
     let collision = |mode: i32| Some(pb::CollisionCheck { mode, table_height: None });
     let flagged =
-        asked_with(&client, DetectOptions { collision: collision(1), ..DetectOptions::default() }).await.grasps;
+        detect_with(&client, DetectOptions { collision: collision(1), ..DetectOptions::default() }).await.grasps;
     let filtered =
-        asked_with(&client, DetectOptions { collision: collision(2), explain: true, ..DetectOptions::default() }).await;
+        detect_with(&client, DetectOptions { collision: collision(2), explain: true, ..DetectOptions::default() })
+            .await;
     assert_same(&flagged, &all);
     let free: Vec<_> = flagged.iter().filter(|grasp| grasp.collides == Some(false)).copied().collect();
-    assert!(free.len() < flagged.len(), "hands in the block or the table");
+    assert!(free.len() < flagged.len(), "some grasps collide with the block or the table");
     let left = |grasp: &&Proposal| filtered.grasps.iter().any(|other| other.pose == grasp.pose);
     assert_eq!(free.iter().filter(left).count(), free.len());
-    assert!(filtered.grasps.len() > free.len(), "who is dropped makes way for the neighbours");
+    assert!(filtered.grasps.len() > free.len(), "neighbours of dropped grasps are added");
     assert!(filtered.dropped.unwrap().collision as usize >= flagged.len() - free.len());
-    assert!(filtered.grasps.iter().all(|grasp| grasp.pose.translation.z >= TABLE + 0.01), "none through the table");
+    assert!(
+        filtered.grasps.iter().all(|grasp| grasp.pose.translation.z >= TABLE + 0.01),
+        "no grasp is below the table"
+    );
     let buried = Some(pb::CollisionCheck { mode: 1, table_height: Some(0.3) });
-    let buried = asked_with(&client, DetectOptions { collision: buried, ..DetectOptions::default() }).await.grasps;
-    assert!(buried.iter().all(|grasp| grasp.collides == Some(true)), "under a table");
+    let buried = detect_with(&client, DetectOptions { collision: buried, ..DetectOptions::default() }).await.grasps;
+    assert!(buried.iter().all(|grasp| grasp.collides == Some(true)), "the table is above all grasps");
 }
 
 #[tokio::test]
-async fn poses_are_told_as_the_robot_wants_them() {
+async fn poses_have_the_requested_convention_pre_grasp_and_retreat() {
     let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS).rotation([1.0, 0.0, 0.0, 0.0])], &[]);
     let client = server.client().await;
-    let own = asked_with(&client, DetectOptions::default()).await.grasps;
+    let own = detect_with(&client, DetectOptions::default()).await.grasps;
     let offset = |a: &Isometry3<f64>, b: &Isometry3<f64>| (a.inverse() * b).translation.vector;
     for grasp in &own {
         assert!((offset(&grasp.pose, &grasp.pregrasp) - Vector3::new(0.0, 0.0, -0.05)).norm() < 1e-9);
@@ -381,27 +435,30 @@ async fn poses_are_told_as_the_robot_wants_them() {
         retreat: Some(pb::Retreat { distance: Some(0.2), direction: vector(0.0, 0.0, 1.0) }),
         ..DetectOptions::default()
     };
-    let told = asked_with(&client, detect).await.grasps;
-    for (own, told) in own.iter().zip(&told) {
-        assert!((offset(&own.pose, &told.pose) - Vector3::new(0.0, 0.0, 0.05)).norm() < 1e-9, "the fingertips");
-        let closing = own.pose.inverse() * (told.pose * Vector3::x());
-        assert!((closing - Vector3::y()).norm() < 1e-9, "what was y is x");
-        assert!((offset(&told.pose, &told.pregrasp) - Vector3::new(0.0, 0.0, -0.12)).norm() < 1e-9);
-        let lifted = told.retreat.translation.vector - told.pose.translation.vector;
+    let converted = detect_with(&client, detect).await.grasps;
+    for (own, converted) in own.iter().zip(&converted) {
+        assert!(
+            (offset(&own.pose, &converted.pose) - Vector3::new(0.0, 0.0, 0.05)).norm() < 1e-9,
+            "the origin is between the fingertips"
+        );
+        let closing = own.pose.inverse() * (converted.pose * Vector3::x());
+        assert!((closing - Vector3::y()).norm() < 1e-9, "the closing axis y becomes x");
+        assert!((offset(&converted.pose, &converted.pregrasp) - Vector3::new(0.0, 0.0, -0.12)).norm() < 1e-9);
+        let lifted = converted.retreat.translation.vector - converted.pose.translation.vector;
         assert!((lifted - Vector3::new(0.0, 0.0, 0.2)).norm() < 1e-9);
     }
 
-    // Twice as long fingers stand further back, with their tips in the same place.
+    // Fingers of twice the depth: the base is further back, the fingertips are at the same place.
     let gripper =
         pb::Gripper { max_opening: 0.1, finger_depth: 0.1, finger_width: 0.01, finger_breadth: 0.02, palm: None };
-    let long = asked_with(&client, DetectOptions { gripper: Some(gripper), ..DetectOptions::default() }).await.grasps;
+    let long = detect_with(&client, DetectOptions { gripper: Some(gripper), ..DetectOptions::default() }).await.grasps;
     assert_eq!(long.len(), own.len());
     for (own, long) in own.iter().zip(&long) {
         assert!((offset(&own.pose, &long.pose) - Vector3::new(0.0, 0.0, -0.05)).norm() < 1e-9);
     }
     let bad = DetectOptions { gripper: Some(pb::Gripper { max_opening: 85.0, ..gripper }), ..DetectOptions::default() };
     let views = [view(&camera(30.0, -90.0))];
-    let (code, message) = refusal(client.detect_from_depth(&views, &Workspace::default(), asking(bad)).await);
+    let (code, message) = refusal(client.detect_from_depth(&views, &Workspace::default(), with_options(bad)).await);
     assert_eq!(code, Code::InvalidArgument);
     assert_eq!(message, "options.gripper.max_opening is 85 m, must be above 0 and at most 0.5");
 }

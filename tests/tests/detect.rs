@@ -1,4 +1,4 @@
-//! What a valid request is answered with.
+//! Replies to valid requests.
 
 use std::time::{Duration, SystemTime};
 
@@ -19,24 +19,27 @@ fn voxels(dropped: &Dropped) -> usize {
     (below_threshold + mask + width + suppressed + over_limit) as usize
 }
 
-fn assert_same(got: &[Proposal], wanted: &[Grasp]) {
-    assert_eq!(got.len(), wanted.len());
-    for (got, wanted) in got.iter().zip(wanted) {
-        assert!((got.pose.translation.vector - wanted.pose.translation.vector).norm() < 1e-12, "{got:?} {wanted:?}");
-        assert!(got.pose.rotation.angle_to(&wanted.pose.rotation) < 1e-7, "{got:?} {wanted:?}");
-        assert_eq!((got.width, got.quality), (wanted.width, wanted.quality));
+fn assert_same(actual: &[Proposal], grasps: &[Grasp]) {
+    assert_eq!(actual.len(), grasps.len());
+    for (actual, grasp) in actual.iter().zip(grasps) {
+        assert!(
+            (actual.pose.translation.vector - grasp.pose.translation.vector).norm() < 1e-12,
+            "{actual:?} {grasp:?}"
+        );
+        assert!(actual.pose.rotation.angle_to(&grasp.pose.rotation) < 1e-7, "{actual:?} {grasp:?}");
+        assert_eq!((actual.width, actual.quality), (grasp.width, grasp.quality));
     }
 }
 
 #[tokio::test]
-async fn the_answer_is_the_decoded_output_of_the_network() {
+async fn the_reply_is_the_decoded_output_of_the_network() {
     let server = Server::run(&[TestModel::new("mirror").version("3")], &[]);
     let detection = server.client().await.detect(&volume(), Options::default()).await.unwrap();
-    let wanted = expected(&volume(), &DecodeParams::default());
-    assert_eq!(wanted.grasps.len(), CENTRES.len());
-    assert_same(&detection.grasps, &wanted.grasps);
+    let decoded = expected(&volume(), &DecodeParams::default());
+    assert_eq!(decoded.grasps.len(), CENTRES.len());
+    assert_same(&detection.grasps, &decoded.grasps);
     assert_eq!((detection.model.as_str(), detection.version.as_str()), ("mirror", "3"));
-    assert_eq!(detection.dropped, None, "it was not asked for");
+    assert_eq!(detection.dropped, None, "`explain` is not set");
 }
 
 #[tokio::test]
@@ -71,7 +74,7 @@ async fn grasps_are_in_the_frame_of_the_volumes_pose() {
 }
 
 #[tokio::test]
-async fn every_voxel_is_explained_once() {
+async fn explain_counts_every_voxel_once() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let client = server.client().await;
     for threshold in [0.3, 0.7, 0.9, 1.0] {
@@ -80,29 +83,29 @@ async fn every_voxel_is_explained_once() {
                 DetectOptions { threshold: Some(threshold), max_grasps, explain: true, ..DetectOptions::default() };
             let options = Options { detect, ..Options::default() };
             let detection = client.detect(&volume(), options).await.unwrap();
-            let dropped = detection.dropped.expect("it was asked for");
+            let dropped = detection.dropped.expect("`explain` is set");
             assert_eq!(voxels(&dropped) + detection.grasps.len(), RESOLUTION.pow(3), "{dropped:?}");
-            let wanted = expected(&volume(), &DecodeParams { threshold, ..DecodeParams::default() });
-            let sent = if max_grasps == 0 { wanted.grasps.len() } else { 1.min(wanted.grasps.len()) };
+            let decoded = expected(&volume(), &DecodeParams { threshold, ..DecodeParams::default() });
+            let sent = if max_grasps == 0 { decoded.grasps.len() } else { 1.min(decoded.grasps.len()) };
             assert_eq!(detection.grasps.len(), sent);
-            assert_eq!(dropped.over_limit as usize, wanted.grasps.len() - sent);
-            assert_eq!(dropped.suppressed as usize, wanted.dropped.suppressed);
+            assert_eq!(dropped.over_limit as usize, decoded.grasps.len() - sent);
+            assert_eq!(dropped.suppressed as usize, decoded.dropped.suppressed);
         }
     }
 }
 
 #[tokio::test]
-async fn an_empty_answer_is_always_explained() {
+async fn an_empty_reply_always_has_the_reasons() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let detect = DetectOptions { threshold: Some(1.0), ..DetectOptions::default() };
     let options = Options { detect, ..Options::default() };
     let detection = server.client().await.detect(&volume(), options).await.unwrap();
     assert!(detection.grasps.is_empty());
-    assert_eq!(voxels(&detection.dropped.expect("no grasp needs a reason")), RESOLUTION.pow(3));
+    assert_eq!(voxels(&detection.dropped.expect("an empty reply has the reasons")), RESOLUTION.pow(3));
 }
 
 #[tokio::test]
-async fn force_gives_the_best_grasp_alone() {
+async fn force_gives_the_single_best_grasp() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let detect = DetectOptions { threshold: Some(1.0), force: Some(0.5), ..DetectOptions::default() };
     let options = Options { detect, ..Options::default() };
@@ -112,7 +115,7 @@ async fn force_gives_the_best_grasp_alone() {
 }
 
 #[tokio::test]
-async fn what_names_a_request_comes_back() {
+async fn request_id_and_stamp_are_returned() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let client = server.client().await;
     let stamp = SystemTime::UNIX_EPOCH + Duration::new(1_700_000_000, 123_456_789);
@@ -128,7 +131,7 @@ async fn what_names_a_request_comes_back() {
 }
 
 #[tokio::test]
-async fn the_stages_of_the_latency_add_up() {
+async fn the_stages_of_the_latency_are_within_the_total() {
     let server = Server::run(&[TestModel::new("mirror").convolutions(2)], &[]);
     let latency = server.client().await.detect(&volume(), Options::default()).await.unwrap().latency;
     let stages = [latency.queue, latency.preprocessing, latency.inference, latency.postprocessing];
@@ -137,11 +140,11 @@ async fn the_stages_of_the_latency_add_up() {
 }
 
 #[tokio::test]
-async fn a_stream_answers_in_order_and_survives_bad_volumes() {
+async fn stream_replies_are_in_order_and_errors_do_not_end_the_stream() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let requests: Vec<_> = (0..50)
         .map(|index| {
-            let model = if index % 5 == 3 { "nobody" } else { "" }.to_owned();
+            let model = if index % 5 == 3 { "unknown" } else { "" }.to_owned();
             let detect = DetectOptions { model, ..DetectOptions::default() };
             (volume(), Options { request_id: format!("volume {index}"), detect, ..Options::default() })
         })
@@ -164,7 +167,7 @@ async fn a_stream_answers_in_order_and_survives_bad_volumes() {
 }
 
 #[tokio::test]
-async fn the_model_is_the_one_asked_for_or_the_first_that_fits() {
+async fn the_model_is_the_requested_one_or_the_first_of_the_resolution() {
     let models = [
         TestModel::new("large").resolution(24),
         TestModel::new("mirror").version("1.9"),
@@ -178,7 +181,7 @@ async fn the_model_is_the_one_asked_for_or_the_first_that_fits() {
     assert_eq!(listed, ["small 1", "large 1", "mirror 1.10", "mirror 1.9", "shaf 1"]);
 
     let large = blobs(24, Isometry3::identity(), &CENTRES);
-    for (volume, model, version, wanted) in [
+    for (volume, model, version, selected) in [
         (&volume(), "", "", "small 1"),
         (&large, "", "", "large 1"),
         (&volume(), "mirror", "", "mirror 1.10"),
@@ -187,13 +190,13 @@ async fn the_model_is_the_one_asked_for_or_the_first_that_fits() {
         let detect = DetectOptions { model: model.to_owned(), version: version.to_owned(), ..DetectOptions::default() };
         let options = Options { detect, ..Options::default() };
         let detection = client.detect(volume, options).await.unwrap();
-        assert_eq!(format!("{} {}", detection.model, detection.version), wanted);
+        assert_eq!(format!("{} {}", detection.model, detection.version), selected);
     }
 }
 
 #[tokio::test]
-async fn a_reply_larger_than_http2s_windows_comes_whole() {
-    // One grasp for each 8th voxel of an edge: some 4000 of them, 400 kB.
+async fn a_reply_larger_than_the_http2_windows_is_complete() {
+    // A block at every sixth voxel of each edge: 1,000 grasps, so that the reply exceeds a window of 64 KiB.
     let resolution = 64;
     let server = Server::run(&[TestModel::new("mirror").resolution(resolution)], &[]);
     let centres: Vec<_> = (3..61)
@@ -201,8 +204,8 @@ async fn a_reply_larger_than_http2s_windows_comes_whole() {
         .flat_map(|x| (3..61).step_by(6).flat_map(move |y| (3..61).step_by(6).map(move |z| [x, y, z])))
         .collect();
     let volume = blobs(resolution, Isometry3::identity(), &centres);
-    let wanted = expected(&volume, &DecodeParams::default());
-    assert!(wanted.grasps.len() * 80 > 65_536, "{} grasps", wanted.grasps.len());
+    let decoded = expected(&volume, &DecodeParams::default());
+    assert!(decoded.grasps.len() * 80 > 65_536, "{} grasps", decoded.grasps.len());
     let detection = server.client().await.detect(&volume, Options::default()).await.unwrap();
-    assert_same(&detection.grasps, &wanted.grasps);
+    assert_same(&detection.grasps, &decoded.grasps);
 }

@@ -1,4 +1,4 @@
-//! How the server ends.
+//! Shutdown of the server, and errors at its start.
 
 use std::process::Command;
 
@@ -20,19 +20,19 @@ fn slow() -> TestModel {
 }
 
 #[tokio::test]
-async fn an_idle_server_exits_with_0() {
+async fn an_idle_server_exits_with_code_0() {
     for workers in ["1", "3"] {
         let server = Server::run(&[TestModel::new("mirror")], &["--workers", workers]);
         let client = server.client().await;
         client.detect(&volume(), Options::default()).await.unwrap();
-        // The connection is still open.
+        // The client's connection is still open.
         assert_eq!(stop(server).await, Some(0));
         assert!(client.detect(&volume(), Options::default()).await.is_err());
     }
 }
 
 #[tokio::test]
-async fn what_was_taken_is_answered() {
+async fn accepted_requests_are_answered_before_the_exit() {
     let mut server = Server::run(&[slow()], &["--queue", "8"]);
     let client = server.client().await;
     let mut calls = JoinSet::new();
@@ -45,20 +45,20 @@ async fn what_was_taken_is_answered() {
     for outcome in calls.join_all().await {
         assert_eq!(outcome.unwrap().grasps.len(), 1);
     }
-    assert!(Client::connect(server.grpc().to_string()).await.is_err(), "nothing more is taken");
+    assert!(Client::connect(server.grpc().to_string()).await.is_err(), "new connections are refused");
     assert_eq!(server.wait().unwrap().code(), Some(0));
 }
 
 #[tokio::test]
-async fn a_stream_is_answered_as_far_as_it_was_read_and_ended() {
+async fn an_open_stream_is_ended_with_unavailable() {
     let mut server = Server::run(&[TestModel::new("mirror")], &[]);
     let (send, requests) = mpsc::channel(1);
     send.send((volume(), Options::default())).await.unwrap();
     let mut replies = server.client().await.detect_stream(ReceiverStream::new(requests)).await.unwrap();
     assert_eq!(replies.next().await.unwrap().unwrap().grasps.len(), 1);
     server.terminate().unwrap();
-    // The client would go on sending; it is the server that ends the stream, and says so.
-    let ended = replies.next().await.expect("why the stream ends").unwrap_err();
+    // The client keeps its side open; the server ends the stream with an error.
+    let ended = replies.next().await.expect("the error that ends the stream").unwrap_err();
     assert_eq!(ended.code(), Some(tonic::Code::Unavailable), "{ended}");
     assert!(replies.next().await.is_none());
     assert_eq!(server.wait().unwrap().code(), Some(0));
@@ -66,7 +66,7 @@ async fn a_stream_is_answered_as_far_as_it_was_read_and_ended() {
 }
 
 #[tokio::test]
-async fn after_the_drain_timeout_callers_are_told_and_the_exit_is_still_0() {
+async fn after_the_drain_timeout_requests_are_refused_and_the_exit_code_is_0() {
     let mut server = Server::run(&[slow()], &["--queue", "8", "--drain-timeout", "0"]);
     let client = server.client().await;
     let mut calls = JoinSet::new();
@@ -77,19 +77,19 @@ async fn after_the_drain_timeout_callers_are_told_and_the_exit_is_still_0() {
     server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 3.0).await;
     server.terminate().unwrap();
     for outcome in calls.join_all().await {
-        outcome.expect_err("there was no time to answer");
+        outcome.expect_err("the drain timeout is 0");
     }
     assert_eq!(server.wait().unwrap().code(), Some(0));
 }
 
 #[tokio::test]
-async fn a_server_that_is_still_warming_up_exits_with_0() {
+async fn a_server_that_is_warming_up_exits_with_code_0() {
     let server = Server::start(&[slow()], &[]);
     assert_eq!(stop(server).await, Some(0));
 }
 
 #[test]
-fn every_mistake_in_the_configuration_is_reported_in_one_run() {
+fn all_configuration_errors_are_reported_in_one_run() {
     let output = Command::new(graspd())
         .args(["--listen", "nowhere", "--workers", "0", "--drain-timeout", "-1", "--models", "/no/such/folder"])
         .env("GRASPD_QUEUE", "many")
@@ -98,7 +98,7 @@ fn every_mistake_in_the_configuration_is_reported_in_one_run() {
         .unwrap();
     assert_eq!(output.status.code(), Some(2));
     let text = String::from_utf8(output.stderr).unwrap();
-    for mistake in [
+    for error in [
         "--listen (GRASPD_LISTEN) is `nowhere`",
         "--workers (GRASPD_WORKERS) is `0`",
         "--drain-timeout (GRASPD_DRAIN_TIMEOUT) is `-1`",
@@ -106,13 +106,13 @@ fn every_mistake_in_the_configuration_is_reported_in_one_run() {
         "--queue (GRASPD_QUEUE) is `many`",
         "--log (GRASPD_LOG) is `a=b=c`",
     ] {
-        assert!(text.contains(mistake), "`{mistake}` is not in:\n{text}");
+        assert!(text.contains(error), "`{error}` is missing from:\n{text}");
     }
-    assert!(output.stdout.is_empty(), "nothing was bound");
+    assert!(output.stdout.is_empty(), "no address is bound");
 }
 
 #[test]
-fn a_client_that_starts_a_server_is_told_when_it_ends() {
+fn a_local_server_that_exits_is_an_error() {
     let error = LocalServer::spawn(graspd(), ["--models", "/no/such/folder"]).unwrap_err();
     assert!(matches!(error, LocalServerError::Ended(status) if status.code() == Some(2)), "{error}");
     let error = LocalServer::spawn("/no/such/graspd".as_ref(), [""; 0]).unwrap_err();
@@ -120,7 +120,7 @@ fn a_client_that_starts_a_server_is_told_when_it_ends() {
 }
 
 #[test]
-fn an_address_that_is_taken_is_named() {
+fn an_address_in_use_is_named() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let taken = server.grpc().to_string();
     let output = Command::new(graspd())

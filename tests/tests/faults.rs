@@ -1,4 +1,4 @@
-//! What goes wrong around a server, and inside it.
+//! Faults outside and inside the server: failed batches, blocked logs, stalled clients and idle connections.
 
 use std::fs;
 use std::process::Command;
@@ -25,7 +25,7 @@ fn volume() -> Volume {
     blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]])
 }
 
-/// The same, but for a voxel that was not observed.
+/// The same volume with one unobserved voxel.
 fn volume_with_a_zero() -> Volume {
     let mut values = volume().values().to_vec();
     values[0] = 0.0;
@@ -33,7 +33,7 @@ fn volume_with_a_zero() -> Volume {
 }
 
 #[tokio::test]
-async fn when_a_batch_fails_only_its_requests_do_and_they_say_which_they_were() {
+async fn a_failed_batch_fails_only_its_requests_and_names_them() {
     let model = TestModel::new("fragile").convolutions(60).fails_at_zero();
     let server = Server::run(&[model], &["--queue", "8", "--max-batch", "4"]);
     let client = server.client().await;
@@ -43,7 +43,7 @@ async fn when_a_batch_fails_only_its_requests_do_and_they_say_which_they_were() 
     };
     let running = tokio::spawn(detect("alone", volume()));
     server.wait_for("graspd_batch_size_count{model=\"fragile 1\"}", 1.0).await;
-    // These wait together, hence they run together.
+    // These four are queued at the same time, so that they form one batch.
     let mut batch = JoinSet::new();
     for id in ["a", "b", "c"] {
         batch.spawn(detect(id, volume()));
@@ -58,19 +58,19 @@ async fn when_a_batch_fails_only_its_requests_do_and_they_say_which_they_were() 
         let Err(Error::Refused { code: Code::Internal, message, .. }) = outcome else { panic!("{outcome:?}") };
         assert!(["a", "b", "c", "bad"].iter().any(|id| message.ends_with(&format!("(request {id})"))), "{message}");
     }
-    // The session lives on.
+    // The session is still usable.
     assert_eq!(detect("next", volume()).await.unwrap().grasps.len(), 1);
     assert_eq!(server.metric("graspd_requests_total{code=\"INTERNAL\",model=\"fragile 1\"}"), 4.0);
     assert_eq!(server.metric("graspd_requests_total{code=\"OK\",model=\"fragile 1\"}"), 2.0);
 }
 
-/// A graspd that logs all there is to log, to wherever the shell puts it.
+/// A graspd with log level `trace` and this redirection of stderr.
 fn log_to(redirection: &str) -> (LocalServer, TempDir) {
     let folder = tempfile::tempdir().unwrap();
     TestModel::new("mirror").write(folder.path());
     let models = folder.path().to_str().unwrap();
-    // Another process makes the script executable: had this one written it, a child that another test forks meanwhile
-    // would hold it open for writing, and it could not be run.
+    // `install` writes the executable script. If this process wrote it, a child that another test forks meanwhile could
+    // inherit the open file, and running the script would fail with ETXTBSY.
     let (draft, script) = (folder.path().join("draft"), folder.path().join("graspd-with-a-log"));
     fs::write(&draft, format!("#!/bin/sh\nexec {} \"$@\" {redirection}\n", graspd().display())).unwrap();
     assert!(Command::new("install").arg("-m755").args([&draft, &script]).status().unwrap().success());
@@ -79,8 +79,8 @@ fn log_to(redirection: &str) -> (LocalServer, TempDir) {
 }
 
 #[tokio::test]
-async fn a_log_that_cannot_be_written_stops_nothing() {
-    // A disk that is always full.
+async fn requests_succeed_when_the_log_cannot_be_written() {
+    // Every write to /dev/full fails, as on a full disk.
     let (mut server, _folder) = log_to("2> /dev/full");
     let client = Client::connect(server.grpc().to_string()).await.unwrap();
     for _ in 0..100 {
@@ -91,25 +91,25 @@ async fn a_log_that_cannot_be_written_stops_nothing() {
 }
 
 #[tokio::test]
-async fn a_log_that_nobody_reads_holds_up_nobody_and_what_it_loses_is_counted() {
+async fn requests_succeed_when_the_log_blocks_and_dropped_lines_are_counted() {
     let pipes = tempfile::tempdir().unwrap();
     let pipe = pipes.path().join("pipe");
     assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
-    // Opened for reading, too, lest the shell wait for a reader.
+    // `<>` also opens the pipe for reading, so that the shell does not block until there is a reader.
     let (mut server, _folder) = log_to(&format!("2<> {}", pipe.display()));
     let client = Client::connect(server.grpc().to_string()).await.unwrap();
     let mut calls = 0;
     while metric(server.http(), "graspd_log_lines_dropped_total") == 0.0 {
         assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 1);
         calls += 1;
-        assert!(calls < 10_000, "the pipe never filled");
+        assert!(calls < 10_000, "the pipe is not full after {calls} requests");
     }
     server.terminate().unwrap();
     assert_eq!(server.wait().unwrap().code(), Some(0));
 }
 
 #[tokio::test]
-async fn a_client_that_does_not_read_holds_up_nobody_and_loses_nothing() {
+async fn a_client_that_does_not_read_blocks_no_others_and_loses_no_replies() {
     const CALLS: usize = 3000;
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let endpoint = tonic::transport::Channel::from_shared(format!("http://{}", server.grpc())).unwrap();
@@ -126,15 +126,15 @@ async fn a_client_that_does_not_read_holds_up_nobody_and_loses_nothing() {
         }
     });
 
-    // Somebody else is answered meanwhile, more often than the slow one could have been if it were all read ahead.
+    // Requests of another client are answered meanwhile, long enough for all of the stream to be read ahead.
     let client = server.client().await;
     for _ in 0..200 {
         assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 1);
     }
     let answered = server.metric("graspd_requests_total{code=\"OK\",model=\"mirror 1\"}");
-    assert!(answered < 200.0 + CALLS as f64, "the server reads no further ahead than it can answer");
+    assert!(answered < 200.0 + CALLS as f64, "the server read a whole stream although its client reads no replies");
 
-    // It comes back to its senses, and finds every answer in its order.
+    // The slow client now reads: all replies are there, in order.
     for number in 0..CALLS {
         let reply = replies.next().await.unwrap().unwrap();
         assert_eq!(reply.request_id, number.to_string());
@@ -144,7 +144,7 @@ async fn a_client_that_does_not_read_holds_up_nobody_and_loses_nothing() {
 }
 
 #[tokio::test]
-async fn half_a_message_is_waited_for_no_longer_than_it_may_stand_still() {
+async fn incomplete_messages_are_refused_after_the_stall_timeout() {
     let mut server = Server::run(&[TestModel::new("mirror")], &["--stall-timeout", "0.3"]);
     let message = pb::DetectGraspsRequest { volume: Some(encode(&volume(), DataType::F32, "")), ..Default::default() };
     let mut bytes = vec![0];
@@ -152,7 +152,7 @@ async fn half_a_message_is_waited_for_no_longer_than_it_may_stand_still() {
     bytes.extend(message.encode_to_vec());
     let mut h2 = connect(&server).await;
 
-    // A slow one is heard out, for it never stands still for long.
+    // A slow message is accepted if no pause exceeds the stall timeout.
     let pieces: Vec<&[u8]> = bytes.chunks(bytes.len() / 4 + 1).collect();
     let status = call("1M", &mut h2, "DetectGrasps", &pieces, Duration::from_millis(100), true).await;
     assert_eq!(status, (Code::Ok, String::new()));
@@ -168,20 +168,20 @@ async fn half_a_message_is_waited_for_no_longer_than_it_may_stand_still() {
     }
     assert_eq!(server.metric("graspd_requests_total{code=\"DEADLINE_EXCEEDED\",model=\"\"}"), 5.0);
 
-    // Messages of a stream may be cut anywhere: each has its own time.
+    // Pieces of a stream need not end at message boundaries: the timeout applies to each message.
     let many = bytes.repeat(12);
     let (first, rest) = many.split_at(bytes.len() + 3);
     let pieces: Vec<&[u8]> = std::iter::once(first).chain(rest.chunks(bytes.len())).collect();
     let status = call("1M", &mut h2, "DetectGraspsStream", &pieces, Duration::from_millis(100), true).await;
     assert_eq!(status, (Code::Ok, String::new()));
 
-    // Fed a byte at a time it never stands still, and is refused all the same.
+    // One byte at a time: no pause exceeds the stall timeout, but the rate is below the minimum.
     let single: Vec<&[u8]> = bytes.chunks(1).collect();
     let (code, message) = call("1M", &mut h2, "DetectGrasps", &single, Duration::from_millis(10), true).await;
     assert_eq!(code, Code::DeadlineExceeded);
     assert!(message.starts_with("the message is slower than 65536 bytes per second, "), "{message}");
 
-    // Nor does it hold up the end.
+    // An incomplete message does not delay the shutdown.
     let stuck =
         tokio::spawn(
             async move { call("1M", &mut h2, "DetectGrasps", &[&bytes[..1000]], Duration::ZERO, false).await },
@@ -189,12 +189,12 @@ async fn half_a_message_is_waited_for_no_longer_than_it_may_stand_still() {
     tokio::task::yield_now().await;
     server.terminate().unwrap();
     assert_eq!(tokio::task::spawn_blocking(move || server.wait().unwrap().code()).await.unwrap(), Some(0));
-    // The connection may have been closed before the call was begun.
+    // The result is not checked: the connection may have closed before the call began.
     drop(stuck);
 }
 
 #[tokio::test]
-async fn nobody_is_waited_for_beyond_their_own_deadline() {
+async fn incomplete_messages_are_refused_at_the_deadline_of_the_request() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let mut h2 = connect(&server).await;
     for timeout in ["1u", "100m"] {
@@ -206,14 +206,14 @@ async fn nobody_is_waited_for_beyond_their_own_deadline() {
 }
 
 #[tokio::test]
-async fn who_connects_and_says_nothing_is_not_waited_for() {
+async fn connections_without_a_preface_are_closed() {
     let server = Server::run(&[TestModel::new("mirror")], &["--stall-timeout", "0.3"]);
     let mut silent =
         [TcpStream::connect(server.grpc()).await.unwrap(), TcpStream::connect(server.grpc()).await.unwrap()];
     silent[1].write_all(b"PRI * HTTP/2.0").await.unwrap();
     server.wait_for("graspd_connections", 2.0).await;
     server.wait_for("graspd_connections", 0.0).await;
-    // Who has greeted may rest.
+    // After the preface a connection may stay idle.
     let client = server.client().await;
     client.detect(&volume(), Options::default()).await.unwrap();
     tokio::time::sleep(Duration::from_millis(600)).await;
@@ -222,10 +222,10 @@ async fn who_connects_and_says_nothing_is_not_waited_for() {
 }
 
 #[tokio::test]
-async fn what_is_no_message_is_the_callers_fault_and_counted() {
+async fn malformed_messages_are_invalid_arguments_and_counted() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let mut h2 = connect(&server).await;
-    // The fifth field of wire type 7, which there is none of.
+    // Field 5 with wire type 7, which does not exist.
     let (code, message) = call("1M", &mut h2, "DetectGrasps", &[&[0, 0, 0, 0, 1, 0x2f]], Duration::ZERO, true).await;
     assert_eq!(code, Code::InvalidArgument, "{message}");
     assert_eq!(server.metric("graspd_requests_total{code=\"INVALID_ARGUMENT\",model=\"\"}"), 1.0);
@@ -236,7 +236,7 @@ async fn what_is_no_message_is_the_callers_fault_and_counted() {
 }
 
 #[tokio::test]
-async fn connections_beyond_the_most_are_closed_and_those_below_are_not() {
+async fn connections_above_the_limit_are_closed_and_others_stay() {
     let server = Server::run(&[TestModel::new("mirror")], &["--max-connections", "2"]);
     let clients = [server.client().await, server.client().await];
     for client in &clients {
@@ -258,7 +258,7 @@ async fn connections_beyond_the_most_are_closed_and_those_below_are_not() {
 
 #[tokio::test]
 #[ignore = "opens as many files: make test-faults"]
-async fn ten_thousand_idle_connections_cost_little_and_hold_up_nobody() {
+async fn ten_thousand_idle_connections_use_little_memory_and_delay_no_requests() {
     const CONNECTIONS: usize = 10_000;
     let server = Server::run(&[TestModel::new("mirror")], &["--log", "warn"]);
     let client = server.client().await;
@@ -287,8 +287,8 @@ async fn connect(server: &Server) -> SendRequest<Bytes> {
     h2
 }
 
-/// Calls a method with these bytes, piece by piece, as one who waits so long, as `grpc-timeout` has it; the status and its
-/// message.
+/// Calls a method with these bytes, piece by piece, with a pause after each. `timeout` is the value of `grpc-timeout`.
+/// Returns the code and the message of the status.
 async fn call(
     timeout: &str,
     h2: &mut SendRequest<Bytes>,
@@ -302,7 +302,7 @@ async fn call(
     let request = request.header("grpc-timeout", timeout).body(()).unwrap();
     let (response, mut body) = h2.clone().ready().await.unwrap().send_request(request, false).unwrap();
     for (index, piece) in pieces.iter().enumerate() {
-        // The server may have ended it.
+        // The server may have ended the call.
         if body.send_data(Bytes::copy_from_slice(piece), ends && index + 1 == pieces.len()).is_err() {
             break;
         }

@@ -1,4 +1,4 @@
-//! What the server says of itself, at each point of its life.
+//! Health and readiness during warm-up, service and drain.
 
 use std::time::Duration;
 
@@ -15,17 +15,17 @@ use tonic_health::pb::health_client::HealthClient;
 
 const SERVICE: &str = "grasp.v1.GraspService";
 
-fn ask(service: &str) -> HealthCheckRequest {
+fn request(service: &str) -> HealthCheckRequest {
     HealthCheckRequest { service: service.to_owned() }
 }
 
 async fn check(client: &mut HealthClient<Channel>, service: &str) -> ServingStatus {
-    client.check(ask(service)).await.unwrap().into_inner().status()
+    client.check(request(service)).await.unwrap().into_inner().status()
 }
 
 #[tokio::test]
-async fn it_serves_after_the_warm_up_and_not_before() {
-    // The warm-up is an inference of the slow model; the questions before it ends take a hundredth of that.
+async fn the_server_is_ready_after_the_warm_up_and_not_before() {
+    // The warm-up is an inference of the slow model; the checks before its end take a hundredth of that time.
     let mut server = Server::start(&[TestModel::new("slow").convolutions(600)], &[]);
     let mut health = HealthClient::new(server.channel().await);
     let client = server.client().await;
@@ -35,7 +35,7 @@ async fn it_serves_after_the_warm_up_and_not_before() {
     assert_eq!(check(&mut health, SERVICE).await, ServingStatus::NotServing);
     assert_eq!(client.health().await.unwrap(), Health::NotServing);
     assert_eq!(server.get("/readyz"), (503, "warming up\n".to_owned()));
-    assert_eq!(server.get("/healthz"), (200, "ok\n".to_owned()), "alive, if not ready");
+    assert_eq!(server.get("/healthz"), (200, "ok\n".to_owned()), "live, but not ready");
     let error = client.detect(&volume, Options::default()).await.unwrap_err();
     assert_eq!(error.code(), Some(Code::Unavailable), "{error}");
     assert!(error.to_string().contains("warming up"), "{error}");
@@ -53,11 +53,11 @@ async fn it_serves_after_the_warm_up_and_not_before() {
 }
 
 #[tokio::test]
-async fn watchers_are_told_of_the_drain_and_do_not_hold_it_up() {
+async fn health_watches_report_the_drain_and_do_not_delay_it() {
     let mut server = Server::run(&[TestModel::new("mirror")], &[]);
     let mut health = HealthClient::new(server.channel().await);
-    let mut all = health.watch(ask("")).await.unwrap().into_inner();
-    let mut one = health.watch(ask(SERVICE)).await.unwrap().into_inner();
+    let mut all = health.watch(request("")).await.unwrap().into_inner();
+    let mut one = health.watch(request(SERVICE)).await.unwrap().into_inner();
     for watch in [&mut all, &mut one] {
         assert_eq!(watch.next().await.unwrap().unwrap().status(), ServingStatus::Serving);
     }
@@ -70,16 +70,16 @@ async fn watchers_are_told_of_the_drain_and_do_not_hold_it_up() {
 }
 
 #[tokio::test]
-async fn a_service_that_there_is_not_is_unknown() {
+async fn the_health_of_an_unknown_service_is_not_found() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let mut health = HealthClient::new(server.channel().await);
-    assert_eq!(health.check(ask("grasp.v2")).await.unwrap_err().code(), Code::NotFound);
-    let mut watch = health.watch(ask("grasp.v2")).await.unwrap().into_inner();
+    assert_eq!(health.check(request("grasp.v2")).await.unwrap_err().code(), Code::NotFound);
+    let mut watch = health.watch(request("grasp.v2")).await.unwrap().into_inner();
     assert_eq!(watch.next().await.unwrap().unwrap().status(), ServingStatus::ServiceUnknown);
 }
 
 #[tokio::test]
-async fn while_it_drains_it_says_so() {
+async fn the_server_is_not_ready_during_the_drain() {
     let mut server = Server::run(&[TestModel::new("slow").convolutions(200)], &[]);
     let client = server.client().await;
     let mut calls = JoinSet::new();
@@ -88,7 +88,7 @@ async fn while_it_drains_it_says_so() {
         let volume = blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]]);
         calls.spawn(async move { client.detect(&volume, Options::default()).await });
     }
-    let mut watch = HealthClient::new(server.channel().await).watch(ask("")).await.unwrap().into_inner();
+    let mut watch = HealthClient::new(server.channel().await).watch(request("")).await.unwrap().into_inner();
     assert_eq!(watch.next().await.unwrap().unwrap().status(), ServingStatus::Serving);
     server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 1.0).await;
     server.terminate().unwrap();

@@ -1,4 +1,4 @@
-//! The limits, at their exact boundaries.
+//! Size limits, at the exact boundaries.
 
 use grasp_proto::{encode, pb};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
@@ -13,7 +13,7 @@ fn request(padding: usize) -> pb::DetectGraspsRequest {
 }
 
 #[tokio::test]
-async fn a_message_of_the_limit_is_taken_and_one_byte_more_is_not() {
+async fn a_message_at_the_limit_is_accepted_and_a_larger_one_is_refused() {
     let limit = request(10).encoded_len();
     assert_eq!(request(11).encoded_len(), limit + 1);
     let server = Server::run(&[TestModel::new("mirror")], &["--max-message-bytes", &limit.to_string()]);
@@ -29,7 +29,7 @@ async fn a_message_of_the_limit_is_taken_and_one_byte_more_is_not() {
 }
 
 #[tokio::test]
-async fn a_stream_ends_at_a_message_over_the_limit_and_the_connection_goes_on() {
+async fn a_message_over_the_limit_ends_the_stream_but_not_the_connection() {
     let limit = request(10).encoded_len();
     let server = Server::run(&[TestModel::new("mirror")], &["--max-message-bytes", &limit.to_string()]);
     let mut client = server.raw().await;
@@ -43,7 +43,7 @@ async fn a_stream_ends_at_a_message_over_the_limit_and_the_connection_goes_on() 
 }
 
 #[tokio::test]
-async fn a_volume_larger_than_http2s_windows_is_taken() {
+async fn a_volume_larger_than_the_http2_windows_is_accepted() {
     let resolution = 128;
     let server = Server::run(&[TestModel::new("mirror").resolution(resolution)], &[]);
     let volume = encode(&blobs(resolution, Isometry3::identity(), &[[50, 60, 70]]), pb::DataType::F32, "");
@@ -54,7 +54,7 @@ async fn a_volume_larger_than_http2s_windows_is_taken() {
 }
 
 #[tokio::test]
-async fn ids_are_taken_up_to_their_limit() {
+async fn request_ids_are_accepted_up_to_the_limit() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let mut client = server.raw().await;
     assert_eq!(client.detect_grasps(request(256)).await.unwrap().into_inner().request_id.len(), 256);

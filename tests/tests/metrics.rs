@@ -1,4 +1,4 @@
-//! What Prometheus reads.
+//! The metrics for Prometheus.
 
 use grasp_client::Options;
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
@@ -7,7 +7,7 @@ use nalgebra::Isometry3;
 const STAGES: [&str; 5] = ["queue", "preprocessing", "inference", "postprocessing", "total"];
 
 #[tokio::test]
-async fn every_answer_is_in_every_stages_histogram() {
+async fn every_reply_is_counted_in_the_histogram_of_every_stage() {
     let server = Server::run(&[TestModel::new("mirror"), TestModel::new("other")], &[]);
     let client = server.client().await;
     let volume = blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5], [11, 11, 11]]);
@@ -22,11 +22,11 @@ async fn every_answer_is_in_every_stages_histogram() {
         assert_eq!(server.metric(&series("bucket", ",le=\"+Inf\"")), 7.0, "{stage}");
     }
     let sum = server.metric("graspd_stage_duration_seconds_sum{model=\"mirror 1\",stage=\"total\"}");
-    assert!((sum - seconds).abs() < 1e-9, "the histogram's {sum} s are the replies' {seconds} s");
+    assert!((sum - seconds).abs() < 1e-9, "{sum} s in the histogram, {seconds} s in the replies");
     assert_eq!(server.metric("graspd_requests_total{code=\"OK\",model=\"mirror 1\"}"), 7.0);
     assert_eq!(server.metric("graspd_grasps_total{model=\"mirror 1\"}"), 14.0);
     let other = server.metric("graspd_stage_duration_seconds_count{model=\"other 1\",stage=\"total\"}");
-    assert_eq!(other, 0.0, "the other model answered nothing");
+    assert_eq!(other, 0.0, "the other model has no requests");
 }
 
 #[tokio::test]
@@ -43,7 +43,7 @@ async fn the_buckets_are_dense_from_50_microseconds_to_10_seconds() {
 }
 
 #[tokio::test]
-async fn prometheus_can_read_it() {
+async fn metrics_are_in_the_format_of_prometheus() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let (status, text) = server.get("/metrics");
     assert_eq!(status, 200);

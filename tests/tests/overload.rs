@@ -1,4 +1,4 @@
-//! More requests than can be answered.
+//! More requests than the server can answer.
 
 use std::time::Duration;
 
@@ -21,7 +21,7 @@ fn slow() -> TestModel {
 }
 
 #[tokio::test]
-async fn what_does_not_fit_the_queue_is_refused_at_once_and_the_rest_is_answered() {
+async fn requests_beyond_the_queue_are_refused_at_once_and_the_others_answered() {
     let server = Server::run(&[slow()], &["--queue", "2"]);
     let client = server.client().await;
     let mut calls = JoinSet::new();
@@ -40,24 +40,24 @@ async fn what_does_not_fit_the_queue_is_refused_at_once_and_the_rest_is_answered
             Err(Error::Refused { code, message, retry_after, .. }) => {
                 assert_eq!(*code, Code::ResourceExhausted, "{message}");
                 assert!(message.starts_with("the queue of the model `slow` is full (2 requests)"), "{message}");
-                assert!(!retry_after.expect("a hint").is_zero());
+                assert!(!retry_after.expect("a retry delay").is_zero());
             }
             Err(error) => panic!("{error}"),
         }
     }
     let refused = outcomes.iter().filter(|outcome| outcome.is_err()).count();
     assert!(refused > 0 && refused < 40, "{refused} of 40 refused");
-    assert!(outcomes[0].is_err(), "a refusal is told before the first answer is there");
+    assert!(outcomes[0].is_err(), "the first refusal is sent before the first result");
     assert_eq!(server.metric("graspd_requests_total{code=\"RESOURCE_EXHAUSTED\",model=\"slow 1\"}"), refused as f64);
     assert_eq!(server.metric("graspd_requests_total{code=\"OK\",model=\"slow 1\"}"), (40 - refused) as f64);
     assert_eq!(server.metric("graspd_queue_requests{model=\"slow 1\"}"), 0.0);
 }
 
 #[tokio::test]
-async fn images_that_are_fused_more_slowly_than_they_come_are_refused_at_once() {
+async fn images_beyond_the_capacity_of_the_fusion_are_refused_at_once() {
     let server = Server::run(&[TestModel::new("mirror")], &["--queue", "1"]);
     let client = server.client().await;
-    // Fusing takes milliseconds, the network microseconds: its queue is never full.
+    // Fusion takes milliseconds and the network microseconds, so that the queue of the network is never full.
     let views: Vec<_> = (0..24).map(|index| view(&camera(40.0, 15.0 * f64::from(index)))).collect();
     let mut calls = JoinSet::new();
     for _ in 0..40 {
@@ -76,10 +76,10 @@ async fn images_that_are_fused_more_slowly_than_they_come_are_refused_at_once() 
 }
 
 #[tokio::test]
-async fn the_hint_when_to_come_back_counts_all_the_work_on_an_answer() {
+async fn the_retry_delay_includes_postprocessing() {
     let server = Server::run(&[TestModel::new("mirror").resolution(96)], &["--queue", "1"]);
     let client = server.client().await;
-    // Far more work for the decoding than for the network.
+    // Decoding takes far longer than the network.
     let centres: Vec<[usize; 3]> = (0..343).map(|i| [i / 49, i / 7 % 7, i % 7].map(|c| 12 + 12 * c)).collect();
     let volume = blobs(96, Isometry3::identity(), &centres);
     let flag = CollisionCheck { mode: collision_check::Mode::Flag.into(), table_height: None };
@@ -95,14 +95,14 @@ async fn the_hint_when_to_come_back_counts_all_the_work_on_an_answer() {
         Err(Error::Refused { retry_after, .. }) => retry_after,
         _ => None,
     });
-    let hint = hints.min().expect("one of eight is refused, where one is answered and two wait").as_secs_f64();
+    let hint = hints.min().expect("at least one of eight requests is refused: one runs and two wait").as_secs_f64();
     let latency = first.latency;
     assert!(latency.postprocessing > latency.inference, "{latency:?}");
     assert!(hint > latency.inference + 0.3 * latency.postprocessing, "{hint} s after {latency:?}");
 }
 
 #[tokio::test]
-async fn a_stream_alone_is_never_refused() {
+async fn a_single_stream_is_never_refused() {
     let server = Server::run(&[TestModel::new("mirror").convolutions(2)], &["--queue", "1"]);
     let volumes = tokio_stream::iter((0..100).map(|_| (volume(), Options::default())));
     let mut replies = server.client().await.detect_stream(volumes).await.unwrap();
@@ -115,7 +115,7 @@ async fn a_stream_alone_is_never_refused() {
 }
 
 #[tokio::test]
-async fn callers_that_have_gone_are_skipped_and_counted() {
+async fn cancelled_requests_are_skipped_and_counted() {
     let server = Server::run(&[slow()], &["--queue", "17"]);
     let client = server.client().await;
     let mut calls = JoinSet::new();
@@ -126,13 +126,13 @@ async fn callers_that_have_gone_are_skipped_and_counted() {
     server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 16.0).await;
     calls.shutdown().await;
     server.wait_for("graspd_requests_total{code=\"CANCELLED\",model=\"slow 1\"}", 17.0).await;
-    // The one that follows waits for the one that runs, and for none of the sixteen that were queued.
+    // The next request waits for the running one, and not for the sixteen that were queued.
     let detection = client.detect(&volume(), Options::default()).await.unwrap();
     assert!(detection.latency.queue < 8.0 * detection.latency.inference, "{:?}", detection.latency);
 }
 
 #[tokio::test]
-async fn every_worker_has_its_own_session() {
+async fn every_worker_runs_its_own_session() {
     let server = Server::run(&[slow()], &["--queue", "8", "--workers", "2"]);
     let client = server.client().await;
     let mut calls = JoinSet::new();
@@ -151,7 +151,7 @@ async fn every_worker_has_its_own_session() {
 async fn a_request_whose_deadline_passes_is_dropped_from_the_queue() {
     let server = Server::run(&[slow()], &["--queue", "8"]);
     let client = server.client().await;
-    // So many that it would wait for far longer than it may.
+    // With these ahead, the wait is far longer than the timeout below.
     let mut ahead = JoinSet::new();
     for _ in 0..8 {
         let client = client.clone();
@@ -160,7 +160,7 @@ async fn a_request_whose_deadline_passes_is_dropped_from_the_queue() {
     server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 7.0).await;
     let volume = grasp_proto::encode(&volume(), grasp_client::DataType::F32, "");
     let mut request = tonic::Request::new(DetectGraspsRequest { volume: Some(volume), ..Default::default() });
-    // Not so early that it is not even sent.
+    // Long enough for the request to be sent.
     request.set_timeout(Duration::from_millis(50));
     let status = server.raw().await.detect_grasps(request).await.unwrap_err();
     assert!(matches!(status.code(), Code::Cancelled | Code::DeadlineExceeded), "{status}");
@@ -172,7 +172,7 @@ async fn a_request_whose_deadline_passes_is_dropped_from_the_queue() {
 }
 
 #[tokio::test]
-async fn what_waits_is_taken_as_a_batch_and_each_gets_its_own_answer() {
+async fn queued_requests_form_a_batch_and_each_gets_its_own_grasps() {
     let server = Server::run(&[slow()], &["--queue", "8", "--max-batch", "3"]);
     let client = server.client().await;
     let mut calls = JoinSet::new();
@@ -190,6 +190,6 @@ async fn what_waits_is_taken_as_a_batch_and_each_gets_its_own_answer() {
     let sum = server.metric("graspd_batch_size_sum{model=\"slow 1\"}");
     let batches = server.metric("graspd_batch_size_count{model=\"slow 1\"}");
     assert_eq!(sum, 7.0);
-    // The first is taken alone, unless others came as fast; then three at a time.
+    // The first request usually runs alone; then three at a time.
     assert!((3.0..7.0).contains(&batches), "{batches} batches");
 }

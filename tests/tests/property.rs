@@ -1,4 +1,4 @@
-//! Whatever is thrown at the server, it answers, and stays up and ready.
+//! Random requests, messages and connections: the server replies to each request, and stays up and ready.
 
 use std::cell::Cell;
 use std::io::Write;
@@ -22,7 +22,7 @@ use tonic::{Code, Request, Status};
 const VALUES: usize = RESOLUTION.pow(3);
 const VOXEL_SIZE: f64 = 0.3 / RESOLUTION as f64;
 
-/// Mostly what is right, so that requests get far, with everything that can be wrong now and then.
+/// Mostly valid requests, so that they pass the first checks, with an invalid value in some fields.
 fn request() -> impl Strategy<Value = pb::DetectGraspsRequest> {
     let model = prop_oneof![6 => Just(""), 3 => Just("mirror"), 1 => Just("vgn")];
     let version = prop_oneof![6 => Just(""), 2 => Just("1"), 1 => Just("9")];
@@ -105,7 +105,7 @@ fn pose() -> impl Strategy<Value = pb::Pose> {
         .prop_map(|(position, orientation)| pb::Pose { position, orientation })
 }
 
-/// What an answer must be, whatever was asked.
+/// Checks the properties that every reply must have.
 fn check(request: &pb::DetectGraspsRequest, response: &pb::DetectGraspsResponse) {
     let volume = request.volume.as_ref().expect("a request without a volume is refused");
     assert_eq!((&response.frame_id, response.stamp), (&volume.frame_id, volume.stamp));
@@ -119,7 +119,7 @@ fn check(request: &pb::DetectGraspsRequest, response: &pb::DetectGraspsResponse)
         let pb::Quaternion { x, y, z, w } = orientation;
         assert!((x * x + y * y + z * z + w * w - 1.0).abs() < 1e-6, "{pose:?}");
     }
-    let options = request.options.as_ref().expect("every request has them");
+    let options = request.options.as_ref().expect("every request has options");
     if options.max_grasps > 0 {
         assert!(response.grasps.len() <= options.max_grasps as usize);
     }
@@ -145,8 +145,8 @@ impl Target {
         Self { server, channel, runtime }
     }
 
-    /// A good request is answered on the connection that all of it went over.
-    fn assert_well(&self) {
+    /// A valid request is still answered on the same connection.
+    fn assert_usable(&self) {
         assert_eq!(self.server.get("/readyz"), (200, "ready\n".to_owned()));
         let volume = blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]]);
         let volume = grasp_proto::encode(&volume, pb::DataType::F32, "");
@@ -159,7 +159,7 @@ impl Target {
 }
 
 #[test]
-fn thousands_of_random_requests() {
+fn random_requests_are_answered_or_refused() {
     let target = Target::new();
     let (answered, refused) = (Cell::new(0), Cell::new(0));
     let mut runner = TestRunner::new(Config { cases: 4000, failure_persistence: None, ..Config::default() });
@@ -174,20 +174,20 @@ fn thousands_of_random_requests() {
                 refused.set(refused.get() + 1);
                 prop_assert!(matches!(status.code(), Code::InvalidArgument | Code::NotFound), "{status}");
                 let message = status.message();
-                let names_the_value = message.contains(" is ") || message.contains(" not found; available: ");
-                prop_assert!(names_the_value, "the message names the field and the value: {status}");
+                let has_the_value = message.contains(" is ") || message.contains(" not found; available: ");
+                prop_assert!(has_the_value, "the message must contain the field and the value: {status}");
             }
         }
         Ok(())
     });
     outcome.unwrap();
     let (answered, refused) = (answered.get(), refused.get());
-    assert!(answered > 500 && refused > 500, "{answered} answered, {refused} refused: the mixture is lopsided");
-    target.assert_well();
+    assert!(answered > 500 && refused > 500, "{answered} answered, {refused} refused: the requests are too uniform");
+    target.assert_usable();
 }
 
 #[test]
-fn thousands_of_messages_that_are_none() {
+fn malformed_messages_are_refused() {
     let target = Target::new();
     let message = (request(), vec((any::<prop::sample::Index>(), any::<u8>()), 1..4), any::<prop::sample::Index>());
     let damaged = message.prop_map(|(request, changes, end)| {
@@ -211,11 +211,11 @@ fn thousands_of_messages_that_are_none() {
         Ok(())
     });
     outcome.unwrap();
-    target.assert_well();
+    target.assert_usable();
 }
 
 #[test]
-fn connections_that_speak_something_else() {
+fn connections_with_another_protocol_do_no_harm() {
     let target = Target::new();
     let mut runner = TestRunner::new(Config { cases: 300, failure_persistence: None, ..Config::default() });
     let preface = Just(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".to_vec());
@@ -223,16 +223,16 @@ fn connections_that_speak_something_else() {
     let outcome = runner.run(&bytes.no_shrink(), |(preface, noise)| {
         for address in [target.server.grpc(), target.server.http()] {
             let mut stream = TcpStream::connect(address).unwrap();
-            // The server may hang up in the middle of it.
+            // The server may close the connection before all bytes are written.
             let _ = stream.write_all(&preface).and_then(|()| stream.write_all(&noise));
         }
         Ok(())
     });
     outcome.unwrap();
-    target.assert_well();
+    target.assert_usable();
 }
 
-/// Calls DetectGrasps with bytes that need not be a message.
+/// Calls DetectGrasps with bytes that may not be a valid message.
 async fn send(channel: Channel, bytes: Vec<u8>) -> Result<(), Status> {
     let mut grpc = tonic::client::Grpc::new(channel);
     grpc.ready().await.map_err(|error| Status::unavailable(error.to_string()))?;
@@ -240,7 +240,7 @@ async fn send(channel: Channel, bytes: Vec<u8>) -> Result<(), Status> {
     grpc.unary(Request::new(bytes), path, Raw).await.map(drop)
 }
 
-/// Bytes as they are.
+/// A codec that does not change the bytes.
 struct Raw;
 
 impl Codec for Raw {

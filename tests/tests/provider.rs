@@ -1,4 +1,4 @@
-//! What runs the models is what was asked for, and everybody is told.
+//! Models run on the requested provider and precision, which the list of models and the metrics report.
 
 use std::process::Command;
 
@@ -11,7 +11,7 @@ fn volume() -> Volume {
     blobs(RESOLUTION, Isometry3::identity(), &[[4, 5, 6], [11, 10, 9]])
 }
 
-/// A graspd that does not get as far as listening: its exit code, and what it says.
+/// The exit code and stderr of a graspd that must fail to start.
 fn refused(model: &TestModel, args: &[&str]) -> (Option<i32>, String) {
     let models = tempfile::tempdir().unwrap();
     model.write(models.path());
@@ -22,24 +22,24 @@ fn refused(model: &TestModel, args: &[&str]) -> (Option<i32>, String) {
 }
 
 #[tokio::test]
-async fn the_list_and_the_metric_say_what_runs() {
-    for asked in ["auto", "cpu"] {
-        let server = Server::run(&[TestModel::new("blobs")], &["--provider", asked, "--workers", "2"]);
+async fn the_list_of_models_and_the_metric_report_the_provider() {
+    for requested in ["auto", "cpu"] {
+        let server = Server::run(&[TestModel::new("blobs")], &["--provider", requested, "--workers", "2"]);
         let client = server.client().await;
         let model = client.list_models().await.unwrap().remove(0);
-        assert!(asked == "auto" || (&*model.provider, &*model.precision) == ("cpu", "fp32"), "{model:?}");
+        assert!(requested == "auto" || (&*model.provider, &*model.precision) == ("cpu", "fp32"), "{model:?}");
         let (provider, precision, sha256) = (&model.provider, &model.precision, &model.sha256);
         let labels = format!(r#"model="blobs 1",precision="{precision}",provider="{provider}",sha256="{sha256}""#);
         assert_eq!(server.metric(&format!("graspd_model_info{{{labels}}}")), 1.0);
         let detection = client.detect(&volume(), Options::default()).await.unwrap();
-        assert_eq!(detection.grasps.len(), 2, "{asked} ({provider} {precision}) gives the model's answer");
+        assert_eq!(detection.grasps.len(), 2, "{requested} ({provider} {precision}) gives the grasps of the model");
     }
 }
 
-/// The library that `make` fetches on x86-64 Linux has OpenVINO.
+/// The library that `make` downloads on x86-64 Linux has OpenVINO.
 #[tokio::test]
 #[cfg(all(target_os = "linux", target_arch = "x86_64"))]
-async fn openvino_runs_where_it_was_asked_for() {
+async fn openvino_runs_when_requested() {
     let server = Server::run(&[TestModel::new("blobs")], &["--provider", "openvino", "--precision", "fp32"]);
     let client = server.client().await;
     let model = client.list_models().await.unwrap().remove(0);
@@ -47,35 +47,36 @@ async fn openvino_runs_where_it_was_asked_for() {
     assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 2);
 }
 
-/// Processors that multiply bf16 are where this could go wrong.
+/// Only processors with bf16 instructions exercise the check of the outputs.
 #[tokio::test]
-async fn what_gives_other_answers_is_passed_over_or_refused() {
+async fn backends_with_other_outputs_are_skipped_by_auto_and_refused_on_request() {
     let model = TestModel::new("blobs").needs_fp32();
     let server = Server::run(std::slice::from_ref(&model), &[]);
     let client = server.client().await;
     assert_eq!(client.list_models().await.unwrap()[0].precision, "fp32");
     assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 2);
 
-    let (code, said) = refused(&model, &["--provider", "openvino", "--precision", "bf16"]);
-    assert_eq!(code, Some(1), "{said}");
-    let other_answers = said.contains("with openvino bf16 the outputs differ from the reference: `quality` differs by");
-    let not_there = said.contains("provider `openvino` not found") || said.contains("does not support bf16");
-    assert!(other_answers || not_there, "{said}");
+    let (code, stderr) = refused(&model, &["--provider", "openvino", "--precision", "bf16"]);
+    assert_eq!(code, Some(1), "{stderr}");
+    let other_outputs =
+        stderr.contains("with openvino bf16 the outputs differ from the reference: `quality` differs by");
+    let unavailable = stderr.contains("provider `openvino` not found") || stderr.contains("does not support bf16");
+    assert!(other_outputs || unavailable, "{stderr}");
 }
 
 #[test]
-fn what_cannot_be_had_is_an_error_and_nothing_else_is_taken() {
+fn an_unavailable_backend_is_an_error_without_fallback() {
     let model = TestModel::new("blobs");
     for (args, expected) in [
         (&["--provider", "tensorrt"][..], "provider `tensorrt` not found"),
         (&["--provider", "cpu", "--precision", "fp16"], "`cpu` does not support fp16"),
         (&["--precision", "int8"], "grasp-train export --precision int8"),
     ] {
-        let (code, said) = refused(&model, args);
-        assert_eq!(code, Some(1), "{said}");
-        assert!(said.contains("blobs-1.onnx") && said.contains(expected), "{args:?}: {said}");
+        let (code, stderr) = refused(&model, args);
+        assert_eq!(code, Some(1), "{stderr}");
+        assert!(stderr.contains("blobs-1.onnx") && stderr.contains(expected), "{args:?}: {stderr}");
     }
-    let (code, said) = refused(&model, &["--provider", "gpu", "--precision", "half"]);
-    assert_eq!(code, Some(2), "{said}");
-    assert!(said.contains("--provider (GRASPD_PROVIDER) is `gpu`") && said.contains("--precision"), "{said}");
+    let (code, stderr) = refused(&model, &["--provider", "gpu", "--precision", "half"]);
+    assert_eq!(code, Some(2), "{stderr}");
+    assert!(stderr.contains("--provider (GRASPD_PROVIDER) is `gpu`") && stderr.contains("--precision"), "{stderr}");
 }

@@ -1,4 +1,4 @@
-//! Another language, with the tests in `python/`.
+//! Runs the Python tests in `python/`.
 
 use std::ffi::OsStr;
 use std::path::Path;
@@ -7,7 +7,7 @@ use std::process::Command;
 use grasp_tests::{Server, TestModel, example, grasp, grasp_sim, graspd};
 use tempfile::TempDir;
 
-/// Runs the tests of a file; `expected` is one of them, for unittest is content when it finds none at all.
+/// Runs the tests of a file. `expected` is the name of one of them, because unittest succeeds if it finds none.
 fn run(file: &str, environment: &[(&str, &OsStr)], expected: &str) {
     let python = std::env::var_os("GRASPD_PYTHON").expect("GRASPD_PYTHON is not set: run the tests by `make test`");
     let tests = Path::new(env!("CARGO_MANIFEST_DIR")).join("python");
@@ -22,7 +22,7 @@ fn run(file: &str, environment: &[(&str, &OsStr)], expected: &str) {
     assert!(output.status.success() && report.contains(expected), "{report}");
 }
 
-/// A folder with one network of the zoo and its classifier, however many there are by then.
+/// A folder with one network of the zoo and the classifiers.
 fn models() -> TempDir {
     let zoo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo").canonicalize().unwrap();
     let folder = tempfile::tempdir().unwrap();
@@ -33,7 +33,7 @@ fn models() -> TempDir {
 }
 
 #[test]
-fn a_python_client_gets_along_with_the_server() {
+fn a_generated_python_client_works() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let address = server.grpc().to_string();
     let proto = Path::new(env!("CARGO_MANIFEST_DIR")).join("../proto/proto");
@@ -42,53 +42,53 @@ fn a_python_client_gets_along_with_the_server() {
 }
 
 #[test]
-fn the_deployment_fits_the_server_seen_from_python() {
+fn the_deployment_files_match_the_server() {
     run("test_deploy.py", &[("GRASPD", graspd().as_os_str())], "test_the_manifests_are_valid");
 }
 
 #[test]
-fn prometheus_sees_what_the_dashboard_shows_seen_from_python() {
-    // GRASPD_PROMETHEUS and GRASPD_PROMTOOL are the environment's.
+fn prometheus_and_the_dashboard_show_data() {
+    // GRASPD_PROMETHEUS and GRASPD_PROMTOOL are inherited from the environment.
     let models = models();
     let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.path().as_os_str())];
     run("test_monitoring.py", &environment, "test_panels_show_data");
 }
 
 #[test]
-fn a_browser_shows_the_page_seen_from_python() {
-    // GRASPD_CHROMIUM is the environment's.
+fn the_page_works_in_a_browser() {
+    // GRASPD_CHROMIUM is inherited from the environment.
     let models = models();
     let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.path().as_os_str())];
     run("test_page.py", &environment, "test_the_scene_is_drawn");
 }
 
 #[test]
-fn the_python_package_does_what_it_says() {
+fn the_python_package_works() {
     let models = models();
     let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.path().as_os_str())];
     run("test_package.py", &environment, "test_the_grasps_are_at_the_block");
 }
 
 #[test]
-fn exports_are_what_other_programs_read_seen_from_python() {
+fn exported_files_can_be_parsed() {
     let models = models();
     let environment = [
         ("GRASPD", graspd().as_os_str()),
         ("GRASP", grasp().as_os_str()),
         ("GRASPD_MODELS", models.path().as_os_str()),
     ];
-    run("test_exports.py", &environment, "test_isaac_reads_its_format");
+    run("test_exports.py", &environment, "test_isaac_files_have_the_fields_of_the_format");
 }
 
 #[test]
-fn tritonclient_gets_the_maps_seen_from_python() {
+fn tritonclient_receives_the_maps() {
     let models = models();
     let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.path().as_os_str())];
     run("test_inference.py", &environment, "test_calls_run_at_the_same_time");
 }
 
 #[test]
-fn the_documents_are_true_seen_from_python() {
+fn the_code_blocks_of_the_documents_run() {
     let models = models();
     let environment = [
         ("GRASPD", graspd().as_os_str()),
@@ -96,20 +96,20 @@ fn the_documents_are_true_seen_from_python() {
         ("GRASP_SIM", grasp_sim().as_os_str()),
         ("GRASPD_MODELS", models.path().as_os_str()),
     ];
-    run("test_docs.py", &environment, "test_what_is_linked_exists");
+    run("test_docs.py", &environment, "test_links_have_targets");
 }
 
 #[test]
-fn a_client_in_cpp_is_built_and_gets_grasps_seen_from_python() {
-    // GRASPD_CPP is the environment's.
+fn the_cpp_client_builds_and_receives_grasps() {
+    // GRASPD_CPP is inherited from the environment.
     let models = models();
     let environment = [("GRASPD", graspd().as_os_str()), ("GRASPD_MODELS", models.path().as_os_str())];
     run("test_cpp.py", &environment, "test_the_grasps_are_at_the_block");
 }
 
 #[test]
-fn the_examples_in_three_languages_print_the_same_grasps_seen_from_python() {
-    // GRASPD_CPP is the environment's.
+fn the_examples_in_three_languages_print_the_same_grasps() {
+    // GRASPD_CPP is inherited from the environment.
     let models = models();
     let environment = [
         ("GRASPD", graspd().as_os_str()),
@@ -120,7 +120,7 @@ fn the_examples_in_three_languages_print_the_same_grasps_seen_from_python() {
 }
 
 #[test]
-fn the_second_simulator_does_what_it_says_seen_from_python() {
+fn the_pybullet_simulator_works() {
     let models = models();
     let environment = [
         ("GRASPD", graspd().as_os_str()),
@@ -131,11 +131,11 @@ fn the_second_simulator_does_what_it_says_seen_from_python() {
 }
 
 #[test]
-fn python_reads_and_writes_our_data() {
+fn python_reads_and_writes_data_sets() {
     run("test_data.py", &[("GRASP_SIM", grasp_sim().as_os_str())], "test_processed_data_load_with_pandas");
 }
 
 #[test]
-fn the_label_jobs_share_the_work_seen_from_python() {
-    run("test_label_jobs.py", &[("GRASP_SIM", grasp_sim().as_os_str())], "test_pods_label_what_one_machine_would");
+fn label_jobs_generate_the_data_of_one_machine() {
+    run("test_label_jobs.py", &[("GRASP_SIM", grasp_sim().as_os_str())], "test_pods_generate_the_data_of_one_machine");
 }

@@ -1,4 +1,4 @@
-//! Every command of the README and of docs/training.md, in their order, in one folder.
+//! Runs every command of the README and of docs/training.md, in order, in one folder.
 
 use std::fs;
 use std::net::TcpListener;
@@ -22,7 +22,7 @@ fn blocks(pages: &[&str], language: &str) -> Vec<String> {
     pages.iter().flat_map(of_page).collect()
 }
 
-/// Commands that other recipes run: `make` itself, and training, which the tests of `grasp-train` run from the same page.
+/// Commands that run elsewhere: those of `make` and Cargo, and training, which the tests of `grasp-train` run.
 fn is_run_elsewhere(line: &str) -> bool {
     ["make ", "cargo ", "export PATH", "export LIBTORCH", "grasp-train "].iter().any(|prefix| line.starts_with(prefix))
 }
@@ -45,19 +45,19 @@ fn every_command_of_the_readme_works() {
     for name in ["models", "deploy", "proto", "client"] {
         std::os::unix::fs::symlink(Path::new(ROOT).join(name), folder.path().join(name)).unwrap();
     }
-    // The page's ports may be taken on this machine.
+    // The ports of the pages may be in use on this machine.
     let [grpc, http] = [50051, 9090].map(|_| TcpListener::bind("127.0.0.1:0").unwrap());
     let [grpc, http] = [grpc, http].map(|listener| listener.local_addr().unwrap().port().to_string());
     let mut script = String::from("set -eu\n");
     let lines = blocks(&PAGES, "sh");
     for line in lines.iter().flat_map(|block| block.lines()).filter(|line| !is_run_elsewhere(line)) {
         if line.starts_with("graspd ") {
-            // Whoever types this waits for `ready` before the next line.
+            // The following lines need a server that has printed `ready`.
             script += &format!("{} > server.log\n", line.trim_end_matches('&'));
             script = script.replace("> server.log\n", "> server.log & server=$!\ntrap 'kill $server' EXIT\n");
             script += "until grep -q ready server.log; do kill -0 $server; sleep 0.1; done\n";
         } else if let Some(package) = line.strip_prefix("pip install ") {
-            // With what it is built by and what it needs from the interpreter of the tests, without a network.
+            // Uses the build backend and the dependencies of the tests' interpreter, without a network.
             let flags = "--quiet --no-index --no-build-isolation --no-deps --target site";
             script += &format!("$GRASPD_PYTHON -m pip install {flags} {package}\n");
         } else {
@@ -81,7 +81,7 @@ fn every_command_of_the_readme_works() {
     let output = command.output().unwrap();
     let (stdout, stderr) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert!(output.status.success(), "{stdout}\n{stderr}");
-    for said in ["vgn-packed", "graspd_", "\"gsr\"", "\"planner\":\"random\""] {
-        assert!(stdout.contains(said), "`{said}` is missing from:\n{stdout}\n{stderr}");
+    for expected in ["vgn-packed", "graspd_", "\"gsr\"", "\"planner\":\"random\""] {
+        assert!(stdout.contains(expected), "`{expected}` is missing from:\n{stdout}\n{stderr}");
     }
 }

@@ -1,4 +1,4 @@
-//! Models that change while they are served.
+//! Changes of the model folder while the server runs.
 
 use std::fs;
 use std::sync::Arc;
@@ -17,12 +17,12 @@ fn volume() -> Volume {
     blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]])
 }
 
-/// The version that answers who names none.
+/// The version that requests without a version use.
 async fn newest(client: &Client) -> String {
     client.detect(&volume(), Options::default()).await.unwrap().version
 }
 
-/// Which networks are served, as `name version`.
+/// The served networks, as `name version`.
 async fn served(client: &Client) -> Vec<String> {
     let models = client.list_models().await.unwrap();
     models
@@ -33,7 +33,7 @@ async fn served(client: &Client) -> Vec<String> {
 }
 
 #[tokio::test]
-async fn a_new_version_is_served_at_sighup_and_the_old_one_stays_for_who_asks_for_it() {
+async fn sighup_loads_a_new_version_and_the_old_one_stays_available() {
     let server = Server::run(&[TestModel::new("mirror")], NO_WATCH);
     let client = server.client().await;
     TestModel::new("mirror").version("2").write(server.models());
@@ -48,7 +48,7 @@ async fn a_new_version_is_served_at_sighup_and_the_old_one_stays_for_who_asks_fo
 }
 
 #[tokio::test]
-async fn a_folder_that_is_watched_needs_no_signal() {
+async fn a_watched_folder_is_reloaded_without_a_signal() {
     let server = Server::run(&[TestModel::new("mirror")], WATCH);
     let client = server.client().await;
     TestModel::new("mirror").version("2").write(server.models());
@@ -63,20 +63,20 @@ async fn a_folder_that_is_watched_needs_no_signal() {
 }
 
 #[tokio::test]
-async fn a_folder_names_its_default() {
+async fn the_default_file_selects_the_default_model() {
     let server = Server::run(&[TestModel::new("mirror"), TestModel::new("second")], WATCH);
     let client = server.client().await;
-    assert_eq!(served(&client).await, ["mirror 1", "second 1"], "by name, where nothing is said");
+    assert_eq!(served(&client).await, ["mirror 1", "second 1"], "sorted by name without a default file");
     fs::write(server.models().join("default"), "second\n").unwrap();
     server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
     assert_eq!(served(&client).await, ["second 1", "mirror 1"]);
     fs::write(server.models().join("default"), "missing").unwrap();
     server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 2.0).await;
-    assert_eq!(served(&client).await, ["mirror 1", "second 1"], "of what is there");
+    assert_eq!(served(&client).await, ["mirror 1", "second 1"], "sorted by name if the default model is missing");
 }
 
 #[tokio::test]
-async fn what_cannot_be_served_changes_nothing_and_is_told() {
+async fn invalid_files_change_nothing_and_are_counted() {
     let server = Server::run(&[TestModel::new("mirror")], NO_WATCH);
     let client = server.client().await;
     let path = server.models().join("mirror-1.onnx");
@@ -95,18 +95,18 @@ async fn what_cannot_be_served_changes_nothing_and_is_told() {
         assert_eq!(newest(&client).await, "1");
         assert_eq!(client.list_models().await.unwrap(), before);
     }
-    // A network that is one, and whose every answer is none.
+    // A valid network whose outputs are invalid.
     TestModel::new("mirror").breaks_at(0.0).write(server.models());
     server.reload().unwrap();
     server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 4.0).await;
     assert_eq!(newest(&client).await, "1");
-    // What is good beside it is served all the same.
+    // A valid file beside the invalid one is served.
     TestModel::new("mirror").version("2").write(server.models());
     server.reload().unwrap();
     server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 5.0).await;
     assert_eq!(served(&client).await, ["mirror 2", "mirror 1"]);
 
-    // And all is well again.
+    // With the file restored, the reload succeeds.
     fs::write(&path, whole).unwrap();
     server.reload().unwrap();
     server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
@@ -114,7 +114,7 @@ async fn what_cannot_be_served_changes_nothing_and_is_told() {
 }
 
 #[tokio::test]
-async fn a_folder_that_is_gone_changes_nothing() {
+async fn a_folder_without_networks_changes_nothing() {
     let server = Server::run(&[TestModel::new("mirror")], WATCH);
     let client = server.client().await;
     fs::remove_file(server.models().join("mirror-1.onnx")).unwrap();
@@ -123,7 +123,7 @@ async fn a_folder_that_is_gone_changes_nothing() {
 }
 
 #[tokio::test]
-async fn nobody_who_asks_while_models_are_swapped_notices() {
+async fn requests_succeed_while_models_are_replaced() {
     let model = TestModel::new("mirror").convolutions(2);
     let server = Server::run(std::slice::from_ref(&model), &["--watch", "0", "--queue", "16", "--workers", "2"]);
     let (stop, answered) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicUsize::new(0)));
@@ -154,7 +154,7 @@ async fn nobody_who_asks_while_models_are_swapped_notices() {
     let count = |version: u32, code: &str| {
         server.metric(&format!("graspd_requests_total{{code=\"{code}\",model=\"mirror {version}\"}}"))
     };
-    assert!((1..8).all(|version| count(version, "OK") > 0.0), "every version has answered");
+    assert!((1..8).all(|version| count(version, "OK") > 0.0), "every version has answered requests");
     let waiting = |version: u32| server.metric(&format!("graspd_queue_requests{{model=\"mirror {version}\"}}"));
     assert!((1..8).all(|version| waiting(version) == 0.0));
 }

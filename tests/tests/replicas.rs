@@ -1,4 +1,4 @@
-//! Two servers behind a load balancer, of which one dies. `make test-faults` runs these: they need haproxy, or many files.
+//! Two servers behind a load balancer, one of which is killed. `make test-faults` runs this test: it needs haproxy.
 
 use std::net::{SocketAddr, TcpListener};
 use std::process::{Child, Command};
@@ -13,7 +13,7 @@ use tonic::Code;
 
 const RESOLUTION: usize = 40;
 
-/// haproxy with the configuration that deploy/ has.
+/// haproxy with the configuration in deploy/.
 struct Balancer {
     process: Child,
     address: SocketAddr,
@@ -43,7 +43,7 @@ impl Drop for Balancer {
 
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "needs haproxy: make test-faults"]
-async fn nobody_who_asks_again_notices_that_a_replica_was_killed() {
+async fn requests_with_retries_succeed_when_a_replica_is_killed() {
     const CALLS: usize = 2000;
     let model = || TestModel::new("mirror").resolution(RESOLUTION);
     let (survivor, victim) = (Server::run(&[model()], &["--log", "warn"]), Server::run(&[model()], &["--log", "warn"]));
@@ -75,8 +75,8 @@ async fn nobody_who_asks_again_notices_that_a_replica_was_killed() {
     while made.load(Ordering::Relaxed) < CALLS / 4 {
         tokio::time::sleep(Duration::from_millis(1)).await;
     }
-    assert!(by_victim() > 0.0, "it has had its share");
-    // SIGKILL.
+    assert!(by_victim() > 0.0, "the victim has answered requests");
+    // Dropping the server sends SIGKILL.
     drop(victim);
     let report = calls.await.unwrap();
     assert_eq!((report.answered.len(), report.refusals()), (CALLS, 0), "{:?}", report.refused.keys());

@@ -1,4 +1,4 @@
-//! Who gets in, and how what they send is kept from others.
+//! Authentication and encryption: TLS, client certificates and tokens.
 
 use std::fs;
 use std::path::PathBuf;
@@ -18,7 +18,7 @@ fn volume() -> Volume {
     blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]])
 }
 
-/// A CA with the files that it makes.
+/// A CA, and a folder with its certificates and keys.
 struct Authority {
     issuer: CertifiedIssuer<'static, KeyPair>,
     folder: TempDir,
@@ -63,14 +63,14 @@ async fn detects(server: &Server, access: Access) -> Result<usize, Error> {
 }
 
 #[tokio::test]
-async fn over_tls_only_who_trusts_its_ca_talks_to_it() {
+async fn tls_needs_the_ca_of_the_server() {
     let authority = Authority::new();
     authority.sign("server");
     let flags = ["--tls-cert", &authority.path("server.pem"), "--tls-key", &authority.path("server.key")];
     let server = Server::run(&[TestModel::new("mirror")], &flags);
     assert_eq!(detects(&server, authority.access()).await.unwrap(), 1);
     assert!(detects(&server, Authority::new().access()).await.is_err());
-    assert!(detects(&server, Access::default()).await.is_err(), "not in clear");
+    assert!(detects(&server, Access::default()).await.is_err(), "without TLS");
 
     let output = Command::new(grasp())
         .args(["--server", &server.grpc().to_string(), "--tls-ca", &authority.path("ca.pem"), "health"])
@@ -80,8 +80,8 @@ async fn over_tls_only_who_trusts_its_ca_talks_to_it() {
 }
 
 #[tokio::test]
-async fn who_has_to_show_a_certificate_gets_in_with_one_of_the_right_ca_only() {
-    let (authority, stranger) = (Authority::new(), Authority::new());
+async fn mutual_tls_needs_a_client_certificate_of_the_ca() {
+    let (authority, other) = (Authority::new(), Authority::new());
     authority.sign("server");
     let flags = [
         ["--tls-cert", &authority.path("server.pem")],
@@ -92,11 +92,11 @@ async fn who_has_to_show_a_certificate_gets_in_with_one_of_the_right_ca_only() {
     let with = |identity| Access { identity, ..authority.access() };
     assert_eq!(detects(&server, with(Some(authority.sign("robot")))).await.unwrap(), 1);
     assert!(detects(&server, with(None)).await.is_err());
-    assert!(detects(&server, with(Some(stranger.sign("robot")))).await.is_err());
+    assert!(detects(&server, with(Some(other.sign("robot")))).await.is_err());
 }
 
 #[tokio::test]
-async fn only_bearers_of_a_token_are_answered_and_tokens_change_at_sighup() {
+async fn requests_need_a_valid_token_and_sighup_reloads_the_tokens() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("tokens");
     fs::write(&file, "first-secret\n").unwrap();
@@ -111,25 +111,25 @@ async fn only_bearers_of_a_token_are_answered_and_tokens_change_at_sighup() {
     refused(detects(&server, Access::default()).await.unwrap_err());
     assert_eq!(server.metric("graspd_requests_total{code=\"UNAUTHENTICATED\",model=\"\"}"), 2.0);
 
-    // A probe has no token; a list of models is no probe's business.
+    // Health checks need no token; the list of models does.
     let client = server.client().await;
     assert_eq!(client.health().await.unwrap(), Health::Serving);
     refused(client.list_models().await.unwrap_err());
 
-    // Both for a while, then the new one alone; and a file that is gone locks nobody out.
+    // First both tokens are valid, then only the new one. A missing file keeps the tokens.
     for (text, good) in [("first-secret\nnew-secret\n", true), ("new-secret\n", false)] {
         fs::write(&file, text).unwrap();
         let reloads = server.metric("graspd_reloads_total{outcome=\"ok\"}");
         server.reload().unwrap();
         server.wait_for("graspd_reloads_total{outcome=\"ok\"}", reloads + 1.0).await;
-        let taken = async {
+        let applied = async {
             while detects(&server, with("new-secret")).await.is_err()
                 || detects(&server, with("first-secret")).await.is_ok() != good
             {
                 tokio::task::yield_now().await;
             }
         };
-        timeout(Duration::from_secs(60), taken).await.expect("the file is reloaded");
+        timeout(Duration::from_secs(60), applied).await.expect("the file is reloaded");
     }
     fs::remove_file(&file).unwrap();
     server.reload().unwrap();
@@ -141,15 +141,15 @@ async fn only_bearers_of_a_token_are_answered_and_tokens_change_at_sighup() {
         .env("GRASPD_TOKEN_FILE", &file)
         .output()
         .unwrap();
-    assert!(String::from_utf8_lossy(&output.stderr).contains("cannot read"), "it says which file is not there");
+    assert!(String::from_utf8_lossy(&output.stderr).contains("cannot read"), "the error names the missing file");
 }
 
 #[test]
-fn half_a_configuration_is_refused() {
+fn incomplete_or_invalid_settings_are_errors() {
     let authority = Authority::new();
     authority.sign("server");
     let (cert, key) = (authority.path("server.pem"), authority.path("server.key"));
-    for (flags, mistake) in [
+    for (flags, error) in [
         (vec!["--tls-cert", &cert], "--tls-key (GRASPD_TLS_KEY) is missing"),
         (vec!["--tls-client-ca", &cert], "--tls-cert (GRASPD_TLS_CERT) is missing"),
         (
@@ -167,9 +167,9 @@ fn half_a_configuration_is_refused() {
         let output = Command::new(graspd()).args(&flags).output().unwrap();
         assert_eq!(output.status.code(), Some(2));
         let text = String::from_utf8(output.stderr).unwrap();
-        assert!(text.contains(mistake), "`{mistake}` is not in:\n{text}");
+        assert!(text.contains(error), "`{error}` is missing from:\n{text}");
     }
-    // What only TLS itself can tell: a key where a certificate should be.
+    // A key in place of a certificate is found only when TLS is set up.
     let folder = tempfile::tempdir().unwrap();
     TestModel::new("mirror").write(folder.path());
     let output = Command::new(graspd())

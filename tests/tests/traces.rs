@@ -1,4 +1,4 @@
-//! Traces of requests, told to a collector of OpenTelemetry.
+//! Traces of requests, exported to an OpenTelemetry collector.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -16,7 +16,7 @@ use tokio::sync::mpsc;
 use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status};
 
-/// Speaks OTLP, and hands on what it is told.
+/// An OTLP collector that forwards each export to a channel.
 struct Collector(mpsc::Sender<ExportTraceServiceRequest>);
 
 #[tonic::async_trait]
@@ -33,8 +33,8 @@ impl TraceService for Collector {
 async fn collector() -> (SocketAddr, mpsc::Receiver<ExportTraceServiceRequest>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
-    let (told, exports) = mpsc::channel(16);
-    let service = TraceServiceServer::new(Collector(told));
+    let (sender, exports) = mpsc::channel(16);
+    let service = TraceServiceServer::new(Collector(sender));
     tokio::spawn(
         tonic::transport::Server::builder().add_service(service).serve_with_incoming(TcpIncoming::from(listener)),
     );
@@ -56,7 +56,7 @@ fn hex(bytes: &[u8]) -> String {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_request_is_a_part_of_its_callers_trace() {
+async fn the_spans_of_a_request_belong_to_the_trace_of_the_client() {
     let (address, mut exports) = collector().await;
     let mut server =
         Server::run(&[TestModel::new("mirror")], &["--otlp", &format!("http://{address}"), "--log", "error"]);
@@ -71,8 +71,8 @@ async fn a_request_is_a_part_of_its_callers_trace() {
     let mut request = Request::new(message("traced", ""));
     request.metadata_mut().insert("traceparent", format!("00-{trace}-{parent}-01").parse().unwrap());
     client.detect_grasps(request).await.unwrap();
-    client.detect_grasps(message("alone", "nobody")).await.unwrap_err();
-    // What was not told yet is told before the end.
+    client.detect_grasps(message("alone", "unknown")).await.unwrap_err();
+    // Remaining spans are exported before the exit.
     drop(client);
     server.terminate().unwrap();
     let ended = tokio::task::spawn_blocking(move || server.wait());
@@ -93,11 +93,11 @@ async fn a_request_is_a_part_of_its_callers_trace() {
     };
     let traced = request("traced");
     assert_eq!((hex(&traced.trace_id), hex(&traced.parent_span_id)), (trace.to_owned(), parent.to_owned()));
-    // A server's.
+    // SPAN_KIND_SERVER.
     assert_eq!(traced.kind, 2);
-    let told = attributes(traced);
-    assert_eq!(told["model"], "mirror 1");
-    assert!(told["total"].parse::<f64>().unwrap() > 0.0);
+    let values = attributes(traced);
+    assert_eq!(values["model"], "mirror 1");
+    assert!(values["total"].parse::<f64>().unwrap() > 0.0);
     let mut stages: Vec<_> = spans.iter().filter(|span| span.parent_span_id == traced.span_id).collect();
     stages.sort_by_key(|span| span.start_time_unix_nano);
     let names: Vec<_> = stages.iter().map(|span| span.name.as_str()).collect();
@@ -107,5 +107,5 @@ async fn a_request_is_a_part_of_its_callers_trace() {
 
     let alone = request("alone");
     assert!(alone.parent_span_id.is_empty() && alone.trace_id != traced.trace_id);
-    assert!(!spans.iter().any(|span| span.parent_span_id == alone.span_id), "it had no stages");
+    assert!(!spans.iter().any(|span| span.parent_span_id == alone.span_id), "a refused request has no stages");
 }

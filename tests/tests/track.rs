@@ -1,4 +1,4 @@
-//! A volume that the server keeps from view to view.
+//! TrackGrasps: a volume that the server keeps between views.
 
 use grasp_client::{DetectOptions, Detection, Error, Extrinsics, Options, Workspace};
 use grasp_proto::pb;
@@ -34,14 +34,14 @@ async fn each_view_is_added_to_those_before_it() {
     for seen in 1..=views.len() {
         let options = Options { frame_id: "base".to_owned(), ..low() };
         let kept = tracking.add(&views[seen - 1..seen], options).await.unwrap();
-        let wanted = client.detect_from_depth(&views[..seen], &workspace, low()).await.unwrap();
+        let expected = client.detect_from_depth(&views[..seen], &workspace, low()).await.unwrap();
         let poses = |detection: &Detection| detection.grasps.iter().map(|grasp| grasp.pose).collect::<Vec<_>>();
         assert!(!kept.grasps.is_empty());
-        assert_eq!(poses(&kept), poses(&wanted), "after {seen} views");
+        assert_eq!(poses(&kept), poses(&expected), "after {seen} views");
         assert_eq!(kept.frame_id, "base");
         assert_eq!(server.metric(TRACKED), 1.0);
     }
-    // Looks once more, at nothing new, with other wishes.
+    // No new view, other options.
     let detect = DetectOptions { max_grasps: 1, ..low().detect };
     let one = tracking.add(&[], Options { detect, ..Options::default() }).await.unwrap();
     assert_eq!(one.grasps.len(), 1);
@@ -51,7 +51,7 @@ async fn each_view_is_added_to_those_before_it() {
 }
 
 #[tokio::test]
-async fn a_bad_view_costs_neither_the_stream_nor_the_volume() {
+async fn an_invalid_view_ends_neither_the_stream_nor_the_volume() {
     let server = Server::run(&[TestModel::new("mirror"), TestModel::new("other").resolution(24)], &[]);
     let client = server.client().await;
     let good = view(&camera(40.0, -90.0));
@@ -70,7 +70,7 @@ async fn a_bad_view_costs_neither_the_stream_nor_the_volume() {
     assert!(message.starts_with("options.model is `other`, which requires a different grid"), "{message}");
     assert_eq!(tracking.add(&[], low()).await.unwrap().grasps, first.grasps);
 
-    // By hand: the library always sends a workspace first.
+    // With the generated client, because the client library always sends a workspace first.
     let request = pb::TrackGraspsRequest { views: vec![(&good).into()], ..Default::default() };
     let replies = server.raw().await.track_grasps(tokio_stream::iter([request])).await.unwrap();
     let reply = replies.into_inner().message().await.unwrap().unwrap();
@@ -82,7 +82,7 @@ async fn a_bad_view_costs_neither_the_stream_nor_the_volume() {
 }
 
 #[tokio::test]
-async fn views_that_come_while_the_queue_is_full_are_kept() {
+async fn views_are_fused_while_the_queue_is_full() {
     let server = Server::run(&[TestModel::new("slow").convolutions(60)], &["--queue", "1"]);
     let client = server.client().await;
     let views = [-90.0, 90.0].map(|azimuth| view(&camera(40.0, azimuth)));
@@ -100,13 +100,13 @@ async fn views_that_come_while_the_queue_is_full_are_kept() {
         callers.join_all().await;
 
         let kept = tracking.add(&[], low()).await.unwrap();
-        let wanted = client.detect_from_depth(&views[..seen], &Workspace::default(), low()).await.unwrap();
-        assert_eq!(kept.grasps, wanted.grasps, "after {seen} views");
+        let expected = client.detect_from_depth(&views[..seen], &Workspace::default(), low()).await.unwrap();
+        assert_eq!(kept.grasps, expected.grasps, "after {seen} views");
     }
 }
 
 #[tokio::test]
-async fn who_does_not_read_holds_no_volume_for_ever() {
+async fn the_volume_of_a_client_that_does_not_read_expires() {
     let server = Server::run(&[TestModel::new("mirror")], &["--track-timeout", "0.3"]);
     let first = pb::TrackGraspsRequest {
         views: vec![(&view(&camera(40.0, -90.0))).into()],
@@ -114,7 +114,7 @@ async fn who_does_not_read_holds_no_volume_for_ever() {
         options: Some(pb::Options { threshold: Some(0.6), ..Default::default() }),
         ..Default::default()
     };
-    // Each is answered by several grasps; what a client does not read fills its window.
+    // Each reply has several grasps. Replies that the client does not read fill its flow-control window.
     const MORE: usize = 500;
     let more = std::iter::repeat_n(pb::TrackGraspsRequest::default(), MORE);
     let requests = tokio_stream::iter(std::iter::once(first).chain(more)).chain(tokio_stream::pending());
@@ -125,12 +125,12 @@ async fn who_does_not_read_holds_no_volume_for_ever() {
     server.wait_for(TRACKED, 1.0).await;
     server.wait_for(TRACKED, 0.0).await;
     let answered = server.metric("graspd_requests_total{code=\"OK\",model=\"mirror 1\"}");
-    assert!(answered < MORE as f64, "{answered} answers fit into the client's window, so nothing was held up");
+    assert!(answered < MORE as f64, "all {answered} replies fit into the window, so the stream was never blocked");
     drop(replies);
 }
 
 #[tokio::test]
-async fn who_goes_meanwhile_is_counted() {
+async fn cancelled_requests_are_counted() {
     let server = Server::run(&[TestModel::new("slow").convolutions(60)], &["--queue", "8"]);
     let client = server.client().await;
     let tracked = {
@@ -151,11 +151,11 @@ async fn who_goes_meanwhile_is_counted() {
     tracked.abort();
     server.wait_for("graspd_requests_total{code=\"CANCELLED\",model=\"slow 1\"}", 1.0).await;
     server.wait_for(TRACKED, 0.0).await;
-    assert!(ahead.join_all().await.iter().all(Result::is_ok), "nobody else is disturbed");
+    assert!(ahead.join_all().await.iter().all(Result::is_ok), "requests of other clients succeed");
 }
 
 #[tokio::test]
-async fn as_many_volumes_are_kept_as_were_allowed_and_none_for_ever() {
+async fn tracked_volumes_are_limited_and_expire() {
     let server = Server::run(&[TestModel::new("mirror")], &["--max-tracked", "1", "--track-timeout", "0.3"]);
     let client = server.client().await;
     let views = [view(&camera(40.0, -90.0))];
@@ -168,5 +168,5 @@ async fn as_many_volumes_are_kept_as_were_allowed_and_none_for_ever() {
     let (status, message) = code(tracking.add(&views, low()).await);
     assert!(status == Code::Aborted && message.contains("no request for 300ms"), "{message}");
     let mut tracking = client.track(Workspace::default()).await.unwrap();
-    assert!(tracking.add(&views, low()).await.is_ok(), "its place is free again");
+    assert!(tracking.add(&views, low()).await.is_ok(), "the slot of the expired volume is free");
 }

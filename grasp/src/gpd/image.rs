@@ -27,6 +27,9 @@ pub struct Image {
 }
 
 impl Image {
+    /// Shape of an image: channels, rows and columns.
+    pub const SHAPE: [usize; 3] = [CHANNELS, IMAGE_SIZE, IMAGE_SIZE];
+
     /// The image of a candidate in its cloud.
     #[must_use]
     pub fn of(cloud: &Cloud, candidate: &Candidate) -> Self {

@@ -1,6 +1,7 @@
-//! Grasp candidates of GPD with their labels, the training data of its classifier: an `.npz` file with
+//! Tried grasp candidates, the training data of a classifier: an `.npz` file with
 //!
-//! - `images`, u8 `[n, CHANNELS, IMAGE_SIZE, IMAGE_SIZE]`, 255 for 1;
+//! - `images`, u8 `[n, shape…]`, 255 for 1: for GPD's classifier the shape of a [`grasp::gpd::Image`], for a grasp
+//!   evaluator that of a [`grasp::Patch`];
 //! - `labels`, u8 `[n]`, 1 for a success;
 //! - `scenes`, u64 `[n]`, the scene number of each candidate.
 
@@ -8,22 +9,21 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::Path;
 
-use grasp::gpd::{CHANNELS, IMAGE_SIZE, Image};
 use npyz::npz::{NpzArchive, NpzWriter, file_name_from_array_name};
 use npyz::{AutoSerialize, Deserialize, NpyFile, WriterBuilder};
 
 use crate::error::{At, DataError};
 use crate::without_time;
 
-/// Bytes of an image.
-const PIXELS: usize = CHANNELS * IMAGE_SIZE * IMAGE_SIZE;
-
-const EXPECTED: &str = "`images` u8 [n, 12, 60, 60], `labels` u8 [n] of 0 and 1, and `scenes` u64 [n], as `grasp-sim candidates` writes them";
+const EXPECTED: &str =
+    "`images` u8 [n, shape…], `labels` u8 [n] of 0 and 1, and `scenes` u64 [n], as `grasp-sim candidates` writes them";
 
 /// Candidates in memory.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Candidates {
-    /// The images of the candidates, [`CHANNELS`] × [`IMAGE_SIZE`] × [`IMAGE_SIZE`] bytes each.
+    /// Shape of an image. Empty without candidates.
+    pub shape: Vec<usize>,
+    /// The images of the candidates, one after the other.
     pub images: Vec<u8>,
     /// Whether each candidate succeeded.
     pub labels: Vec<bool>,
@@ -32,15 +32,29 @@ pub struct Candidates {
 }
 
 impl Candidates {
-    /// Adds a candidate of scene `scene`.
-    pub fn push(&mut self, scene: u64, image: &Image, success: bool) {
-        self.images.extend_from_slice(image.pixels());
+    /// Adds a candidate of scene `scene`, with an image of `shape`.
+    ///
+    /// # Panics
+    /// If the shape is not that of the other images, or the image does not have it.
+    pub fn push(&mut self, scene: u64, shape: &[usize], image: &[u8], success: bool) {
+        assert!(self.is_empty() || self.shape == shape, "the images are of {:?}, not {shape:?}", self.shape);
+        assert_eq!(image.len(), shape.iter().product::<usize>(), "the image is of {shape:?}");
+        self.shape = shape.to_vec();
+        self.images.extend_from_slice(image);
         self.labels.push(success);
         self.scenes.push(scene);
     }
 
     /// Adds all candidates of `others`.
+    ///
+    /// # Panics
+    /// If the shapes of the images differ.
     pub fn append(&mut self, mut others: Self) {
+        if others.is_empty() {
+            return;
+        }
+        assert!(self.is_empty() || self.shape == others.shape, "{:?} is not {:?}", others.shape, self.shape);
+        self.shape = others.shape;
         self.images.append(&mut others.images);
         self.labels.append(&mut others.labels);
         self.scenes.append(&mut others.scenes);
@@ -76,8 +90,9 @@ impl Candidates {
 
     fn write_arrays(&self, path: &Path) -> io::Result<()> {
         let mut archive = NpzWriter::create(path)?;
-        let (count, edge) = (self.labels.len() as u64, IMAGE_SIZE as u64);
-        write_array(&mut archive, "images", &[count, CHANNELS as u64, edge, edge], self.images.iter().copied())?;
+        let count = self.labels.len() as u64;
+        let shape: Vec<u64> = [count].into_iter().chain(self.shape.iter().map(|&size| size as u64)).collect();
+        write_array(&mut archive, "images", &shape, self.images.iter().copied())?;
         write_array(&mut archive, "labels", &[count], self.labels.iter().map(|&label| u8::from(label)))?;
         write_array(&mut archive, "scenes", &[self.scenes.len() as u64], self.scenes.iter().copied())
     }
@@ -93,7 +108,7 @@ impl Candidates {
         let (_, labels) = read_array::<u8>(&mut archive, "labels").at(path)?;
         let (_, scenes) = read_array::<u64>(&mut archive, "scenes").at(path)?;
         let count = labels.len();
-        if shape[1..] != [CHANNELS as u64, IMAGE_SIZE as u64, IMAGE_SIZE as u64] || images.len() != count * PIXELS {
+        if shape.len() < 2 || shape[0] != count as u64 {
             return Err(wrong(format!("the shape of `images` is {shape:?} for {count} labels")));
         }
         if scenes.len() != count || count == 0 {
@@ -102,7 +117,8 @@ impl Candidates {
         if let Some(label) = labels.iter().find(|&&label| label > 1) {
             return Err(wrong(format!("a label is {label}")));
         }
-        Ok(Self { images, labels: labels.into_iter().map(|label| label == 1).collect(), scenes })
+        let shape = shape[1..].iter().map(|&size| size as usize).collect();
+        Ok(Self { shape, images, labels: labels.into_iter().map(|label| label == 1).collect(), scenes })
     }
 }
 
@@ -137,8 +153,8 @@ mod tests {
     use super::*;
 
     fn two() -> Candidates {
-        let images = (0..2 * PIXELS).map(|index| index as u8).collect();
-        Candidates { images, labels: vec![true, false], scenes: vec![7, 9] }
+        let images = (0..2 * 24).collect();
+        Candidates { shape: vec![2, 3, 4], images, labels: vec![true, false], scenes: vec![7, 9] }
     }
 
     #[test]

@@ -9,7 +9,7 @@
 //! | 4 | CRC-32 of that content |
 //! | 8 | number of the scene |
 //! | 4, 4 | number of trials, number of volumes |
-//! | 41 per trial | position (voxels), quaternion x y z w, width (voxels): eight f32; one byte, bit 0: success, bit k: the grasp yawed by k · 36° is a success too; share of successful executions and clearance (metres): two f32 |
+//! | 41 per trial | position (voxels), quaternion x y z w, width (voxels): eight f32; one byte, bit 0: success, bit k: the grasp rotated by k · 36° about the approach is a success too; share of successful executions and clearance (metres): two f32 |
 //! | N³ per volume | [`quantise`]d values, `[x][y][z]` |
 //!
 //! In versions 1 and 2 a trial has 33 bytes, without share and clearance: the share is 1 for a success and 0 for

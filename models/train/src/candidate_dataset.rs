@@ -1,13 +1,12 @@
 use std::path::PathBuf;
 
-use grasp::gpd::{CHANNELS, IMAGE_SIZE};
 use grasp_data::{Candidates, DataError};
 use sha2::{Digest, Sha256};
 use tch::{Kind, Tensor};
 
 /// Labelled grasp candidates, all in memory.
 pub struct CandidateDataset {
-    /// u8 `[n, CHANNELS, IMAGE_SIZE, IMAGE_SIZE]`, 255 for 1.
+    /// u8 `[n, shape…]`, 255 for 1.
     images: Tensor,
     /// Whether each candidate succeeded.
     labels: Vec<bool>,
@@ -16,16 +15,23 @@ pub struct CandidateDataset {
 }
 
 impl CandidateDataset {
-    /// Reads files of [`Candidates`]; several are mixed.
+    /// Reads files of [`Candidates`] with images of `shape`; several are mixed.
     ///
     /// # Errors
     /// [`DataError`] names the file that cannot be used.
-    pub fn read(files: &[PathBuf]) -> Result<Self, DataError> {
+    pub fn read(files: &[PathBuf], shape: &[usize]) -> Result<Self, DataError> {
         let (mut images, mut labels, mut scenes) = (Vec::new(), Vec::new(), Vec::new());
         for (file, path) in files.iter().enumerate() {
             let candidates = Candidates::read(path)?;
-            let edge = IMAGE_SIZE as i64;
-            images.push(Tensor::from_slice(&candidates.images).reshape([-1, CHANNELS as i64, edge, edge]));
+            if candidates.shape != shape {
+                let reason = format!("the images are of {:?}, the network needs {shape:?}", candidates.shape);
+                let expected =
+                    "the candidates of this network; `grasp-sim candidates --network` writes those of an evaluator";
+                return Err(DataError::Scene { path: path.clone(), reason, expected });
+            }
+            let sizes = [&[candidates.len()], shape].concat();
+            let sizes: Vec<i64> = sizes.into_iter().map(|size| size as i64).collect();
+            images.push(Tensor::from_slice(&candidates.images).reshape(sizes));
             labels.extend(candidates.labels);
             scenes.extend(candidates.scenes.into_iter().map(|scene| (file, scene)));
         }
@@ -62,7 +68,7 @@ impl CandidateDataset {
         })
     }
 
-    /// Images, f32 `[n, CHANNELS, IMAGE_SIZE, IMAGE_SIZE]` in [0, 1], and their classes, i64 `[n]`: 1 for a success.
+    /// Images, f32 `[n, shape…]` in [0, 1], and their classes, i64 `[n]`: 1 for a success.
     pub(crate) fn batch(&self, indices: &[i64]) -> (Tensor, Tensor) {
         let images = self.images.index_select(0, &Tensor::from_slice(indices)).to_kind(Kind::Float) / 255.0;
         let labels: Vec<i64> = indices.iter().map(|&index| i64::from(self.labels[index as usize])).collect();

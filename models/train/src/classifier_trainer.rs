@@ -1,14 +1,14 @@
 use grasp_models::gpd::OUTPUT;
 use grasp_models::onnx::ModelProto;
-use rand::SeedableRng;
 use rand::seq::SliceRandom;
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use tch::{Device, Kind, Tensor, no_grad};
 
 use crate::{Adam, CandidateDataset, ExecuteError, ExecutionOptions, Executor};
 
-/// Trains the classifier of grasp candidates with Adam and class-balanced cross-entropy.
+/// Trains a classifier of grasp candidates with Adam and cross-entropy.
 pub struct ClassifierTrainer<'a> {
     executor: Executor,
     adam: Adam,
@@ -17,7 +17,7 @@ pub struct ClassifierTrainer<'a> {
     training: Vec<i64>,
     /// Indices of the validation candidates.
     validation: Vec<i64>,
-    /// Weights of failures and of successes in the loss, n / (2 n_class).
+    /// Weights of failures and of successes in the loss: n / (2 n_class) with `balance`, else 1.
     class_weights: Tensor,
     settings: ClassifierSettings,
     rng: ChaCha8Rng,
@@ -26,14 +26,21 @@ pub struct ClassifierTrainer<'a> {
 /// How a classifier is trained.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ClassifierSettings {
+    /// Number of epochs, over which the learning rate falls to 0 along half a cosine.
+    pub epochs: u64,
     /// Candidates per step.
     pub batch: usize,
-    /// Adam's learning rate.
+    /// Adam's initial learning rate.
     pub learning_rate: f64,
     /// Share of the scenes used for validation.
     pub validation: f64,
     /// Seed of the order of the candidates.
     pub seed: u64,
+    /// Whether failures and successes have the same total weight. Without it the predicted probability is that of the
+    /// data.
+    pub balance: bool,
+    /// Whether each step reverses the x and y axes of the patches at random: the hand is symmetric in both.
+    pub mirror: bool,
     /// Computes convolutions and matrix products in bf16.
     pub bf16: bool,
 }
@@ -41,7 +48,7 @@ pub struct ClassifierSettings {
 /// Metrics of a classifier over the training or the validation candidates.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ClassifierMetrics {
-    /// Mean class-balanced loss.
+    /// Mean loss.
     pub loss: f64,
     /// Share of correctly classified candidates.
     pub accuracy: f64,
@@ -61,12 +68,14 @@ impl<'a> ClassifierTrainer<'a> {
         dataset: &'a CandidateDataset,
         settings: ClassifierSettings,
     ) -> Result<Self, ExecuteError> {
-        let ClassifierSettings { validation, seed, bf16, .. } = settings;
+        let ClassifierSettings { validation, seed, balance, bf16, .. } = settings;
         let execution = ExecutionOptions { device: Device::cuda_if_available(), bf16, channels_last: false };
         let executor = Executor::new(model, execution)?;
         let (training, validation) = dataset.split(validation);
-        let class_weights =
-            dataset.class_counts(&training).map(|count| training.len() as f32 / (2.0 * count.max(1) as f32));
+        let class_weights = dataset.class_counts(&training).map(|count| match balance {
+            true => training.len() as f32 / (2.0 * count.max(1) as f32),
+            false => 1.0,
+        });
         let class_weights = Tensor::from_slice(&class_weights).to_device(executor.device());
         let adam = Adam::new(executor.parameters(), 0.0);
         let rng = ChaCha8Rng::seed_from_u64(seed);
@@ -93,12 +102,22 @@ impl<'a> ClassifierTrainer<'a> {
         self.training.shuffle(&mut self.rng);
         let mut sums = MetricSums::default();
         for indices in self.training.chunks(self.settings.batch) {
-            let loss = sums.add(&self.executor, self.dataset, &self.class_weights, indices)?;
+            let (images, classes) = self.dataset.batch(indices);
+            let axes: Vec<i64> = [-3, -2].into_iter().filter(|_| self.settings.mirror && self.rng.random()).collect();
+            let loss = sums.add(&self.executor, &self.class_weights, &images.flip(axes), &classes)?;
             loss.backward();
-            self.adam.step(self.executor.parameters(), self.settings.learning_rate);
+            let learning_rate = self.learning_rate();
+            self.adam.step(self.executor.parameters(), learning_rate);
             progress();
         }
         Ok(sums.metrics())
+    }
+
+    /// The learning rate of the next step.
+    fn learning_rate(&self) -> f64 {
+        let steps = (self.settings.epochs * self.steps_per_epoch()).max(1);
+        let progress = (self.adam.steps() as f64 / steps as f64).min(1.0);
+        self.settings.learning_rate * 0.5 * (1.0 + (std::f64::consts::PI * progress).cos())
     }
 
     /// The metrics on the validation candidates; `None` if there are none.
@@ -108,7 +127,8 @@ impl<'a> ClassifierTrainer<'a> {
     pub fn validate(&self) -> Result<Option<ClassifierMetrics>, ExecuteError> {
         let mut sums = MetricSums::default();
         for indices in self.validation.chunks(self.settings.batch) {
-            let _ = no_grad(|| sums.add(&self.executor, self.dataset, &self.class_weights, indices))?;
+            let (images, classes) = self.dataset.batch(indices);
+            let _ = no_grad(|| sums.add(&self.executor, &self.class_weights, &images, &classes))?;
         }
         Ok((!self.validation.is_empty()).then(|| sums.metrics()))
     }
@@ -134,11 +154,10 @@ impl MetricSums {
     fn add(
         &mut self,
         executor: &Executor,
-        dataset: &CandidateDataset,
         class_weights: &Tensor,
-        indices: &[i64],
+        images: &Tensor,
+        classes: &Tensor,
     ) -> Result<Tensor, ExecuteError> {
-        let (images, classes) = dataset.batch(indices);
         let (images, classes) = (images.to_device(executor.device()), classes.to_device(executor.device()));
         let scores = executor.output(&images, OUTPUT)?;
         let loss = scores.cross_entropy_loss(&classes, Some(class_weights), tch::Reduction::Mean, -100, 0.0);

@@ -5,8 +5,12 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
-use clap::Args;
+use clap::{Args, ValueEnum};
+use grasp::Patch;
+use grasp::gpd::Image;
+use grasp_models::evaluator;
 use grasp_models::gpd::{describe, gpd};
+use grasp_models::onnx::ModelProto;
 use grasp_train::{CandidateDataset, ClassifierMetrics, ClassifierSettings, ClassifierTrainer};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
@@ -15,6 +19,12 @@ use time::OffsetDateTime;
 /// Prints one JSON object per epoch. Keeps the model with the smallest validation loss, or the last without validation.
 #[derive(Args)]
 pub(crate) struct Classify {
+    /// Classifier.
+    #[arg(long, value_enum, default_value = "gpd")]
+    network: Kind,
+    /// Name of the network whose grasps the evaluator scores.
+    #[arg(long, required_if_eq("network", "evaluator"))]
+    proposals_of: Option<String>,
     /// Files of `grasp-sim candidates`; several are mixed.
     #[arg(long, required = true, num_args = 1..)]
     data: Vec<PathBuf>,
@@ -27,7 +37,7 @@ pub(crate) struct Classify {
     /// Candidates per step.
     #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u16).range(1..))]
     batch: u16,
-    /// Adam's learning rate.
+    /// Adam's initial learning rate; it falls to 0 along half a cosine.
     #[arg(long, default_value_t = 1e-3)]
     lr: f64,
     /// Share of the scenes used for validation.
@@ -47,6 +57,38 @@ pub(crate) struct Classify {
     threads: Option<usize>,
 }
 
+/// The classifiers.
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Kind {
+    /// GPD's classifier, of candidates on the point cloud.
+    Gpd,
+    /// The evaluator of the poses of a network's grasps.
+    Evaluator,
+}
+
+impl Kind {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Gpd => "gpd",
+            Self::Evaluator => "evaluator",
+        }
+    }
+
+    fn build(self, seed: u64) -> ModelProto {
+        match self {
+            Self::Gpd => gpd(seed),
+            Self::Evaluator => evaluator(seed),
+        }
+    }
+
+    fn shape(self) -> &'static [usize] {
+        match self {
+            Self::Gpd => &Image::SHAPE,
+            Self::Evaluator => &Patch::SHAPE,
+        }
+    }
+}
+
 /// A line of the output: the metrics of an epoch.
 #[derive(Serialize)]
 struct ClassifierEpochRecord {
@@ -64,15 +106,19 @@ impl Classify {
         if let Some(folder) = self.out.parent() {
             fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
         }
-        let examples = CandidateDataset::read(&self.data)?;
+        let examples = CandidateDataset::read(&self.data, self.network.shape())?;
         let settings = ClassifierSettings {
+            epochs: self.epochs,
             batch: usize::from(self.batch),
             learning_rate: self.lr,
             validation: self.val,
             seed: self.seed,
+            // Half of GPD's candidates succeed in no scene. The evaluator predicts a probability.
+            balance: self.network == Kind::Gpd,
+            mirror: self.network == Kind::Evaluator,
             bf16: self.bf16,
         };
-        let mut trainer = ClassifierTrainer::new(gpd(self.seed), &examples, settings)?;
+        let mut trainer = ClassifierTrainer::new(self.network.build(self.seed), &examples, settings)?;
         let (training, held_out) = trainer.candidates();
         ensure!(training > 0, "--val is {}, which leaves no scene for training; use a smaller share", self.val);
         eprintln!(
@@ -112,7 +158,7 @@ impl Classify {
         let name = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let mut provenance = BTreeMap::new();
         let mut note = |key: &str, value: String| provenance.insert(key.to_owned(), value);
-        note("architecture", "gpd".to_owned());
+        note("architecture", self.network.name().to_owned());
         note("data", self.data.iter().map(|path| name(path)).collect::<Vec<_>>().join(" "));
         note("candidates", examples.len().to_string());
         note("successes", examples.successes().to_string());
@@ -127,7 +173,8 @@ impl Classify {
             note("validation", serde_json::to_string(&validation)?);
         }
         let mut model = trainer.model();
-        describe(&mut model, &name(&self.out), &self.model_version, &provenance);
+        let network = self.proposals_of.as_deref();
+        describe(&mut model, &name(&self.out), &self.model_version, network, &provenance);
         Ok(model.write(&self.out)?)
     }
 }

@@ -4,13 +4,12 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use grasp::DecodeParams;
-use grasp::SurfacePoint;
 use grasp::gpd::{Candidate, Cloud, Image};
+use grasp::{DecodeParams, Patch, SurfacePoint};
 use grasp_data::Candidates;
-use grasp_models::Options;
 use grasp_models::gpd::gpd;
 use grasp_models::onnx::ModelProto;
+use grasp_models::{Classifier, Metadata, Options};
 use grasp_sim::benchmark::Benchmark;
 use grasp_sim::camera::Views;
 use grasp_sim::label::SceneConfig;
@@ -32,7 +31,7 @@ fn push(number: u64, candidates: &mut Candidates) {
         false => SurfacePoint { position: Point3::new(x, along, 0.04 + offset), normal: Vector3::z() },
     });
     let candidate = Candidate { pose: Isometry3::identity(), width: 0.02, point: Point3::origin() };
-    candidates.push(number / 4, &Image::of(&Cloud::new(points), &candidate), success);
+    candidates.push(number / 4, &Image::SHAPE, Image::of(&Cloud::new(points), &candidate).pixels(), success);
 }
 
 fn candidate_file(folder: &Path, count: u64) -> PathBuf {
@@ -51,9 +50,18 @@ fn classify(folder: &Path, arguments: &str) -> Output {
 #[test]
 fn a_small_data_set_is_memorized() {
     let folder = tempfile::tempdir().unwrap();
-    let dataset = CandidateDataset::read(&[candidate_file(folder.path(), 48)]).unwrap();
+    let dataset = CandidateDataset::read(&[candidate_file(folder.path(), 48)], &Image::SHAPE).unwrap();
     assert_eq!((dataset.len(), dataset.successes()), (48, 16));
-    let settings = ClassifierSettings { batch: 16, learning_rate: 1e-3, validation: 0.25, seed: 1, bf16: false };
+    let settings = ClassifierSettings {
+        epochs: 16,
+        batch: 16,
+        learning_rate: 2e-3,
+        validation: 0.25,
+        seed: 1,
+        balance: true,
+        mirror: false,
+        bf16: false,
+    };
     let mut trainer = ClassifierTrainer::new(gpd(1), &dataset, settings).unwrap();
     let (training, held_out) = trainer.candidates();
     assert!(training + held_out == 48 && held_out > 0 && held_out % 4 == 0, "validation has whole scenes");
@@ -110,6 +118,40 @@ fn a_trained_classifier_plans_in_the_benchmark() {
     let summary = Summary::of(&rounds);
     assert!(summary.rounds == 2 && summary.objects >= 2, "{summary:?}");
     assert!(summary.attempts > 0 || summary.nothing_proposed == 2, "{summary:?}");
+}
+
+#[test]
+fn an_evaluator_separates_full_from_empty_patches() {
+    let folder = tempfile::tempdir().unwrap();
+    let patch = |level: u8| vec![level; Patch::SHAPE.iter().product()];
+    let mut candidates = Candidates::default();
+    for number in 0..96 {
+        let success = number % 2 == 0;
+        let level = if success { 180 } else { 40 } + number as u8 % 32;
+        candidates.push(number / 4, &Patch::SHAPE, &patch(level), success);
+    }
+    candidates.write(&folder.path().join("patches.npz")).unwrap();
+    let arguments = "--network evaluator --proposals-of vgn-packed --data patches.npz --out evaluator.onnx --epochs 6 \
+                     --batch 16";
+    let output = classify(folder.path(), arguments);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let path = folder.path().join("evaluator.onnx");
+    let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
+    assert_eq!((&*metadata.name, metadata.network.as_deref()), ("evaluator", Some("vgn-packed")));
+    let mut evaluator = Classifier::load(&path, &Patch::SHAPE, &Options::default()).unwrap();
+    let scores = evaluator.score(&[&patch(200), &patch(50)]).unwrap();
+    assert!(scores[0] > 0.0 && scores[1] < 0.0, "{scores:?}");
+
+    candidate_file(folder.path(), 8);
+    for (arguments, expected) in [
+        ("--network evaluator --data patches.npz --out x.onnx", "--proposals-of"),
+        ("--network evaluator --proposals-of vgn --data walls.npz --out x.onnx", "the images are of [12, 60, 60]"),
+        ("--data patches.npz --out x.onnx", "the images are of [2, 10, 20, 16]"),
+    ] {
+        let output = classify(folder.path(), arguments);
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert!(!output.status.success() && stderr.contains(expected), "{arguments}: {stderr}");
+    }
 }
 
 #[test]

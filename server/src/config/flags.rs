@@ -133,7 +133,7 @@ pub(super) struct Flags {
     )]
     pub token_file: Option<Arc<Tokens>>,
 
-    /// Maximum number of open connections. Further connections are closed immediately.
+    /// Maximum number of open connections. Further connections are refused.
     #[arg(long, env = "GRASPD_MAX_CONNECTIONS", value_name = "N", default_value = "16384")]
     pub max_connections: NonZeroUsize,
 

@@ -3,7 +3,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use grasp_models::{Entry, Options, Scan, StoreError};
+use grasp_models::{Entry, Options};
 use tokio::signal::unix::Signal;
 use tokio::sync::watch;
 use tracing::{error, info, warn};
@@ -11,8 +11,9 @@ use tracing::{error, info, warn};
 use crate::config::Config;
 use crate::readiness::State;
 use crate::serving::engine::{Engine, Serving, SessionThreads};
+use crate::serving::model_files::ModelFiles;
 use crate::serving::registry::ModelRegistry;
-use crate::serving::stamps::{CLASSIFIERS, DEFAULT, Stamps, stamps};
+use crate::serving::stamps::{DEFAULT, Stamps, stamps};
 use crate::telemetry::metrics::Metrics;
 use grasp_planner::Source;
 
@@ -43,15 +44,15 @@ impl ModelFolder {
         Self { directory, stamps, default_model, serving, models, sessions, metrics }
     }
 
-    /// Loads the networks `entries`, the classifiers and the planners without a file, and serves them. Returns early
+    /// Loads the networks `entries` and the planners of the subfolders, and serves them. Returns early
     /// when the server is draining.
     pub fn load(&self, entries: &[Entry], state: &watch::Receiver<State>) -> anyhow::Result<()> {
         let mut engines = Vec::new();
-        let classifiers = classifiers(&self.directory)?;
-        if let Some(error) = classifiers.rejected.into_iter().next() {
+        let files = ModelFiles::with_networks(&self.directory, entries.to_vec())?;
+        if let Some(error) = files.rejected.into_iter().next() {
             return Err(error.into());
         }
-        for source in sources(entries.to_vec(), classifiers.entries) {
+        for source in files.sources {
             if *state.borrow() == State::Draining {
                 return Ok(());
             }
@@ -90,9 +91,8 @@ impl ModelFolder {
     /// Loads and warms up new models while the old ones are served, then replaces them. If a file cannot be loaded, the
     /// model that was loaded from it before remains served.
     fn reload(&self) {
-        let scans = Scan::read(&self.directory).and_then(|networks| Ok((networks, classifiers(&self.directory)?)));
-        let (networks, classifiers) = match scans {
-            Ok(scans) => scans,
+        let files = match ModelFiles::read(&self.directory) {
+            Ok(files) => files,
             Err(error) => {
                 error!(%error, "cannot read the model folder; the served models are unchanged");
                 return self.metrics.reloaded(Err(()));
@@ -100,12 +100,12 @@ impl ModelFolder {
         };
         let served = self.models.now();
         let mut rejected: Vec<PathBuf> = Vec::new();
-        for error in networks.rejected.into_iter().chain(classifiers.rejected) {
-            error!(%error, "cannot load a model file; its previous version remains served");
+        for error in files.rejected {
+            error!(%error, "cannot load a model file; a model that was loaded from it before remains served");
             rejected.push(error.path().to_owned());
         }
         let mut engines = Vec::new();
-        for source in sources(networks.entries, classifiers.entries) {
+        for source in files.sources {
             if let Some(engine) = served.iter().find(|engine| engine.source == source) {
                 engines.push(Arc::clone(engine));
                 continue;
@@ -116,7 +116,7 @@ impl ModelFolder {
                 Err(error) => {
                     error!(
                         error = format!("{error:#}"),
-                        "cannot load a model file; its previous version remains served"
+                        "cannot load a model file; a model that was loaded from it before remains served"
                     );
                     rejected.extend(path);
                 }
@@ -163,23 +163,4 @@ impl ModelFolder {
 fn default_of(directory: &Path) -> Option<String> {
     let name = fs::read_to_string(directory.join(DEFAULT)).ok()?;
     Some(name.trim().to_owned()).filter(|name| !name.is_empty())
-}
-
-/// The classifiers in the subfolder [`CLASSIFIERS`], which may be missing.
-fn classifiers(directory: &Path) -> Result<Scan, StoreError> {
-    let none = || Scan { entries: Vec::new(), rejected: Vec::new() };
-    let directory = directory.join(CLASSIFIERS);
-    if !directory.is_dir() {
-        return Ok(none());
-    }
-    match Scan::read(&directory) {
-        Err(StoreError::Empty(_)) => Ok(none()),
-        scan => scan,
-    }
-}
-
-/// The sources of all planners: networks, classifiers, and SHAF, which needs no file.
-fn sources(networks: Vec<Entry>, classifiers: Vec<Entry>) -> Vec<Source> {
-    let networks = networks.into_iter().map(Source::Network);
-    networks.chain(classifiers.into_iter().map(Source::Gpd)).chain([Source::Shaf]).collect()
 }

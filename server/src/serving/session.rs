@@ -5,9 +5,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use grasp::{DecodeParams, Decoded, Obstacles, Volume, decode};
-use grasp_models::{Output, batch_sizes};
-use grasp_planner::{Loaded, NetworkPlanner, PlanParams, Planner};
+use grasp::{DecodeParams, Decoded, Obstacles, Volume};
+use grasp_models::batch_sizes;
+use grasp_planner::{Inference, Loaded, NetworkPlanner, PlanParams, Planner};
 use grasp_proto::{Collision, DetectParams};
 use nalgebra::Isometry3;
 use prometheus::Histogram;
@@ -101,7 +101,7 @@ fn infer(
 ) {
     let started = Instant::now();
     let volumes: Vec<&Volume> = jobs.iter().map(|job| &job.scene.volume).collect();
-    let output = caught(|| Ok(network.infer(&volumes)?));
+    let mut output = caught(|| Ok(network.infer(&volumes)?));
     let times = done(started.elapsed());
     for (index, Job { scene, task, deadline, span, submitted }) in jobs.into_iter().enumerate() {
         let _entered = span.enter();
@@ -110,7 +110,7 @@ fn infer(
             task.fail(EngineError::Expired);
             continue;
         }
-        let output = match &output {
+        let output = match &mut output {
             Ok(output) => output,
             Err(error) => {
                 error!(%error, "the session failed");
@@ -119,10 +119,13 @@ fn infer(
             }
         };
         match task {
-            Task::Grasps(params, reply) => send_result(reply, submitted, times, || {
-                let decoded = decode(&scene.volume, &output.maps(index), &params.decode_params(defaults))?;
-                Ok(detection(decoded, scene.volume, &params))
-            }),
+            Task::Grasps(params, reply) => {
+                let decoded = caught(|| {
+                    let is_wanted = || !reply.is_closed() && !deadline.is_some_and(Deadline::has_passed);
+                    Ok(output.decode(index, &scene.volume, &params.decode_params(defaults), &is_wanted)?)
+                });
+                send_result(reply, submitted, times, || Ok(detection(decoded?, scene.volume, &params)));
+            }
             Task::Maps(reply) => send_result(reply, submitted, times, || Ok(tensors(output, index))),
         }
     }
@@ -183,7 +186,7 @@ fn detection(decoded: Decoded, volume: Volume, params: &DetectParams) -> Detecti
     Detection { grasps, collides, dropped, over_limit, volume }
 }
 
-fn tensors(output: &Output, index: usize) -> Tensors {
+fn tensors(output: &Inference, index: usize) -> Tensors {
     let maps = output.maps(index);
     Tensors(
         [maps.quality, maps.rotation, maps.width].map(|map| map.iter().flat_map(|value| value.to_le_bytes()).collect()),

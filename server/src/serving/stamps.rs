@@ -7,6 +7,9 @@ use std::time::SystemTime;
 /// Subfolder of the model folder with GPD's classifiers.
 pub(super) const CLASSIFIERS: &str = "classifiers";
 
+/// Subfolder of the model folder with the evaluators of networks' grasps.
+pub(super) const EVALUATORS: &str = "evaluators";
+
 /// File in the model folder with the name of the default model.
 pub(super) const DEFAULT: &str = "default";
 
@@ -19,7 +22,7 @@ pub(crate) fn stamps(directory: &Path) -> Stamps {
         let metadata = fs::metadata(&path).ok()?;
         Some((path, metadata.modified().ok(), metadata.len()))
     };
-    let folders = [directory.to_owned(), directory.join(CLASSIFIERS)];
+    let folders = [directory.to_owned(), directory.join(CLASSIFIERS), directory.join(EVALUATORS)];
     let files = folders.iter().flat_map(fs::read_dir).flatten().flatten().map(|file| file.path());
     let is_watched =
         |path: &PathBuf| path.extension().is_some_and(|extension| extension == "onnx") || path.ends_with(DEFAULT);

@@ -90,7 +90,7 @@ struct DecodingArgs {
     #[arg(long, default_value = "0.5", value_parser = parse_force)]
     force: Force,
 
-    /// Voxels above this value are in front of a surface (out_th).
+    /// Values above this count as in front of a surface when grasps are decoded (out_th).
     #[arg(long, default_value_t = 0.1)]
     out_th: f32,
 
@@ -118,7 +118,7 @@ impl fmt::Display for DecodingArgs {
         let Self { threshold, force, out_th, no_border, clear } = self;
         write!(f, "ε {threshold}, ")?;
         match force.0 {
-            Some(floor) => write!(f, "force down to {floor}, ")?,
+            Some(floor) => write!(f, "or the best grasp if its quality is at least {floor}, ")?,
             None => f.write_str("no force, ")?,
         }
         write!(f, "out_th {out_th}")?;

@@ -20,7 +20,7 @@ pub struct Stats {
     #[arg(required = true, num_args = 1..)]
     folders: Vec<PathBuf>,
 
-    /// File written by `label --export`, to count by object.
+    /// File written by `label --export`, to count trials by object.
     #[arg(long)]
     export: Option<PathBuf>,
 

@@ -9,12 +9,12 @@ use grasp_tests::grasp_sim;
 use nalgebra::Isometry3;
 use npyz::npz::NpzArchive;
 
-/// The network that is measured, with what it learnt.
+/// The measured network, with trained weights.
 pub(crate) const ZOO: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo/vgn-packed.onnx");
 
-/// On what everything was measured.
+/// The conditions of the measurement: CPU, threads, ONNX Runtime, load and time.
 pub(crate) fn describe(threads: usize) -> anyhow::Result<String> {
-    ensure!(!cfg!(debug_assertions), "this measures: build it with --release");
+    ensure!(!cfg!(debug_assertions), "a debug build cannot be measured: build it with --release");
     let cpu = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let cpu = cpu.lines().find_map(|line| line.strip_prefix("model name")).unwrap_or("\t: an unknown CPU");
     let load = fs::read_to_string("/proc/loadavg").unwrap_or_default();
@@ -29,7 +29,7 @@ pub(crate) fn describe(threads: usize) -> anyhow::Result<String> {
     ))
 }
 
-/// A packed scene seen from one side, as the simulator makes it.
+/// The volume of a packed scene from the simulator, observed from one side.
 pub(crate) fn scene(folder: &Path) -> anyhow::Result<Volume> {
     let out = folder.join("scene");
     let label = "label --scene packed --scenes 1 --points 1 --seed 51 --format processed --out";

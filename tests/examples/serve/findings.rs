@@ -3,7 +3,7 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 
-/// Rows of numbers below a title.
+/// A table with a title, and a name for each row of numbers.
 pub(crate) struct Table {
     title: String,
     columns: Vec<String>,
@@ -19,7 +19,7 @@ impl Table {
         }
     }
 
-    /// What is not known is NaN.
+    /// Adds a row. Unknown numbers are NaN.
     pub fn row<const N: usize>(&mut self, name: &str, numbers: [f64; N]) {
         self.rows.push((name.to_owned(), numbers.to_vec()));
     }
@@ -40,7 +40,7 @@ impl Table {
     }
 }
 
-/// All that a run finds out.
+/// All results of a run.
 pub(crate) struct Findings {
     conditions: String,
     tables: Vec<Table>,
@@ -53,7 +53,7 @@ impl Findings {
         Self { conditions, tables: vec![], figures: BTreeMap::new() }
     }
 
-    /// Prints a table, and keeps it.
+    /// Prints a table, and stores it.
     pub fn table(&mut self, table: Table) {
         table.print();
         self.tables.push(table);
@@ -63,9 +63,9 @@ impl Findings {
         self.figures.insert(name.to_owned(), (figure * 1e4).round() / 1e4);
     }
 
-    /// What was aimed at, beside what came of it. A figure that was not measured is left out.
+    /// Adds a table of the targets with the measured figures. Figures that were not measured are left out.
     pub fn compare(&mut self, aims: &[(&str, Aim)]) {
-        let mut table = Table::new("What was aimed at", &["aim", "measured", "reached: 1 or 0"]);
+        let mut table = Table::new("Targets", &["aim", "measured", "reached: 1 or 0"]);
         for (name, aim) in aims {
             let Some(&figure) = self.figures.get(*name) else { continue };
             let (sign, aim, reached) = match *aim {
@@ -77,7 +77,7 @@ impl Findings {
         self.table(table);
     }
 
-    /// The last line that is printed.
+    /// The figures as JSON, for the last line of the output.
     pub fn figures(&self) -> Value {
         json!(self.figures)
     }
@@ -94,7 +94,7 @@ impl Findings {
     }
 }
 
-/// What a figure is meant to be.
+/// The target of a figure.
 pub(crate) enum Aim {
     AtMost(f64),
     AtLeast(f64),

@@ -1,11 +1,11 @@
-//! How fast the server answers, beside what it is made of and beside other servers, all in one run.
+//! Latency and throughput of the server, compared in one run with its parts and with other servers.
 //!
-//! `make bench-serve`, or `cargo run --release -p grasp-tests --example serve [SECONDS [FILE]]` with `ORT_DYLIB_PATH` set;
-//! `SECONDS` is how long each load lasts, 5 by default, and all that is printed is also written to `FILE`, as JSON.
+//! `make bench-serve`, or `cargo run --release -p grasp-tests --example serve [SECONDS [FILE]]` with `ORT_DYLIB_PATH`
+//! set. `SECONDS` is the duration of each load, 5 by default. All results are also written to `FILE`, as JSON.
 //! `GRASP_TRAIN` names grasp-train, for libtorch's eager mode; `GRASPD_PEERS` names a Python with the packages of
-//! tests/peers, for the other servers. What is not there is left out.
+//! tests/peers, for the other servers. Without a variable its part is left out.
 //!
-//! The last line is one JSON object, of the figures that count. Times are those of one machine that does nothing else;
+//! The last line is one JSON object with the main figures. Run it on an idle machine. Durations depend on the machine:
 //! compare ratios.
 
 mod conditions;
@@ -28,17 +28,17 @@ use tonic::Code;
 use crate::findings::{Aim, Findings, Table, milliseconds};
 use crate::peers::{Peer, eager, openvino};
 
-/// Calls of the identity network, of which only the hop is left.
+/// Calls of the identity network, which measure the cost of gRPC.
 const HOPS: usize = 10_000;
-/// Calls before those that count.
+/// Calls before each measurement.
 const WARM_UP: usize = 20;
-/// Each row is measured in so many turns, one row after the other, so that a slow minute falls on all of them.
+/// The rows are measured alternately, in this many turns, so that a slow minute affects all of them.
 const TURNS: usize = 5;
-/// How many ask at the same time.
-const CROWDS: [usize; 3] = [1, 8, 32];
-/// The batch sizes of which the best is what a machine can do.
+/// Numbers of concurrent callers.
+const CALLERS: [usize; 3] = [1, 8, 32];
+/// Batch sizes. The best throughput of these is the capacity of the machine.
 const BATCHES: [usize; 4] = [1, 2, 4, 8];
-/// What the server is to reach. Beside libtorch, it is the share of the time that its eager mode takes in fp32.
+/// Targets. Those with libtorch are shares of the latency of its eager mode in fp32.
 const AIMS: [(&str, Aim); 6] = [
     ("hop_p50_ms", Aim::AtMost(0.6)),
     ("hop_p99_ms", Aim::AtMost(1.5)),
@@ -59,7 +59,7 @@ async fn main() -> anyhow::Result<()> {
         bench.latency(network, &mut findings).await?;
     }
     bench.throughput(&mut findings).await?;
-    bench.life(&mut findings)?;
+    bench.start_up(&mut findings)?;
     findings.compare(&AIMS);
     let stolen = started.percent_until(Stolen::so_far());
     println!("\nOther machines on the host took {stolen:.1} % of the processors' time.");
@@ -92,7 +92,7 @@ impl Bench {
         TestModel::new("mirror").resolution(grasp::RESOLUTION).write(&models("mirror")?);
         std::fs::copy(conditions::ZOO, models("vgn")?.join("vgn.onnx"))
             .with_context(|| format!("cannot copy {}", conditions::ZOO))?;
-        // Nobody has trained one yet; how long it takes does not depend on what it knows.
+        // Random weights: the latency does not depend on the weights.
         let transformer = Architecture::Transformer.build(grasp::RESOLUTION, 0)?;
         transformer.write(&models("transformer")?.join("transformer.onnx"))?;
         let scene = Arc::new(conditions::scene(folder.path())?);
@@ -108,20 +108,20 @@ impl Bench {
         self.models(network).join(format!("{name}.onnx"))
     }
 
-    /// graspd as it is by default.
+    /// graspd with its defaults and these flags.
     fn serve(&self, network: &str, flags: &[&str]) -> anyhow::Result<LocalServer> {
         let models = self.models(network);
         let fixed = ["--log".as_ref(), "warn".as_ref(), "--models".as_ref(), models.as_os_str()];
         Ok(LocalServer::spawn(graspd(), fixed.into_iter().chain(flags.iter().map(AsRef::as_ref)))?)
     }
 
-    /// What gRPC costs: the identity network leaves nothing else.
+    /// The latency that gRPC adds, measured with the identity network.
     async fn hop(&self, findings: &mut Findings) -> anyhow::Result<()> {
         let mut network = Network::load(&self.file("mirror"), &Running::default())?;
         let server = self.serve("mirror", &["--provider", "cpu", "--threads", "1"])?;
         let client = Client::connect(server.grpc().to_string()).await?;
         let mut table = Table::new(&format!("identity network, {HOPS} calls, one at a time"), &["p50 ms", "p99 ms"]);
-        // Two blocks, in which the identity sees two grasps; in a scene it would see hundreds.
+        // Two blocks give two grasps. In a real scene the identity network would have hundreds.
         let volume = Arc::new(blobs(grasp::RESOLUTION, Isometry3::identity(), &[[10, 20, 15], [30, 12, 25]]));
         network.fill(&[&volume])?;
         let run = times(HOPS, || network.run(1).map(drop))?;
@@ -132,7 +132,7 @@ impl Bench {
             let hop = [0.5, 0.99].map(|share| {
                 milliseconds(Report::quantile(&calls, share)) - milliseconds(Report::quantile(&run, share))
             });
-            table.row(&format!("gRPC beyond it, {name}"), hop);
+            table.row(&format!("gRPC overhead, {name}"), hop);
             if dtype == DataType::F32 {
                 findings.figure("hop_p50_ms", hop[0]);
                 findings.figure("hop_p99_ms", hop[1]);
@@ -142,7 +142,8 @@ impl Bench {
         Ok(())
     }
 
-    /// One caller: bare, in this process, and over gRPC, in turns; then what others take for the same.
+    /// Latency of single calls, measured in turns: the session alone, the parts in this process, and over gRPC.
+    /// Then the latency of libtorch and OpenVINO.
     async fn latency(&self, name: &str, findings: &mut Findings) -> anyhow::Result<()> {
         let mut network = Network::load(&self.file(name), &Running::auto(self.threads))?;
         let server = self.serve(name, &[])?;
@@ -182,7 +183,7 @@ impl Bench {
         if let Some(eager) = eager(&self.file(name), self.threads)? {
             table.row("libtorch, eager, fp32", [eager.p50_ms, f64::NAN, p50 / eager.p50_ms]);
             table.row(
-                "  its heads apart, as published",
+                "  with separate heads, as published",
                 [eager.published_p50_ms, f64::NAN, p50 / eager.published_p50_ms],
             );
             findings.figure(&format!("{name}_vs_torch"), p50 / eager.published_p50_ms);
@@ -199,7 +200,8 @@ impl Bench {
         Ok(())
     }
 
-    /// Many callers, beside the best that this machine can do and beside other servers; then callers who come by chance.
+    /// Throughput with concurrent callers, compared with batches without a server and with other servers; then Poisson
+    /// arrivals.
     async fn throughput(&self, findings: &mut Findings) -> anyhow::Result<()> {
         let max_batch = BATCHES.into_iter().max().unwrap_or(1);
         let running = Running { max_batch, ..Running::auto(self.threads) };
@@ -229,7 +231,7 @@ impl Bench {
             &format!("vgn, {backend}, many callers, {:?} each", self.seconds),
             &["callers", "answers/s", "p50 ms", "p99 ms"],
         );
-        let mut crowd = |server: &str, callers: usize, report: &Report| {
+        let mut add_row = |server: &str, callers: usize, report: &Report| {
             let [p50, p99] = [0.5, 0.99].map(|share| milliseconds(Report::quantile(&report.answered, share)));
             table.row(server, [callers as f64, report.throughput(), p50, p99]);
             report.throughput()
@@ -238,10 +240,10 @@ impl Bench {
         {
             let server = self.serve("vgn", &["--queue", "64"])?;
             let client = Client::connect(server.grpc().to_string()).await?;
-            for callers in CROWDS {
+            for callers in CALLERS {
                 let report =
-                    ask(&client, &self.scene, Arrivals::Callers(callers), self.until(), Options::default()).await;
-                let throughput = crowd("graspd", callers, &report);
+                    run_load(&client, &self.scene, Arrivals::Callers(callers), self.until(), Options::default()).await;
+                let throughput = add_row("graspd", callers, &report);
                 ensure!(report.refusals() == 0, "graspd refused calls: {:?}", report.refused.keys());
                 if callers == 8 {
                     capacity = throughput;
@@ -251,9 +253,9 @@ impl Bench {
         findings.figure("throughput_ratio", capacity / best);
         for kind in ["plain_grpc", "triton"] {
             let Some(peer) = Peer::run(kind, &self.file("vgn"), self.threads, backend)? else { continue };
-            for callers in CROWDS {
+            for callers in CALLERS {
                 let report = peer.load(&self.scene, callers, self.until()).await?;
-                let throughput = crowd(kind, callers, &report);
+                let throughput = add_row(kind, callers, &report);
                 ensure!(report.refusals() == 0, "{kind} refused calls: {:?}", report.refused.keys());
                 if callers == 8 {
                     findings.figure(&format!("{kind}_ratio"), capacity / throughput);
@@ -261,16 +263,15 @@ impl Bench {
             }
         }
         findings.table(table);
-        self.chance(capacity, bare_p50, findings).await
+        self.poisson(capacity, bare_p50, findings).await
     }
 
-    /// The highest rate at which callers who come by chance wait no longer than three bare inferences, but for one in a
-    /// hundred.
-    async fn chance(&self, capacity: f64, bare_p50: f64, findings: &mut Findings) -> anyhow::Result<()> {
+    /// The highest rate of Poisson arrivals (open loop) at which the p99 latency is at most that of three inferences.
+    async fn poisson(&self, capacity: f64, bare_p50: f64, findings: &mut Findings) -> anyhow::Result<()> {
         let server = self.serve("vgn", &[])?;
         let client = Client::connect(server.grpc().to_string()).await?;
         let mut table = Table::new(
-            "vgn, callers who come by chance",
+            "vgn, Poisson arrivals (open loop)",
             &["a second", "of capacity", "p50 ms", "p99 ms", "p99 to bare"],
         );
         let (mut good, mut bad) = (0.0, 1.0);
@@ -278,7 +279,7 @@ impl Bench {
             let share = f64::midpoint(good, bad);
             let rate = share * capacity;
             let until = Until::Elapsed(2 * self.seconds);
-            let report = ask(&client, &self.scene, Arrivals::Rate(rate), until, Options::default()).await;
+            let report = run_load(&client, &self.scene, Arrivals::Rate(rate), until, Options::default()).await;
             let [p50, p99] = [0.5, 0.99].map(|share| milliseconds(Report::quantile(&report.answered, share)));
             table.row("", [rate, share, p50, p99, p99 / bare_p50]);
             if report.refusals() == 0 && p99 <= 3.0 * bare_p50 { good = share } else { bad = share }
@@ -289,9 +290,9 @@ impl Bench {
         Ok(())
     }
 
-    /// From nothing to the first answer, and the memory that took.
-    fn life(&self, findings: &mut Findings) -> anyhow::Result<()> {
-        let mut table = Table::new("graspd's life", &["s to ready", "MB at most"]);
+    /// Time until graspd is ready, and its peak memory.
+    fn start_up(&self, findings: &mut Findings) -> anyhow::Result<()> {
+        let mut table = Table::new("graspd's start and memory", &["s to ready", "MB at most"]);
         for network in ["vgn", "transformer"] {
             let started = Instant::now();
             let server = self.serve(network, &[])?;
@@ -310,7 +311,7 @@ impl Bench {
     }
 }
 
-/// The sorted times of calls that must all be answered.
+/// The sorted latencies of calls, none of which may be refused.
 async fn calls(
     client: &Client,
     volume: &Arc<Volume>,
@@ -318,15 +319,15 @@ async fn calls(
     until: Until,
     options: Options,
 ) -> anyhow::Result<Vec<Duration>> {
-    let report = ask(client, volume, arrivals, until, options).await;
+    let report = run_load(client, volume, arrivals, until, options).await;
     ensure!(report.refusals() == 0, "graspd refused {} calls: {:?}", report.refusals(), report.refused.keys());
     Ok(report.answered)
 }
 
-/// Asks graspd, a few times before it counts.
-async fn ask(client: &Client, volume: &Arc<Volume>, arrivals: Arrivals, until: Until, options: Options) -> Report {
+/// Runs a load after a few calls as warm-up.
+async fn run_load(client: &Client, volume: &Arc<Volume>, arrivals: Arrivals, until: Until, options: Options) -> Report {
     for _ in 0..WARM_UP {
-        // What is wrong is seen in what follows.
+        // Errors are ignored here, because they are counted in the load below.
         let _ = client.detect(volume, options.clone()).await;
     }
     let (client, volume) = (client.clone(), Arc::clone(volume));
@@ -340,7 +341,7 @@ async fn ask(client: &Client, volume: &Arc<Volume>, arrivals: Arrivals, until: U
     .await
 }
 
-/// How long each of so many takes, sorted.
+/// The sorted durations of `count` runs of `work`.
 fn times<E>(count: usize, mut work: impl FnMut() -> Result<(), E>) -> Result<Vec<Duration>, E> {
     let mut times = Vec::with_capacity(count);
     for _ in 0..count {
@@ -352,7 +353,7 @@ fn times<E>(count: usize, mut work: impl FnMut() -> Result<(), E>) -> Result<Vec
     Ok(times)
 }
 
-/// A path below this crate's folder.
-fn beside(path: &str) -> PathBuf {
+/// A path relative to the folder of this crate.
+fn relative(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
 }

@@ -1,4 +1,4 @@
-//! Others who do the same: a server in Python, Triton, libtorch's eager mode, OpenVINO by itself.
+//! Other programs that run the same network: a server in Python, Triton, libtorch's eager mode, OpenVINO's runtime.
 
 use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;
@@ -20,20 +20,20 @@ use serde::de::DeserializeOwned;
 use tonic::Code;
 use tonic::transport::Channel;
 
-use crate::beside;
+use crate::relative;
 
-/// Replies of Triton hold the maps, 1.5 MB.
+/// Flow-control window, bytes. Triton's replies contain the maps, 1.5 MB.
 const WINDOW: u32 = 4 << 20;
 
 /// Another server of the same network.
 pub(crate) struct Peer {
     process: Child,
     address: SocketAddr,
-    speaks: Speaks,
+    protocol: Protocol,
 }
 
 #[derive(Clone, Copy)]
-enum Speaks {
+enum Protocol {
     Grasps,
     OpenInference,
 }
@@ -51,7 +51,7 @@ pub(crate) struct Latency {
     pub version: String,
 }
 
-/// libtorch's eager mode in fp32, if there is a grasp-train.
+/// Latency of libtorch's eager mode in fp32, if GRASP_TRAIN is set.
 pub(crate) fn eager(model: &Path, threads: usize) -> anyhow::Result<Option<Eager>> {
     let Some(train) = std::env::var_os("GRASP_TRAIN") else { return Ok(None) };
     let threads = threads.to_string();
@@ -60,7 +60,7 @@ pub(crate) fn eager(model: &Path, threads: usize) -> anyhow::Result<Option<Eager
     printed(&mut command).map(Some)
 }
 
-/// OpenVINO's own runtime, if there are the peers' packages.
+/// Latency of OpenVINO's own runtime, if GRASPD_PEERS is set.
 pub(crate) fn openvino(
     model: &Path,
     threads: usize,
@@ -77,7 +77,7 @@ pub(crate) fn openvino(
 
 fn python(script: &str) -> Option<Command> {
     let mut command = Command::new(std::env::var_os("GRASPD_PEERS")?);
-    command.arg(beside(&format!("peers/{script}.py"))).env("GRASPD_PROTO", beside("../proto/proto"));
+    command.arg(relative(&format!("peers/{script}.py"))).env("GRASPD_PROTO", relative("../proto/proto"));
     Some(command)
 }
 
@@ -85,11 +85,11 @@ fn python(script: &str) -> Option<Command> {
 fn printed<T: DeserializeOwned>(command: &mut Command) -> anyhow::Result<T> {
     let output = command.stderr(Stdio::inherit()).output().with_context(|| format!("cannot run {command:?}"))?;
     ensure!(output.status.success(), "{command:?} ended with {}", output.status);
-    serde_json::from_slice(&output.stdout).with_context(|| format!("what {command:?} prints"))
+    serde_json::from_slice(&output.stdout).with_context(|| format!("the output of {command:?} is not valid JSON"))
 }
 
 impl Peer {
-    /// Starts one, if there are the peers' packages, and waits until it is ready.
+    /// Starts a server if GRASPD_PEERS is set, and waits until it is ready.
     pub fn run(name: &str, model: &Path, threads: usize, backend: Backend) -> anyhow::Result<Option<Self>> {
         let Some(mut command) = python(name) else { return Ok(None) };
         let Backend { provider, precision } = backend;
@@ -103,9 +103,9 @@ impl Peer {
         ]);
         command.arg("--model").arg(model).stdout(Stdio::piped()).stderr(Stdio::null());
         let mut process = command.spawn().with_context(|| format!("cannot run {command:?}"))?;
-        let stdout = BufReader::new(process.stdout.take().context("stdout was asked for")?);
-        let speaks = if name == "triton" { Speaks::OpenInference } else { Speaks::Grasps };
-        let mut peer = Self { process, address: SocketAddr::from(([127, 0, 0, 1], 0)), speaks };
+        let stdout = BufReader::new(process.stdout.take().context("stdout is piped")?);
+        let protocol = if name == "triton" { Protocol::OpenInference } else { Protocol::Grasps };
+        let mut peer = Self { process, address: SocketAddr::from(([127, 0, 0, 1], 0)), protocol };
         for line in stdout.lines() {
             let line = line?;
             if let Some(address) = line.strip_prefix("grpc listening on ") {
@@ -119,10 +119,10 @@ impl Peer {
 
     pub async fn load(&self, scene: &Volume, callers: usize, until: Until) -> anyhow::Result<Report> {
         let arrivals = Arrivals::Callers(callers);
-        // The first calls are not those that count.
+        // Warm-up, which is not measured.
         let warm_up = Until::Elapsed(Duration::from_secs(1));
-        match self.speaks {
-            Speaks::Grasps => {
+        match self.protocol {
+            Protocol::Grasps => {
                 let client = Client::connect(self.address.to_string()).await?;
                 let scene = Arc::new(scene.clone());
                 let call = move |_| {
@@ -135,7 +135,7 @@ impl Peer {
                 load(arrivals, warm_up, call.clone()).await;
                 Ok(load(arrivals, until, call).await)
             }
-            Speaks::OpenInference => {
+            Protocol::OpenInference => {
                 let endpoint = Channel::from_shared(format!("http://{}", self.address))?;
                 let endpoint = endpoint.initial_stream_window_size(WINDOW).initial_connection_window_size(4 * WINDOW);
                 let client = GrpcInferenceServiceClient::new(endpoint.connect().await?);
@@ -154,7 +154,7 @@ impl Peer {
 
 impl Drop for Peer {
     fn drop(&mut self) {
-        // Its own children end with it only if it is told.
+        // SIGTERM, because after SIGKILL the children of the process would stay.
         let _ = kill_process(Pid::from_child(&self.process), Signal::TERM);
         let _ = self.process.wait();
     }

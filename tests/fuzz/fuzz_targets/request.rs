@@ -1,4 +1,4 @@
-//! A request's bytes as anybody may send them: decoded, checked, and, if the volume is one, used as a network's answer.
+//! Arbitrary bytes as a request: decoded and checked. A valid volume is also decoded as the outputs of a network.
 
 #![no_main]
 
@@ -9,17 +9,17 @@ use prost::Message;
 
 fuzz_target!(|bytes: &[u8]| {
     let Some((&kind, bytes)) = bytes.split_first() else { return };
-    // A message whose parts fit together is too rare among bytes left to chance.
+    // Random bytes almost never decode to a message with consistent fields, so every other input is built from fields.
     let volume = if kind % 2 == 0 { any(bytes) } else { fitting(bytes) };
     let Some(message) = &volume else { return };
-    // What it says of itself is checked before its data.
-    let says = resolution(message);
+    // The resolution is checked before the data.
+    let checked = resolution(message);
     let Ok(volume) = Volume::try_from(message) else { return };
-    assert_eq!(says.ok(), Some(volume.resolution()));
+    assert_eq!(checked.ok(), Some(volume.resolution()));
     assert!(volume.values().iter().all(|value| (0.0..=1.0).contains(value)));
 
-    // What was taken can be sent on, and is the same there.
-    let again = Volume::try_from(&encode(&volume, pb::DataType::F32, "")).expect("what was taken is taken again");
+    // A valid volume round-trips.
+    let again = Volume::try_from(&encode(&volume, pb::DataType::F32, "")).expect("an encoded volume is valid");
     assert_eq!(again.values(), volume.values());
 
     let values = volume.values();
@@ -28,7 +28,7 @@ fuzz_target!(|bytes: &[u8]| {
     if let Ok(decoded) = decode(&volume, &maps, &DecodeParams::default()) {
         for grasp in &decoded.grasps {
             let message = pb::Grasp::from(grasp);
-            let read = grasp::Grasp::try_from(&message).expect("what is sent can be read");
+            let read = grasp::Grasp::try_from(&message).expect("an encoded grasp is valid");
             assert!(read.quality.is_finite() && read.pose.translation.vector.iter().all(|c| c.is_finite()));
         }
     }
@@ -38,7 +38,7 @@ fn any(bytes: &[u8]) -> Option<pb::Volume> {
     pb::DetectGraspsRequest::decode(bytes).ok()?.volume
 }
 
-/// A volume with as many bytes as its resolution and type want, all of them the fuzzer's.
+/// A volume whose data has the length for its resolution and type, with values from the fuzzer.
 fn fitting(mut bytes: &[u8]) -> Option<pb::Volume> {
     let [resolution, dtype] = *bytes.split_off(..2)?.first_chunk()?;
     let mut number = || Some(f64::from_le_bytes(*bytes.split_off(..8)?.first_chunk()?));

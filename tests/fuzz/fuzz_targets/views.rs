@@ -1,4 +1,4 @@
-//! Depth images, point clouds and wishes as anybody may send them: decoded, checked, fused, and answered about.
+//! Arbitrary bytes as options, depth images and point clouds: decoded, checked and fused.
 
 #![no_main]
 
@@ -18,7 +18,7 @@ fuzz_target!(|bytes: &[u8]| {
     }
 });
 
-/// Whatever was taken can be told in poses that are finite.
+/// Poses with valid options are finite.
 fn options(bytes: &[u8]) {
     let Ok(options) = pb::Options::decode(bytes) else { return };
     let Ok(params) = DetectParams::try_from(&options) else { return };
@@ -33,7 +33,7 @@ fn depth(bytes: &[u8]) {
     let Ok(request) = pb::DetectGraspsFromDepthRequest::decode(bytes) else { return };
     let Ok(workspace) = Workspace::try_from(request.workspace.unwrap_or_default()) else { return };
     for (index, view) in request.views.iter().enumerate() {
-        look(view, index, &workspace.frame_from_task);
+        check(view, index, &workspace.frame_from_task);
     }
 }
 
@@ -49,7 +49,7 @@ fn cloud(bytes: &[u8]) {
     }
 }
 
-/// An image whose data fits its size: too rare among bytes left to chance.
+/// A depth image whose data has the length for its size, which random bytes almost never have.
 fn fitting(mut bytes: &[u8]) {
     let mut number = || Some(f64::from_le_bytes(*bytes.split_off(..8)?.first_chunk()?));
     let mut view = || {
@@ -67,19 +67,19 @@ fn fitting(mut bytes: &[u8]) {
         camera: Some(pb::Camera { width: 12, height: 9, k }),
         extrinsics: Some(pb::depth_view::Extrinsics::CameraFromTask(pose)),
     };
-    look(&view, 0, &Isometry3::identity());
+    check(&view, 0, &Isometry3::identity());
 }
 
-fn look(view: &pb::DepthView, index: usize, frame_from_task: &Isometry3<f64>) {
+fn check(view: &pb::DepthView, index: usize, frame_from_task: &Isometry3<f64>) {
     match depth_view(view, index, frame_from_task) {
         Ok(view) => integrate(&view),
         Err(error) => assert!(error.message.starts_with(&*error.field), "{error:?}"),
     }
 }
 
-/// Whatever a camera says, a volume has values that volumes may have, or there is a reason for none.
+/// Every valid view gives a valid volume, or a reason why nothing was measured.
 fn integrate(view: &grasp::View) {
-    let image = DepthImage::new(view.intrinsics, &view.depth).expect("it was checked");
+    let image = DepthImage::new(view.intrinsics, &view.depth).expect("the image was checked");
     let mut fusion = Fusion::new(8, 0.3);
     if fusion.integrate(&image, &view.camera_from_task) == 0 {
         assert!(!fusion.blind(&image, &view.camera_from_task).to_string().is_empty());

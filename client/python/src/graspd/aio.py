@@ -53,7 +53,7 @@ class Client(Connection[grpc.aio.Channel]):
         *,
         request_id: str = "",
     ) -> Detection:
-        """Detects grasps in depth images."""
+        """Detects grasps in 1 to 64 depth images."""
         return await self._call(methods.DETECT_FROM_DEPTH, wire.depth_request(views, workspace, options, request_id))
 
     async def detect_from_cloud(
@@ -64,13 +64,14 @@ class Client(Connection[grpc.aio.Channel]):
         *,
         request_id: str = "",
     ) -> Detection:
-        """Detects grasps in point clouds."""
+        """Detects grasps in 1 to 64 point clouds, each observed by one camera."""
         return await self._call(methods.DETECT_FROM_CLOUD, wire.cloud_request(views, workspace, options, request_id))
 
     async def detect_stream(
         self, volumes: AsyncIterable[Volume | NDArray[Any]], options: Options | None = None
     ) -> AsyncIterator[Detection | Error]:
-        """Yields the grasps of each volume, or its `Error`, in the order of the volumes."""
+        """Yields the grasps of each volume in the order of the volumes. For a refused volume it yields the `Error`, and
+        the stream continues. An error that ends the stream is raised."""
         detecting = Detecting(options)
 
         async def requests() -> AsyncIterator[pb.DetectGraspsRequest]:
@@ -150,10 +151,11 @@ class Tracking:
     async def add(
         self, views: Iterable[DepthView] = (), options: Options | None = None, *, request_id: str = ""
     ) -> Detection:
-        """Adds views to the volume and detects grasps in everything observed so far. Calls must not overlap."""
+        """Adds views to the volume and detects grasps in everything observed so far. Calls must not overlap. For the
+        rest see `graspd.Tracking.add`."""
         request = self._adding.request(views, options, request_id)
         try:
-            # If the server has closed the stream, its last reply holds the reason.
+            # If the server has closed the stream, `read` returns or raises the reason.
             with suppress(asyncio.InvalidStateError):
                 await self._stream.write(request)
             reply = await self._stream.read()

@@ -74,8 +74,8 @@ class Client(Connection[grpc.Channel]):
     def detect_stream(
         self, volumes: Iterable[Volume | NDArray[Any]], options: Options | None = None
     ) -> Iterator[Detection | Error]:
-        """Yields the grasps of each volume in the order of the volumes. Another thread iterates `volumes`. For a
-        refused volume it yields the `Error`, and the stream continues. An error that ends the stream is raised."""
+        """Yields the grasps of each volume in the order of the volumes. For a refused volume it yields the `Error`, and
+        the stream continues. An error that ends the stream is raised. `volumes` is iterated in another thread."""
         detecting = Detecting(options)
 
         def requests() -> Iterator[pb.DetectGraspsRequest]:
@@ -158,8 +158,8 @@ class Tracking:
         """Adds views to the volume and detects grasps in everything observed so far. `views` may be empty. With
         `options` of None the options of the previous call apply.
 
-        An invalid view does not end the tracking. `Aborted` ends it, and so does `ResourceExhausted` at the first call,
-        when the server's limit of tracked volumes is reached. Calls are not retried.
+        An invalid view does not end the tracking. `Aborted` ends it. `ResourceExhausted` at the first call ends it too:
+        the server's limit of tracked volumes is reached. Calls are not retried.
         """
         self._requests.put(self._adding.request(views, options, request_id))
         try:

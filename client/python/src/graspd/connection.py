@@ -16,7 +16,7 @@ File: TypeAlias = "str | PathLike[str]"
 OPTIONS = (
     # A low threshold can return tens of thousands of grasps.
     ("grpc.max_receive_message_length", -1),
-    # Reconnect within the pauses of `Retry`; gRPC's default is seconds.
+    # Reconnect within the pauses of `Retry`. By default gRPC waits for seconds.
     ("grpc.initial_reconnect_backoff_ms", 100),
     ("grpc.max_reconnect_backoff_ms", 500),
     # Detect servers that disappear without closing the connection.

@@ -86,6 +86,7 @@ class Detection:
     model: str
     """Name of the model that found the grasps."""
     version: str
+    """Version of the model."""
     latency: Latency
     dropped: Dropped | None
     """Set if `Options.explain` is set or there is no grasp."""
@@ -114,7 +115,7 @@ class Model:
     precision: str
     """Number format of the inference: fp32, bf16, fp16 or int8."""
     voxel_origin: str
-    """Point of a voxel that a network's grasp refers to: ``corner``, at index · `voxel_size`, or ``center``, half a
+    """Position of a network's grasp in its voxel: ``corner``, at index · `voxel_size`, or ``center``, half a
     voxel further. Empty for planners without a network."""
     camera_azimuth: float | None
     """Azimuth of the camera in the training data, degrees about the vertical axis through the middle of the volume,

@@ -43,11 +43,11 @@ class ResourceExhausted(Error):
 
 
 class DeadlineExceeded(Error):
-    """The client's `timeout` passed."""
+    """The client's `timeout` passed, or the message arrived too slowly."""
 
 
 class Aborted(Error):
-    """The server deleted the tracked volume, because it received no view for too long."""
+    """The server deleted the tracked volume, because it received no request for too long."""
 
 
 class Unavailable(Error):

@@ -14,7 +14,9 @@ class Box:
     """An axis-aligned box, metres."""
 
     min: Vector
+    """Corner with the smallest coordinates."""
     max: Vector
+    """Corner with the largest coordinates."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,10 @@ class Options:
     gripper: Gripper | None = None
     """Shape of the hand; None: the Panda hand, with which the networks were trained."""
     collision: CollisionCheck | None = None
+    """Collision check of the open hand; None: no check."""
     convention: Convention | None = None
+    """Frame of the hand that the poses refer to; None: the finger base, closing along y."""
     pregrasp_distance: float | None = None
     """Distance of the pre-grasp from the grasp, back along the approach, metres; None: 0.05."""
     retreat: Retreat | None = None
+    """Motion of the hand after it has closed; None: 0.1 m back along the approach."""

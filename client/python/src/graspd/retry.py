@@ -11,8 +11,8 @@ from graspd.errors import Error, ResourceExhausted, Unavailable
 
 @dataclass(frozen=True)
 class Retry:
-    """When a call is retried. Only failures that can pass are retried: the server is unreachable, the connection
-    breaks, or the server is busy. Detection is idempotent."""
+    """When a call is retried. Only transient failures are retried: the server is unreachable, the connection breaks, or
+    the server is busy. Retries are safe, because detection is idempotent."""
 
     attempts: int
     """Maximum number of attempts, including the first."""
@@ -21,12 +21,12 @@ class Retry:
     this, so that clients that were refused together do not retry together. It is never shorter than the server's retry
     hint."""
     longest: float
-    """Upper limit of the pause, before the server's retry hint, seconds."""
+    """Upper limit of the pause, seconds. The server's retry hint can exceed it."""
 
     NONE: ClassVar[Retry]
     """A single attempt."""
     RECOMMENDED: ClassVar[Retry]
-    """For robots: bridges a lost replica or a full queue within about half a second."""
+    """For robots: retries for about half a second, for example after the loss of a replica or when a queue is full."""
 
     def after(self, attempts: int, error: Error) -> float | None:
         """The pause after this many attempts, seconds; None: no further attempt. `error` is the last attempt's."""

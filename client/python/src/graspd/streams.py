@@ -28,8 +28,8 @@ class Detecting:
 
     @contextmanager
     def sending(self) -> Iterator[None]:
-        """Surrounds the iteration of the volumes. An exception of the iteration is stored and raised by `end`, after
-        the results of the earlier volumes; gRPC would only log it."""
+        """Wraps the iteration over the volumes. An exception of the iteration is stored, and `end` raises it after the
+        results of the earlier volumes. gRPC would only log it."""
         try:
             yield
         except Exception as failure:

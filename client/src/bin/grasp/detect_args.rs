@@ -14,7 +14,7 @@ pub(crate) struct DetectArgs {
     #[arg(long, default_value = "", hide_default_value = true)]
     model: String,
 
-    /// Version of the model. Default: the newest.
+    /// Version of the model (not of this program). Default: the newest.
     #[arg(long, default_value = "", hide_default_value = true)]
     version: String,
 

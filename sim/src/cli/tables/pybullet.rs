@@ -12,7 +12,7 @@ use grasp_sim::score::Summary;
 use grasp_sim::tables::Condition;
 use tempfile::TempDir;
 
-use super::{FORCE, scene_of};
+use super::{force, scene_of};
 
 /// Relative to the root of a checkout.
 pub(super) const FOLDER: &str = "sim/pybullet";
@@ -31,21 +31,27 @@ pub(super) struct PyBullet {
 pub(super) struct Model<'a> {
     folder: &'a Path,
     name: String,
-    /// Smallest quality of a grasp; `None` for networks, which use ε and `force`.
+    /// Smallest quality of a grasp, without `force`; `None` for networks, which use ε and `force`.
     threshold: Option<&'static str>,
+    /// Floor of `force`.
+    force: f32,
 }
 
 /// The served model of a planner; `None` if graspd does not serve it. `zoo` is the model folder for planners without a
 /// network.
 pub(super) fn model<'a>(planner: &'a PlannerSpec, zoo: &'a Path) -> Option<Model<'a>> {
-    let classical = |name: &str, threshold| Model { folder: zoo, name: name.to_owned(), threshold: Some(threshold) };
+    let classical = |name: &str, threshold| {
+        Some(Model { folder: zoo, name: name.to_owned(), threshold: Some(threshold), force: force(planner) })
+    };
+    let network = |file: &Path, folder| {
+        let name = file.file_stem()?.to_string_lossy().into_owned();
+        Some(Model { folder, name, threshold: None, force: force(planner) })
+    };
     match planner {
-        PlannerSpec::Highest => Some(classical("shaf", "0.000001")),
-        PlannerSpec::Gpd(_) => Some(classical("gpd", "0.5")),
-        PlannerSpec::Network(path) => {
-            let name = path.file_stem()?.to_string_lossy().into_owned();
-            Some(Model { folder: path.parent()?, name, threshold: None })
-        }
+        PlannerSpec::Highest => classical("shaf", "0.000001"),
+        PlannerSpec::Gpd(_) => classical("gpd", "0.5"),
+        PlannerSpec::Network(path) => network(path, path.parent()?),
+        PlannerSpec::Evaluated { evaluator, network: path } => network(evaluator, path.parent()?),
         PlannerSpec::Random | PlannerSpec::Server(_) | PlannerSpec::HighestProposed(_) => None,
     }
 }
@@ -80,7 +86,7 @@ impl PyBullet {
             let epsilon = format!("0.{}", condition.epsilon);
             let (threshold, force) = match model.threshold {
                 Some(threshold) => (threshold, "none".to_owned()),
-                None => (epsilon.as_str(), FORCE.to_string()),
+                None => (epsilon.as_str(), model.force.to_string()),
             };
             command.args(["--planner", &format!("grpc:{address}"), "--model", &model.name]);
             command.args(["--threshold", threshold, "--force", &force]);

@@ -1,0 +1,127 @@
+use std::f64::consts::PI;
+use std::path::Path;
+
+use grasp::{DecodeParams, Decoded, FINGER_DEPTH, Grasp, Patch, Volume, select};
+use grasp_models::{Classifier, LoadError, Metadata, Options, RuntimeError};
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+
+use crate::PlanError;
+
+/// Smallest quality of a network's grasp that is evaluated.
+const PROPOSAL_THRESHOLD: f32 = 0.2;
+
+/// Largest number of a network's grasps that are evaluated.
+const PROPOSALS: usize = 32;
+
+/// Number of the best of them of which moved copies are evaluated, too.
+const REFINED: usize = 6;
+
+/// Smallest gain of quality for which a grasp is moved. The best of many predictions is on average too high.
+const GAIN: f32 = 0.15;
+
+/// Scores grasp poses and moves them: from the volume around the hand it predicts whether the hand reaches the grasp
+/// without a contact and lifts an object.
+///
+/// A network scores voxels. The evaluator scores poses, so it also finds the best pose near a network's grasp.
+pub struct Evaluator {
+    classifier: Classifier,
+}
+
+impl Evaluator {
+    /// The floor of `force` in benchmarks. It is lower than a network's, because the evaluator predicts a success without
+    /// any contact on the approach: in piles half of the grasps at this quality succeed although they touch something.
+    pub const FORCE: f32 = 0.1;
+
+    /// An evaluator with a loaded classifier of patches.
+    #[must_use]
+    pub fn new(classifier: Classifier) -> Self {
+        Self { classifier }
+    }
+
+    /// Loads the classifier from a file.
+    ///
+    /// # Errors
+    /// [`LoadError`] if the file is not a valid classifier of patches.
+    pub fn load(path: &Path, options: &Options) -> Result<Self, LoadError> {
+        Ok(Self::new(Classifier::load(path, &Patch::SHAPE, options)?))
+    }
+
+    /// The default parameters for a network with an evaluator: the threshold 0.5 keeps grasps that succeed more likely
+    /// than not.
+    #[must_use]
+    pub fn decode_params(network: &Metadata) -> DecodeParams {
+        DecodeParams { threshold: 0.5, ..network.decode_params() }
+    }
+
+    /// The decoding parameters of the network's proposals.
+    #[must_use]
+    pub fn proposal_params(params: &DecodeParams) -> DecodeParams {
+        DecodeParams { threshold: PROPOSAL_THRESHOLD, force: None, clearance: None, ..*params }
+    }
+
+    /// Scores and moves a network's proposals, and selects the grasps that pass `params`. Stops when `is_wanted` returns
+    /// false.
+    ///
+    /// # Errors
+    /// [`PlanError`] if the classifier fails or planning is cancelled.
+    pub fn refine(
+        &mut self,
+        proposals: Decoded,
+        volume: &Volume,
+        params: &DecodeParams,
+        is_wanted: &dyn Fn() -> bool,
+    ) -> Result<Decoded, PlanError> {
+        let Decoded { mut grasps, mut dropped } = proposals;
+        dropped.suppressed += grasps.len().saturating_sub(PROPOSALS);
+        grasps.truncate(PROPOSALS);
+        // The hand of the evaluator's training has its fingertips at `FINGER_DEPTH`.
+        let depth = params.hand.map_or(FINGER_DEPTH, |hand| hand.depth);
+        self.evaluate(&mut grasps, volume, depth)?;
+        sort(&mut grasps);
+        for grasp in grasps.iter_mut().take(REFINED) {
+            if !is_wanted() {
+                return Err(PlanError::Cancelled);
+            }
+            let mut moved: Vec<Grasp> = variations(grasp, depth).collect();
+            self.evaluate(&mut moved, volume, depth)?;
+            let best = moved.into_iter().max_by(|a, b| a.quality.total_cmp(&b.quality));
+            *grasp = best.filter(|best| best.quality > grasp.quality + GAIN).unwrap_or(*grasp);
+        }
+        sort(&mut grasps);
+        let mut decoded = select(&grasps, volume, params);
+        decoded.dropped += dropped;
+        Ok(decoded)
+    }
+
+    /// Replaces the quality of each grasp by the predicted probability of success.
+    fn evaluate(&mut self, grasps: &mut [Grasp], volume: &Volume, depth: f64) -> Result<(), RuntimeError> {
+        let of_training_hand = Translation3::new(0.0, 0.0, depth - FINGER_DEPTH);
+        let patches: Vec<Patch> =
+            grasps.iter().map(|grasp| Patch::of(volume, &(grasp.pose * of_training_hand))).collect();
+        let values: Vec<&[u8]> = patches.iter().map(Patch::values).collect();
+        for (grasp, score) in grasps.iter_mut().zip(self.classifier.score(&values)?) {
+            grasp.quality = 1.0 / (1.0 + (-score).exp());
+        }
+        Ok(())
+    }
+}
+
+/// Sorts by quality, best first.
+fn sort(grasps: &mut [Grasp]) {
+    grasps.sort_by(|a, b| b.quality.total_cmp(&a.quality));
+}
+
+/// The grasp moved along its closing axis and its approach, and rotated about its axes through the middle between the
+/// fingertips, so that the grasped part stays between them. `depth` is the distance of the fingertips from the origin.
+fn variations(grasp: &Grasp, depth: f64) -> impl Iterator<Item = Grasp> {
+    const SHIFTS: [f64; 4] = [-0.008, -0.004, 0.004, 0.008];
+    const DEPTHS: [f64; 3] = [-0.015, -0.0075, 0.0075];
+    const ANGLES: [f64; 4] = [-PI / 6.0, -PI / 12.0, PI / 12.0, PI / 6.0];
+    let shifts = SHIFTS.map(|y| Isometry3::translation(0.0, y, 0.0));
+    let depths = DEPTHS.map(|z| Isometry3::translation(0.0, 0.0, z));
+    let tips = Translation3::new(0.0, 0.0, depth);
+    let about = move |axis| ANGLES.map(|angle| tips * UnitQuaternion::from_axis_angle(&axis, angle) * tips.inverse());
+    let turns = [Vector3::x_axis(), Vector3::y_axis(), Vector3::z_axis()].into_iter().flat_map(about);
+    let grasp = *grasp;
+    shifts.into_iter().chain(depths).chain(turns).map(move |change| Grasp { pose: grasp.pose * change, ..grasp })
+}
