@@ -424,7 +424,7 @@ fn errors_name_the_cause() {
         (format!("{label} urdf"), "urdf/a.urdf"),
         (format!("{label} flat"), "flat/a.obj"),
         (format!("{label} wide"), "wide/a.urdf"),
-        ("label --scenes 1 --out never --views top".to_owned(), "use side, side:90, circle, random:1-6"),
+        ("label --scenes 1 --out never --views top".to_owned(), "use side, side:90, side:random, circle, random:1-6"),
         ("label --scenes 1 --out never --noise 2".to_owned(), "must be from 0 to 1"),
         ("label --scenes 1 --out never --observations 2 --format raw".to_owned(), "only --format packed"),
         ("label --scenes 3 --scene pile --points 6 --format processed --out half".to_owned(), "half/setup.json"),

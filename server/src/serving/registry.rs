@@ -11,8 +11,8 @@ use grasp_planner::Source;
 #[derive(Default)]
 pub(crate) struct ModelRegistry(RwLock<Engines>);
 
-/// The default network first, then the other networks by name, then the planners without a network; per name the newest
-/// version first.
+/// The default network first, then the other networks by name, then those with an evaluator, then the planners without a
+/// network; per name the newest version first.
 pub(crate) type Engines = Arc<[Arc<Engine>]>;
 
 impl ModelRegistry {
@@ -26,7 +26,8 @@ impl ModelRegistry {
         engines.sort_by(|a, b| b.source.by_version(&a.source));
         engines.sort_by_key(|engine| {
             let name = engine.source.name().to_owned();
-            (engine.source.network().is_none(), default != Some(&name), name)
+            let is_evaluated = matches!(engine.source, Source::Evaluated { .. });
+            (engine.source.network().is_none(), default != Some(&name), is_evaluated, name)
         });
         *self.0.write().unwrap_or_else(PoisonError::into_inner) = engines.into();
     }

@@ -118,15 +118,16 @@ fn infer(
                 continue;
             }
         };
+        let started = Instant::now();
         match task {
             Task::Grasps(params, reply) => {
                 let decoded = caught(|| {
                     let is_wanted = || !reply.is_closed() && !deadline.is_some_and(Deadline::has_passed);
                     Ok(output.decode(index, &scene.volume, &params.decode_params(defaults), &is_wanted)?)
                 });
-                send_result(reply, submitted, times, || Ok(detection(decoded?, scene.volume, &params)));
+                send_result(reply, submitted, times, started, || Ok(detection(decoded?, scene.volume, &params)));
             }
-            Task::Maps(reply) => send_result(reply, submitted, times, || Ok(tensors(output, index))),
+            Task::Maps(reply) => send_result(reply, submitted, times, started, || Ok(tensors(output, index))),
         }
     }
 }
@@ -144,7 +145,7 @@ fn plan(planner: &mut dyn Planner, defaults: DecodeParams, job: Job, done: impl 
                 Ok(planner.plan(&scene, &params, &keep_going)?)
             });
             let times = done(started.elapsed());
-            send_result(reply, submitted, times, || Ok(detection(decoded?, scene.volume, &params)));
+            send_result(reply, submitted, times, Instant::now(), || Ok(detection(decoded?, scene.volume, &params)));
         }
         Task::Maps(_) => {
             done(Duration::ZERO);
@@ -153,14 +154,14 @@ fn plan(planner: &mut dyn Planner, defaults: DecodeParams, job: Job, done: impl 
     }
 }
 
-/// Runs the post-processing and sends its result.
+/// Ends the post-processing, which began at `started`, and sends its result.
 fn send_result<T>(
     reply: Sender<T>,
     submitted: Instant,
     times: BatchTimes,
+    started: Instant,
     postprocess: impl FnOnce() -> Result<T, EngineError>,
 ) {
-    let started = Instant::now();
     let result = caught(postprocess);
     // Expired requests are logged by their call.
     if let Err(error) = &result
