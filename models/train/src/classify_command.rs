@@ -113,7 +113,8 @@ impl Classify {
             learning_rate: self.lr,
             validation: self.val,
             seed: self.seed,
-            // Half of GPD's candidates succeed in no scene. The evaluator predicts a probability.
+            // GPD's classifier ranks candidates. The evaluator predicts a probability, so its classes keep their
+            // frequencies.
             balance: self.network == Kind::Gpd,
             mirror: self.network == Kind::Evaluator,
             bf16: self.bf16,
