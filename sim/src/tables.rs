@@ -70,7 +70,7 @@ pub struct Condition {
     pub views: String,
     /// ε, the smallest quality of a grasp, in hundredths.
     pub epsilon: u8,
-    /// If no grasp reaches ε: whether the best grasp is executed if its quality is at least 0.5.
+    /// If no grasp reaches ε: whether the best grasp is executed if its quality is at least 0.5, or 0.1 with an evaluator.
     pub forced: bool,
 }
 

@@ -31,11 +31,16 @@ pub(super) struct Session {
 /// Time per scene of the last batch: the estimated time until a queue slot is free.
 pub(super) struct ServiceTime(AtomicU64);
 
-/// When a session took a batch from the queue, and how long its inference took.
+/// The times of a batch.
 #[derive(Clone, Copy)]
-struct BatchTimes {
+struct BatchTimes<'a> {
+    /// When the session took it from the queue.
     taken: Instant,
+    /// How long its inference took.
     inference: Duration,
+    /// Its number of scenes.
+    scenes: u32,
+    service_time: &'a ServiceTime,
 }
 
 impl ServiceTime {
@@ -76,7 +81,7 @@ impl Session {
             let scenes = u32::try_from(jobs.len()).unwrap_or(u32::MAX);
             let done = |inference: Duration| {
                 queue.free();
-                BatchTimes { taken: now, inference }
+                BatchTimes { taken: now, inference, scenes, service_time }
             };
             match planner {
                 Loaded::Network(network) => infer(network, *defaults, jobs, done),
@@ -86,18 +91,16 @@ impl Session {
                     }
                 }
             }
-            // The time per scene, including decoding.
-            service_time.set(now.elapsed() / scenes);
         }
     }
 }
 
 /// Runs the network on a batch, then decodes or returns each output. `done` is called after the inference.
-fn infer(
+fn infer<'a>(
     network: &mut NetworkPlanner,
     defaults: DecodeParams,
     jobs: Vec<Job>,
-    done: impl FnOnce(Duration) -> BatchTimes,
+    done: impl FnOnce(Duration) -> BatchTimes<'a>,
 ) {
     let started = Instant::now();
     let volumes: Vec<&Volume> = jobs.iter().map(|job| &job.scene.volume).collect();
@@ -133,7 +136,12 @@ fn infer(
 }
 
 /// Runs a planner without a network on a scene. `done` is called after the planning.
-fn plan(planner: &mut dyn Planner, defaults: DecodeParams, job: Job, done: impl FnOnce(Duration) -> BatchTimes) {
+fn plan<'a>(
+    planner: &mut dyn Planner,
+    defaults: DecodeParams,
+    job: Job,
+    done: impl FnOnce(Duration) -> BatchTimes<'a>,
+) {
     let Job { scene, task, deadline, span, submitted } = job;
     let _entered = span.enter();
     match task {
@@ -158,7 +166,7 @@ fn plan(planner: &mut dyn Planner, defaults: DecodeParams, job: Job, done: impl 
 fn send_result<T>(
     reply: Sender<T>,
     submitted: Instant,
-    times: BatchTimes,
+    times: BatchTimes<'_>,
     started: Instant,
     postprocess: impl FnOnce() -> Result<T, EngineError>,
 ) {
@@ -169,7 +177,9 @@ fn send_result<T>(
     {
         error!(%error, "the session failed");
     }
-    let BatchTimes { taken, inference } = times;
+    let BatchTimes { taken, inference, scenes, service_time } = times;
+    // The time per scene, including decoding. Set before the reply, so that the next refusal already has it.
+    service_time.set(taken.elapsed() / scenes);
     let (queue, postprocessing) = (taken.duration_since(submitted), started.elapsed());
     // Fails if the client has cancelled, which the call counts.
     let _ = reply.send(result.map(|value| SessionOutput { value, queue, inference, postprocessing }));

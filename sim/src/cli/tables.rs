@@ -389,10 +389,10 @@ impl Tables {
              - Scenes: {} per seed, seeds {} to {}, with five unseen procedural objects each. PyBullet, and views, ε and objects\n\
              \x20 that are not in the paper, use only the first seed.\n\
              - Observation: one side view with depth noise. Grasps: ε = 0.9, out_th 0.1, the best grasp first. If no grasp\n\
-             \x20 reaches ε, the best grasp is executed if its quality is at least 0.5 (`force`).\n\
+             \x20 reaches ε, the best grasp is executed if its quality is at least 0.5, with an evaluator 0.1 (`force`).\n\
              - GSR: share of the grasps that lifted an object. DR: share of the objects that were removed. Mean ± standard\n\
              \x20 deviation over the seeds.\n\
-             - VGN-R: VGN's released weights.\n\
+             - VGN-R: VGN's released weights. graspd: vgn with its evaluator.\n\
              - Times: {} with {} cores, ONNX Runtime's CPU provider, one observation at a time. The paper's times are for an\n\
              \x20 RTX 3090.\n\
              - Simulator and decoding {}.{pybullet}\n\n",
