@@ -29,7 +29,7 @@ pub struct Evaluator {
 
 impl Evaluator {
     /// The floor of `force` in benchmarks. It is lower than a network's, because the evaluator predicts a success without
-    /// any contact on the approach: in piles half of the grasps at this quality succeed although they touch something.
+    /// any contact on the approach, and benchmarks allow contacts (`models/ablations.md` has the effect).
     pub const FORCE: f32 = 0.1;
 
     /// An evaluator with a loaded classifier of patches.
