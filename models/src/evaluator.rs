@@ -8,14 +8,17 @@ use crate::graph::{Builder, Conv};
 use crate::onnx::{AttributeProto, ModelProto};
 
 /// Output channels of the convolutions.
-const CHANNELS: [usize; 2] = [48, 64];
+const CHANNELS: [usize; 2] = [64, 96];
 
 /// Units of the dense layer.
-const DENSE: usize = 128;
+const DENSE: usize = 192;
+
+/// Failure, success after a contact on the approach, success without a contact.
+const CLASSES: usize = 3;
 
 /// Creates an evaluator with random weights: two 2D convolutions over the plane of the approach and the closing axis,
-/// each followed by max pooling by 2; a dense layer; the logits of failure and of success. The samples along x are
-/// channels, because the hand is narrow along x.
+/// each followed by max pooling by 2; a dense layer; the logits of the classes. The samples along x are channels,
+/// because the hand is narrow along x.
 #[must_use]
 pub fn evaluator(seed: u64) -> ModelProto {
     let mut builder = Builder::new("evaluator", seed);
@@ -36,8 +39,8 @@ pub fn evaluator(seed: u64) -> ModelProto {
     x = b.node("Flatten", &[&x], vec![AttributeProto::int("axis", 1)]);
     x = b.linear("dense.0", &x, inputs * pixels, DENSE, true);
     x = b.node("Relu", &[&x], vec![]);
-    x = b.linear("dense.1", &x, DENSE, 2, true);
-    b.output(OUTPUT, &x, &[2]);
+    x = b.linear("dense.1", &x, DENSE, CLASSES, true);
+    b.output(OUTPUT, &x, &[CLASSES]);
     let mut model = builder.finish();
     let provenance = [("architecture", "evaluator".to_owned()), ("seed", seed.to_string())];
     describe(&mut model, "evaluator", "1", None, &provenance.map(|(key, value)| (key.to_owned(), value)).into());

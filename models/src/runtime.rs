@@ -148,14 +148,15 @@ pub enum LoadReason {
     },
     /// The inputs or outputs are not those of a classifier of grasp candidates.
     #[error(
-        "{what}; a classifier has the input `images`, f32 [batch, {c}, {n}, {n}], and the output `scores`, \
-         f32 [batch, 2]; train one with `grasp-train classify`",
-        c = grasp::gpd::CHANNELS,
-        n = grasp::gpd::IMAGE_SIZE
+        "{what}; a classifier has the input `images`, f32 [batch, {}], and the output `scores`, f32 [batch, classes]; \
+         train one with `grasp-train classify`",
+        shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", ")
     )]
     Classifier {
         /// The difference.
         what: String,
+        /// Shape of an image.
+        shape: &'static [usize],
     },
 }
 

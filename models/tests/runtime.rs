@@ -309,15 +309,14 @@ fn a_classifier_scores_images_independently() {
     let (_folder, path) = save(&gpd::gpd(0));
     let mut classifier = Classifier::load(&path, &Image::SHAPE, &Options::default()).unwrap();
     let images = images(40);
-    let images: Vec<&[u8]> = images.iter().map(Image::pixels).collect();
-    let together = classifier.score(&images).unwrap();
+    let together = classifier.score(images.len(), |index, values| images[index].write(values)).unwrap();
     assert_eq!(together.len(), images.len());
     assert!(together.iter().any(|score| (score - together[0]).abs() > 1e-5), "other images have other scores");
     for (image, together) in images.iter().zip(together) {
-        let alone = classifier.score(std::slice::from_ref(image)).unwrap();
+        let alone = classifier.score(1, |_, values| image.write(values)).unwrap();
         assert!((alone[0] - together).abs() < 1e-5);
     }
-    assert_eq!(classifier.score(&[]).unwrap(), Vec::<f32>::new());
+    assert_eq!(classifier.score(0, |_, _| ()).unwrap(), Vec::<f32>::new());
 }
 
 #[test]

@@ -17,7 +17,7 @@ const TOLERANCE: f64 = 2e-3;
 
 #[test]
 fn outputs_of_the_shipped_networks_match_their_snapshots() {
-    for path in scenes::networks() {
+    for path in scenes::shipped(".") {
         let mut network = Network::load(&path, &Options::default()).unwrap();
         let mut text = String::new();
         for (scene, volume) in scenes::all() {

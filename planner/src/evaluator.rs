@@ -13,25 +13,21 @@ const PROPOSAL_THRESHOLD: f32 = 0.2;
 /// Largest number of a network's grasps that are evaluated.
 const PROPOSALS: usize = 32;
 
-/// Number of the best of them of which moved copies are evaluated, too.
+/// Number of the best of them that are moved.
 const REFINED: usize = 6;
 
-/// Smallest gain of quality for which a grasp is moved. The best of many predictions is on average too high.
-const GAIN: f32 = 0.15;
+/// Largest number of times that a grasp is moved.
+const MOVES: usize = 2;
 
-/// Scores grasp poses and moves them: from the volume around the hand it predicts whether the hand reaches the grasp
-/// without a contact and lifts an object.
+/// Scores grasp poses and moves them: from the volume around the hand it predicts whether an execution of the grasp lifts
+/// an object.
 ///
-/// A network scores voxels. The evaluator scores poses, so it also finds the best pose near a network's grasp.
+/// A network scores voxels. The evaluator scores poses, so it also finds a better pose near a network's grasp.
 pub struct Evaluator {
     classifier: Classifier,
 }
 
 impl Evaluator {
-    /// The floor of `force` in benchmarks. It is lower than a network's, because the evaluator predicts a success without
-    /// any contact on the approach, and benchmarks allow contacts (`models/ablations.md` has the effect).
-    pub const FORCE: f32 = 0.1;
-
     /// An evaluator with a loaded classifier of patches.
     #[must_use]
     pub fn new(classifier: Classifier) -> Self {
@@ -78,14 +74,21 @@ impl Evaluator {
         let depth = params.hand.map_or(FINGER_DEPTH, |hand| hand.depth);
         self.evaluate(&mut grasps, volume, depth)?;
         sort(&mut grasps);
-        for grasp in grasps.iter_mut().take(REFINED) {
+        let mut moving: Vec<usize> = (0..REFINED.min(grasps.len())).collect();
+        for _ in 0..MOVES {
             if !is_wanted() {
                 return Err(PlanError::Cancelled);
             }
-            let mut moved: Vec<Grasp> = variations(grasp, depth).collect();
+            let mut moved: Vec<Grasp> = moving.iter().flat_map(|&index| variations(&grasps[index], depth)).collect();
             self.evaluate(&mut moved, volume, depth)?;
-            let best = moved.into_iter().max_by(|a, b| a.quality.total_cmp(&b.quality));
-            *grasp = best.filter(|best| best.quality > grasp.quality + GAIN).unwrap_or(*grasp);
+            let of_grasp = moved.chunks_exact(VARIATIONS);
+            let better = moving.iter().zip(of_grasp).filter_map(|(&index, moved)| {
+                let best = moved.iter().max_by(|a, b| a.quality.total_cmp(&b.quality))?;
+                (best.quality > grasps[index].quality).then_some((index, *best))
+            });
+            let better: Vec<(usize, Grasp)> = better.collect();
+            better.iter().for_each(|&(index, grasp)| grasps[index] = grasp);
+            moving = better.into_iter().map(|(index, _)| index).collect();
         }
         sort(&mut grasps);
         let mut decoded = select(&grasps, volume, params);
@@ -96,10 +99,10 @@ impl Evaluator {
     /// Replaces the quality of each grasp by the predicted probability of success.
     fn evaluate(&mut self, grasps: &mut [Grasp], volume: &Volume, depth: f64) -> Result<(), RuntimeError> {
         let of_training_hand = Translation3::new(0.0, 0.0, depth - FINGER_DEPTH);
-        let patches: Vec<Patch> =
-            grasps.iter().map(|grasp| Patch::of(volume, &(grasp.pose * of_training_hand))).collect();
-        let values: Vec<&[u8]> = patches.iter().map(Patch::values).collect();
-        for (grasp, score) in grasps.iter_mut().zip(self.classifier.score(&values)?) {
+        let scores = self.classifier.score(grasps.len(), |index, patch| {
+            Patch::write(volume, &(grasps[index].pose * of_training_hand), patch);
+        })?;
+        for (grasp, score) in grasps.iter_mut().zip(scores) {
             grasp.quality = 1.0 / (1.0 + (-score).exp());
         }
         Ok(())
@@ -110,6 +113,9 @@ impl Evaluator {
 fn sort(grasps: &mut [Grasp]) {
     grasps.sort_by(|a, b| b.quality.total_cmp(&a.quality));
 }
+
+/// Number of [`variations`].
+const VARIATIONS: usize = 19;
 
 /// The grasp moved along its closing axis and its approach, and rotated about its axes through the middle between the
 /// fingertips, so that the grasped part stays between them. `depth` is the distance of the fingertips from the origin.

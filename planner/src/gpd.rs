@@ -45,9 +45,9 @@ impl Planner for Gpd {
             if !is_wanted() {
                 return Err(PlanError::Cancelled);
             }
-            let images: Vec<Image> = batch.iter().map(|candidate| Image::of(&fit.cloud, candidate)).collect();
-            let pixels: Vec<&[u8]> = images.iter().map(Image::pixels).collect();
-            scores.extend(self.classifier.score(&pixels)?);
+            scores.extend(self.classifier.score(batch.len(), |index, values| {
+                Image::of(&fit.cloud, &batch[index]).write(values);
+            })?);
         }
         let grasps = scored(&fit.candidates, &scores);
         Ok(fit.select(grasps, scene, &params.decode))

@@ -136,7 +136,9 @@ impl Source {
                 (networks.into_iter().zip(evaluators).map(planner).collect(), backend)
             }
             Self::Gpd(entry) => {
-                let classifiers = Classifier::load_several(entry, &Image::SHAPE, options, count)?.into_iter();
+                // GPD runs in f32 on the CPU everywhere.
+                let options = Options { threads: options.threads, ..Options::default() };
+                let classifiers = Classifier::load_several(entry, &Image::SHAPE, &options, count)?.into_iter();
                 (classifiers.map(|classifier| single(Box::new(Gpd::new(classifier)))).collect(), Backend::REFERENCE)
             }
             Self::Shaf => ((0..count).map(|_| single(Box::new(Shaf))).collect(), Backend::REFERENCE),

@@ -8,6 +8,7 @@ mod label;
 mod merge;
 mod objects;
 mod observe;
+mod proposals;
 mod reliability;
 mod replay;
 mod stats;
@@ -50,6 +51,8 @@ pub enum Command {
     Objects(objects::Objects),
     /// Generate scenes, try grasp candidates and write training data for a classifier of them.
     Candidates(candidates::Candidates),
+    /// Generate scenes, try a network's grasps and write training data for an evaluator of them.
+    Proposals(proposals::Proposals),
     /// Run the clutter-removal benchmark with planners.
     Bench(bench::Bench),
     /// Compare the predicted quality of executed grasps with their success rate.
@@ -72,6 +75,7 @@ impl Command {
             Self::Replay(command) => command.run(),
             Self::Objects(command) => command.run(),
             Self::Candidates(command) => command.run(),
+            Self::Proposals(command) => command.run(),
             Self::Bench(command) => command.run(),
             Self::Reliability(command) => command.run(),
             Self::Tables(command) => command.run(),

@@ -14,6 +14,7 @@ pub mod objects;
 pub mod ordered;
 pub mod physics;
 pub mod planner;
+pub mod proposals;
 pub mod reliability;
 pub mod scene;
 pub mod score;

@@ -97,14 +97,37 @@ pub fn clearance(world: &World, grasp: &Isometry3<f64>, limit: f64) -> f64 {
 /// As in the reference, a hand in contact at the pre-grasp closes there, and a hand that overlaps an object or the
 /// table is pushed out. Only a failure then counts as [`BlockedAtPregrasp`](Outcome::BlockedAtPregrasp).
 pub fn execute(world: &mut World, grasp: &Isometry3<f64>) -> (Outcome, f64) {
-    let at = |distance: f64| grasp * Translation3::new(0.0, 0.0, -distance);
-    let steps = (PREGRASP_DISTANCE / APPROACH_STEP).round() as u32;
-    let touched_in = (1..=steps).find(|&step| world.is_near(&OPEN_HAND, &at(distance_after(step) + LAG), CONTACT_GAP));
+    let touched_in = first_contact(world, grasp);
     let short_by = touched_in.map_or(0.0, distance_after);
-    match close_and_lift(world, &at(short_by), grasp, Until::TheEnd) {
+    match close_and_lift(world, &before(grasp, short_by), grasp, Until::TheEnd) {
         outcome if touched_in == Some(1) && !outcome.is_success() => (Outcome::BlockedAtPregrasp, short_by),
         outcome => (outcome, short_by),
     }
+}
+
+/// As [`execute`], but `world` is not changed, and the trial ends as soon as the outcome is known. A hand in contact at
+/// the pre-grasp is [`BlockedAtPregrasp`](Outcome::BlockedAtPregrasp) at once.
+#[must_use]
+pub fn attempt(world: &World, grasp: &Isometry3<f64>) -> (Outcome, f64) {
+    let touched_in = first_contact(world, grasp);
+    let short_by = touched_in.map_or(0.0, distance_after);
+    if touched_in == Some(1) {
+        return (Outcome::BlockedAtPregrasp, short_by);
+    }
+    (close_and_lift(&mut world.clone(), &before(grasp, short_by), grasp, Until::NothingIsHeld), short_by)
+}
+
+/// The step of the approach in which the open hand first touches something.
+fn first_contact(world: &World, grasp: &Isometry3<f64>) -> Option<u32> {
+    let steps = (PREGRASP_DISTANCE / APPROACH_STEP).round() as u32;
+    let is_free = !world.is_near(&SWEPT_HAND, grasp, CONTACT_GAP);
+    let touches = |step| world.is_near(&OPEN_HAND, &before(grasp, distance_after(step) + LAG), CONTACT_GAP);
+    if is_free { None } else { (1..=steps).find(|&step| touches(step)) }
+}
+
+/// The grasp moved back along its approach, by `distance` metres.
+fn before(grasp: &Isometry3<f64>, distance: f64) -> Isometry3<f64> {
+    grasp * Translation3::new(0.0, 0.0, -distance)
 }
 
 /// Distance from the grasp after this many steps of the approach, metres.

@@ -7,7 +7,7 @@ use std::process::{Command, Output, Stdio};
 use std::thread::sleep;
 use std::time::Duration;
 
-use grasp_data::{Candidates, Dataset};
+use grasp_data::Dataset;
 use grasp_sim::export;
 use serde_json::Value;
 use tempfile::TempDir;
@@ -348,17 +348,23 @@ fn scenes_are_observed_again() {
 }
 
 #[test]
-fn candidates_of_a_network_are_patches() {
+fn proposals_are_tried_and_an_interrupted_run_continues() {
     let desk = Desk::new();
-    let command = format!("candidates --network {NETWORK} --scenes 2 --candidates 12 --seed 3");
-    desk.run(&format!("{command} --out one.npz"));
-    desk.run(&format!("{command} --out other.npz"));
-    let [one, other] = ["one.npz", "other.npz"].map(|name| Candidates::read(&desk.path(name)).unwrap());
-    assert_eq!(one, other, "the same seed gives the same candidates");
-    assert_eq!((&*one.shape, one.len()), (&grasp::Patch::SHAPE[..], 24));
-    assert!(one.images.chunks(one.images.len() / 24).all(|patch| patch.iter().any(|&value| value > 0)));
-    let refused = desk.refused("candidates --evaluator x.onnx --scenes 1 --out x.npz");
+    let command = format!("proposals --network {NETWORK} --grasps 12 --seed 3");
+    desk.run(&format!("{command} --scenes 3 --out one"));
+    desk.run(&format!("{command} --scenes 1 --out other"));
+    desk.run(&format!("{command} --scenes 3 --out other"));
+    let [one, other] = ["one", "other"].map(|name| Dataset::open(&[desk.path(name)]).unwrap());
+    assert_eq!((one.len(), one.fingerprint()), (3, other.fingerprint()), "the same seed gives the same trials");
+    let trials: Vec<_> = (0..3).flat_map(|scene| one.trials(scene)).collect();
+    assert_eq!(trials.len(), 36);
+    assert!(trials.iter().all(|trial| !trial.success || trial.share == 1.0), "a success has lifted an object");
+    let lifted = trials.iter().filter(|trial| trial.share == 1.0).count();
+    assert!((1..36).contains(&lifted), "{lifted} of 36");
+    let refused = desk.refused("proposals --scenes 1 --out x");
     assert!(refused.contains("--network"), "{refused}");
+    let refused = desk.refused("observe one --views side --out again");
+    assert!(refused.contains("one holds the grasps of a network"), "{refused}");
 }
 
 #[test]

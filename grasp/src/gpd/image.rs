@@ -46,6 +46,13 @@ impl Image {
     pub fn pixels(&self) -> &[u8] {
         &self.pixels
     }
+
+    /// Writes the pixels to the input of a classifier: values in [0, 1].
+    pub fn write(&self, values: &mut [f32]) {
+        for (value, &pixel) in values.iter_mut().zip(&self.pixels) {
+            *value = f32::from(pixel) / 255.0;
+        }
+    }
 }
 
 /// A point of the region in unit cube coordinates, with the absolute components of its normal.

@@ -1,7 +1,6 @@
-//! Tried grasp candidates, the training data of a classifier: an `.npz` file with
+//! Tried grasp candidates, the training data of GPD's classifier: an `.npz` file with
 //!
-//! - `images`, u8 `[n, shape…]`, 255 for 1: for GPD's classifier the shape of a [`grasp::gpd::Image`], for a grasp
-//!   evaluator that of a [`grasp::Patch`];
+//! - `images`, u8 `[n, shape…]`, 255 for 1: [`grasp::gpd::Image`]s;
 //! - `labels`, u8 `[n]`, 1 for a success;
 //! - `scenes`, u64 `[n]`, the scene number of each candidate.
 

@@ -59,6 +59,12 @@ pub struct Provenance {
     /// Seed of the observations, if they were not generated with the labels.
     #[serde(default, alias = "look_seed", skip_serializing_if = "Option::is_none")]
     pub observation_seed: Option<u64>,
+    /// The network whose grasps were tried; absent if points on the surface were.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub network: Option<String>,
+    /// The evaluator that scored and moved the network's grasps before they were tried.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub evaluator: Option<String>,
     /// Version of the simulator. Labels can differ between versions.
     pub version: String,
 }

@@ -23,7 +23,9 @@ pub struct Trial {
     /// formats of VGN and GIGA, which do not store yaws.
     pub yaws: u8,
     /// Share of successful executions, in [0, 1]. A grasp whose first execution succeeds is repeated with small pose
-    /// errors, and is a success if nearly all executions succeed. With a single execution the share is 1 or 0.
+    /// errors, and is a success if nearly all executions succeed. With a single execution the share is 1 or 0. Of the
+    /// grasps of a planner (`grasp-sim proposals`), which are executed once, it is also 1 for failures that touched
+    /// something on the approach and then lifted an object.
     pub share: f32,
     /// Smallest distance between the open hand on its approach and the objects, metres, at most [`MAX_CLEARANCE`]. 0 if
     /// it is unknown or the hand touches something.

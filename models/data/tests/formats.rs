@@ -21,6 +21,8 @@ fn setup() -> Setup {
         noise: 0.0,
         seed: 1,
         observation_seed: None,
+        network: None,
+        evaluator: None,
         version: "0".into(),
     })
 }

@@ -10,6 +10,7 @@ use prost::Message;
 
 use super::backend::{Backend, Provider};
 use super::{INPUT, LoadReason, OUTPUTS, Options, runtime};
+use crate::gpd;
 use crate::onnx::ModelProto;
 use crate::upsampling::with_upsampling_folded;
 use crate::with_full_weights;
@@ -57,7 +58,8 @@ impl<'a> ModelFile<'a> {
         let optimized = optimized(&model, bytes);
         let graph = model.graph.unwrap_or_default();
         let is_int8 = graph.node.iter().any(|node| node.op_type() == "QuantizeLinear");
-        let batch = graph.input.iter().find(|input| input.name() == INPUT).and_then(|input| input.free(0));
+        let is_batch = |name: &str| name == INPUT || name == gpd::INPUT;
+        let batch = graph.input.iter().find(|input| is_batch(input.name())).and_then(|input| input.free(0));
         let batch = batch.map(str::to_owned);
         let external_weights = graph.initializer.iter().find_map(|tensor| tensor.external_file()).map(str::to_owned);
         Self { path, bytes, optimized, threads: options.threads, is_int8, external_weights, batch }

@@ -3,18 +3,25 @@ use std::path::Path;
 
 use ort::session::Session;
 use ort::value::{Outlet, Tensor, TensorElementType};
+use tracing::warn;
 
+use super::backend::AvailableBackends;
 use super::batch_session::ModelFile;
-use super::{Backend, LoadError, LoadReason, Options, RuntimeError, run_error};
+use super::{Backend, LoadError, LoadReason, Options, Provider, RuntimeError, run_error, runtime};
 use crate::Entry;
 use crate::gpd::{INPUT, OUTPUT};
 
 /// Batch size, which bounds the memory: 5.5 MB of input for GPD.
 const BATCH: usize = 32;
 
+/// Largest allowed difference from the reference of the predicted probability of success, on average and at most.
+const MEAN_DIFFERENCE: f32 = 0.02;
+const LARGEST_DIFFERENCE: f32 = 0.2;
+
 /// A loaded classifier of grasp candidates: of images, as GPD's, or of patches of a volume, as the evaluator.
 pub struct Classifier {
     session: Session,
+    backend: Backend,
     /// Shape of an image.
     shape: &'static [usize],
     /// Name in error messages.
@@ -22,16 +29,20 @@ pub struct Classifier {
 }
 
 impl Classifier {
-    /// Loads a file and checks that its input and output are those of a classifier of images of `shape`.
+    /// Loads a file. Checks that its input and output are those of a classifier of images of `shape`, and that its
+    /// scores on this backend match those of ONNX Runtime's CPU kernels in f32.
     ///
     /// # Errors
     /// [`LoadError`] names the file and the problem.
     pub fn load(path: &Path, shape: &'static [usize], options: &Options) -> Result<Self, LoadError> {
-        let load = || Self::open(path, &fs::read(path)?, shape, options);
+        let load = || {
+            runtime()?;
+            Self::load_fastest(&ModelFile::new(path, &fs::read(path)?, options), shape, options)
+        };
         load().map_err(|reason| LoadError { path: path.to_owned(), reason })
     }
 
-    /// Loads an entry of a store `count` times, once per thread.
+    /// Loads an entry of a store `count` times, once per thread. All copies use the same backend.
     ///
     /// # Errors
     /// [`LoadError`] names the file and the problem, including a file that changed since the store read it.
@@ -42,64 +53,165 @@ impl Classifier {
         count: usize,
     ) -> Result<Vec<Self>, LoadError> {
         let load = || {
+            runtime()?;
             let bytes = entry.bytes()?;
-            (0..count).map(|_| Self::open(&entry.path, &bytes, shape, options)).collect::<Result<_, LoadReason>>()
+            let model = ModelFile::new(&entry.path, &bytes, options);
+            let first = Self::load_fastest(&model, shape, options)?;
+            let backend = first.backend;
+            let others = (1..count).map(|_| Self::open(&model, shape, backend));
+            std::iter::once(Ok(first)).chain(others).take(count).collect::<Result<_, LoadReason>>()
         };
         load().map_err(|reason| LoadError { path: entry.path.clone(), reason })
     }
 
-    /// Loads the model and runs it once, so that buffers are allocated before the first request.
-    fn open(path: &Path, bytes: &[u8], shape: &'static [usize], options: &Options) -> Result<Self, LoadReason> {
-        let session = ModelFile::new(path, bytes, options).open(Backend::REFERENCE, None)?;
-        check(session.inputs(), INPUT, shape)?;
-        check(session.outputs(), OUTPUT, &[2])?;
-        let mut classifier = Self { session, shape, name: path.display().to_string() };
-        classifier.logits(vec![0.0; BATCH * shape.iter().product::<usize>()])?;
+    /// Loads with the first allowed backend whose scores match the reference.
+    fn load_fastest(model: &ModelFile, shape: &'static [usize], options: &Options) -> Result<Self, LoadReason> {
+        let backends = AvailableBackends::here().backends(options.provider, options.precision, model.is_int8)?;
+        let (&last, others) = backends.split_last().ok_or(RuntimeError::EmptyBatch)?;
+        for &backend in others {
+            match Self::load_checked(model, shape, backend) {
+                Ok(classifier) => return Ok(classifier),
+                Err(error) => {
+                    warn!(model = %model.path.display(), %backend, %error, "backend rejected, trying the next one")
+                }
+            }
+        }
+        Self::load_checked(model, shape, last)
+    }
+
+    fn load_checked(model: &ModelFile, shape: &'static [usize], backend: Backend) -> Result<Self, LoadReason> {
+        let mut classifier = Self::open(model, shape, backend)?;
+        if backend.provider != Provider::Cpu {
+            let mut reference = Self::open(model, shape, Backend::REFERENCE)?;
+            let [got, expected] =
+                [&mut classifier, &mut reference].map(|classifier| classifier.score(BATCH + 1, write_sample));
+            if let Some(what) = difference(&got?, &expected?) {
+                return Err(LoadReason::DiffersFromReference { backend, what });
+            }
+        }
         Ok(classifier)
     }
 
-    /// The score of each image: the logit of success minus the logit of failure. Above 0, success is more likely. An
-    /// image has the values of the classifier's shape; 255 stands for 1.
+    /// Loads the model and runs it once, so that buffers are allocated before the first request.
+    fn open(model: &ModelFile, shape: &'static [usize], backend: Backend) -> Result<Self, LoadReason> {
+        let session = model.open(backend, is_fixed(backend).then_some(BATCH))?;
+        let wrong = |what| LoadReason::Classifier { what, shape };
+        check(session.inputs(), INPUT, &shape.iter().map(|&size| size..=size).collect::<Vec<_>>()).map_err(wrong)?;
+        check(session.outputs(), OUTPUT, &[2..=usize::MAX]).map_err(wrong)?;
+        let mut classifier = Self { session, backend, shape, name: model.path.display().to_string() };
+        classifier.run(BATCH, vec![0.0; BATCH * classifier.size()])?;
+        Ok(classifier)
+    }
+
+    /// Values of an image.
+    fn size(&self) -> usize {
+        self.shape.iter().product()
+    }
+
+    /// The backend in use.
+    #[must_use]
+    pub fn backend(&self) -> Backend {
+        self.backend
+    }
+
+    /// The scores of `count` images: the log-odds of success. Above 0, success is more likely. `write` writes the image
+    /// of an index, whose values have the classifier's shape and are in [0, 1].
+    ///
+    /// The first class is failure, all others are successes.
     ///
     /// # Errors
     /// [`RuntimeError::Run`] if ONNX Runtime fails.
-    pub fn score(&mut self, images: &[&[u8]]) -> Result<Vec<f32>, RuntimeError> {
-        let mut scores = Vec::with_capacity(images.len());
-        for batch in images.chunks(BATCH) {
-            let pixels = batch.iter().copied().flatten().map(|&value| f32::from(value) / 255.0).collect();
-            let logits = self.logits(pixels).map_err(|error| run_error(&self.name, &error))?;
-            scores.extend(logits.chunks_exact(2).map(|pair| pair[1] - pair[0]));
+    pub fn score(&mut self, count: usize, mut write: impl FnMut(usize, &mut [f32])) -> Result<Vec<f32>, RuntimeError> {
+        let mut scores = Vec::with_capacity(count);
+        while scores.len() < count {
+            let first = scores.len();
+            let images = BATCH.min(count - first);
+            let batch = if is_fixed(self.backend) { BATCH } else { images };
+            let mut pixels = vec![0.0; batch * self.size()];
+            for (index, image) in pixels.chunks_exact_mut(self.size()).take(images).enumerate() {
+                write(first + index, image);
+            }
+            let logits = self.run(batch, pixels).map_err(|error| run_error(&self.name, &error))?;
+            scores.extend(logits.chunks_exact(logits.len() / batch).take(images).map(log_odds));
         }
         Ok(scores)
     }
 
-    /// The logits of concatenated images.
-    fn logits(&mut self, pixels: Vec<f32>) -> ort::Result<Vec<f32>> {
-        let images = pixels.len() / self.shape.iter().product::<usize>();
-        let shape: Vec<usize> = [&[images], self.shape].concat();
+    /// The logits of a batch of concatenated images.
+    fn run(&mut self, batch: usize, pixels: Vec<f32>) -> ort::Result<Vec<f32>> {
+        let shape: Vec<usize> = [&[batch], self.shape].concat();
         let outputs = self.session.run(ort::inputs![INPUT => Tensor::from_array((shape, pixels))?])?;
         Ok(outputs[OUTPUT].try_extract_tensor::<f32>()?.1.to_vec())
     }
 }
 
-/// Checks that `name` is f32 of shape `[batch, dims…]`.
-fn check(outlets: &[Outlet], name: &str, dims: &[usize]) -> Result<(), LoadReason> {
-    let wrong = |what: String| LoadReason::Classifier { what };
+/// Whether a provider is given the batch size when the model is loaded, as for networks.
+fn is_fixed(backend: Backend) -> bool {
+    matches!(backend.provider, Provider::OpenVino | Provider::TensorRt)
+}
+
+/// Log-odds of the classes after the first against the first.
+fn log_odds(logits: &[f32]) -> f32 {
+    let largest = logits[1..].iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    largest + logits[1..].iter().map(|logit| (logit - largest).exp()).sum::<f32>().ln() - logits[0]
+}
+
+/// Writes the test image of an index: a smooth pattern that differs between images.
+fn write_sample(index: usize, image: &mut [f32]) {
+    let step = 0.01 + 0.003 * index as f32;
+    for (at, value) in image.iter_mut().enumerate() {
+        *value = 0.5 + 0.5 * (at as f32 * step).sin();
+    }
+}
+
+/// Describes the difference between the probabilities, if it exceeds the limits.
+fn difference(got: &[f32], expected: &[f32]) -> Option<String> {
+    let probability = |score: f32| 1.0 / (1.0 + (-score).exp());
+    let differences = || got.iter().zip(expected).map(|(&a, &b)| (probability(a) - probability(b)).abs());
+    let mean = differences().sum::<f32>() / got.len().max(1) as f32;
+    let largest = differences().fold(0.0, f32::max);
+    // With NaN both comparisons are false.
+    let agrees = mean <= MEAN_DIFFERENCE && largest <= LARGEST_DIFFERENCE;
+    (!agrees).then(|| {
+        format!(
+            "the probability of success differs by {mean:.4} on average (limit {MEAN_DIFFERENCE}) and by at most \
+             {largest:.4} (limit {LARGEST_DIFFERENCE})"
+        )
+    })
+}
+
+/// Checks that `name` is f32 of shape `[batch, dims…]`. The error describes the difference.
+fn check(outlets: &[Outlet], name: &str, dims: &[std::ops::RangeInclusive<usize>]) -> Result<(), String> {
     if let [other] = outlets
         && other.name() != name
     {
-        return Err(wrong(format!("found `{}` instead of `{name}`", other.name())));
+        return Err(format!("found `{}` instead of `{name}`", other.name()));
     }
     let outlet = outlets.iter().find(|outlet| outlet.name() == name);
-    let dtype = outlet.ok_or_else(|| wrong(format!("`{name}` is missing")))?.dtype();
+    let dtype = outlet.ok_or_else(|| format!("`{name}` is missing"))?.dtype();
+    // The batch is a free dimension, or fixed by the provider.
     let fits = |shape: &[i64]| {
         shape.len() == dims.len() + 1
-            && shape[0] < 0
-            && shape[1..].iter().zip(dims).all(|(&dim, &size)| dim < 0 || dim == size as i64)
+            && (shape[0] < 0 || shape[0] == BATCH as i64)
+            && shape[1..].iter().zip(dims).all(|(&dim, sizes)| dim < 0 || sizes.contains(&(dim as usize)))
     };
     let is_float = dtype.tensor_type() == Some(TensorElementType::Float32);
     match dtype.tensor_shape() {
         Some(shape) if is_float && fits(shape) => Ok(()),
-        _ => Err(wrong(format!("`{name}` is {dtype}"))),
+        _ => Err(format!("`{name}` is {dtype}")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_classes_but_the_first_are_successes() {
+        assert!((log_odds(&[1.0, 3.5]) - 2.5).abs() < 1e-6);
+        let probability = 1.0 / (1.0 + (-log_odds(&[0.0, 1.0, 2.0])).exp());
+        let [e, e2] = [1.0_f32, 2.0].map(f32::exp);
+        assert!((probability - (e + e2) / (1.0 + e + e2)).abs() < 1e-6);
+        assert!(log_odds(&[0.0, 500.0, 400.0]).is_finite());
     }
 }

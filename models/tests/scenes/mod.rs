@@ -1,7 +1,7 @@
-//! The shipped networks, and scenes on which their outputs are compared.
+//! The shipped models, and scenes on which their outputs are compared.
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use grasp::Volume;
 use nalgebra::Isometry3;
@@ -12,14 +12,14 @@ const VOXEL: f32 = 0.0075;
 const TRUNCATION: f32 = 4.0 * VOXEL;
 const TABLE: f32 = 0.05;
 
-/// The networks of the zoo, by name.
-pub fn networks() -> Vec<PathBuf> {
-    let zoo = concat!(env!("CARGO_MANIFEST_DIR"), "/zoo");
-    let mut networks: Vec<PathBuf> = fs::read_dir(zoo).unwrap().map(|file| file.unwrap().path()).collect();
-    networks.retain(|path| path.extension().is_some_and(|extension| extension == "onnx"));
-    networks.sort();
-    assert!(!networks.is_empty());
-    networks
+/// The files of a folder of the zoo, by name: `.` has the networks.
+pub fn shipped(folder: &str) -> Vec<PathBuf> {
+    let zoo = Path::new(env!("CARGO_MANIFEST_DIR")).join("zoo").join(folder);
+    let mut files: Vec<PathBuf> = fs::read_dir(zoo).unwrap().map(|file| file.unwrap().path()).collect();
+    files.retain(|path| path.extension().is_some_and(|extension| extension == "onnx"));
+    files.sort();
+    assert!(!files.is_empty());
+    files
 }
 
 /// Scenes with their names: blocks on a table, an empty table, and a single observed voxel.

@@ -4,20 +4,59 @@ use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 use tch::{Device, Kind, Tensor, no_grad};
 
-use crate::{Adam, CandidateDataset, ExecuteError, ExecutionOptions, Executor};
+use crate::{Adam, ExecuteError, ExecutionOptions, Executor};
+
+/// The training data of a classifier.
+pub trait Examples {
+    /// Number of examples.
+    fn len(&self) -> usize;
+
+    /// Whether there are no examples.
+    fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The class of an example. Class 0 is failure, all others are successes.
+    fn class(&self, index: usize) -> usize;
+
+    /// Number of classes.
+    fn classes(&self) -> usize;
+
+    /// The scene of an example. Its examples are either all for training or all for validation.
+    fn scene(&self, index: usize) -> String;
+
+    /// The images of examples, f32 `[n, shape…]` in [0, 1].
+    fn images(&self, indices: &[i64]) -> Tensor;
+
+    /// Number of successes.
+    fn successes(&self) -> usize {
+        (0..self.len()).filter(|&index| self.class(index) > 0).count()
+    }
+
+    /// Indices of the training and the validation examples. Validation has all examples of about `fraction` of the
+    /// scenes, chosen by a hash of the scene.
+    fn split(&self, fraction: f64) -> (Vec<i64>, Vec<i64>) {
+        (0..self.len() as i64).partition(|&index| {
+            let hash = Sha256::digest(self.scene(index as usize));
+            let leading = hash.iter().take(8).fold(0_u64, |number, &byte| number << 8 | u64::from(byte));
+            leading as f64 >= fraction * 2.0_f64.powi(64)
+        })
+    }
+}
 
 /// Trains a classifier of grasp candidates with Adam and cross-entropy.
 pub struct ClassifierTrainer<'a> {
     executor: Executor,
     adam: Adam,
-    dataset: &'a CandidateDataset,
+    dataset: &'a dyn Examples,
     /// Indices of the training candidates, shuffled in each epoch.
     training: Vec<i64>,
     /// Indices of the validation candidates.
     validation: Vec<i64>,
-    /// Weights of failures and of successes in the loss: n / (2 n_class) with `balance`, else 1.
+    /// Weight of each class in the loss: n / (classes · n_class) with `balance`, else 1.
     class_weights: Tensor,
     settings: ClassifierSettings,
     rng: ChaCha8Rng,
@@ -65,17 +104,19 @@ impl<'a> ClassifierTrainer<'a> {
     /// [`ExecuteError`] names the node that cannot be executed.
     pub fn new(
         model: ModelProto,
-        dataset: &'a CandidateDataset,
+        dataset: &'a dyn Examples,
         settings: ClassifierSettings,
     ) -> Result<Self, ExecuteError> {
         let ClassifierSettings { validation, seed, balance, bf16, .. } = settings;
         let execution = ExecutionOptions { device: Device::cuda_if_available(), bf16, channels_last: false };
         let executor = Executor::new(model, execution)?;
         let (training, validation) = dataset.split(validation);
-        let class_weights = dataset.class_counts(&training).map(|count| match balance {
-            true => training.len() as f32 / (2.0 * count.max(1) as f32),
-            false => 1.0,
-        });
+        let class_weight = |class| {
+            let count = training.iter().filter(|&&index| dataset.class(index as usize) == class).count();
+            let balanced = training.len() as f32 / (dataset.classes() * count.max(1)) as f32;
+            if balance { balanced } else { 1.0 }
+        };
+        let class_weights: Vec<f32> = (0..dataset.classes()).map(class_weight).collect();
         let class_weights = Tensor::from_slice(&class_weights).to_device(executor.device());
         let adam = Adam::new(executor.parameters(), 0.0);
         let rng = ChaCha8Rng::seed_from_u64(seed);
@@ -102,7 +143,7 @@ impl<'a> ClassifierTrainer<'a> {
         self.training.shuffle(&mut self.rng);
         let mut sums = MetricSums::default();
         for indices in self.training.chunks(self.settings.batch) {
-            let (images, classes) = self.dataset.batch(indices);
+            let (images, classes) = self.batch(indices);
             let axes: Vec<i64> = [-3, -2].into_iter().filter(|_| self.settings.mirror && self.rng.random()).collect();
             let loss = sums.add(&self.executor, &self.class_weights, &images.flip(axes), &classes)?;
             loss.backward();
@@ -111,6 +152,12 @@ impl<'a> ClassifierTrainer<'a> {
             progress();
         }
         Ok(sums.metrics())
+    }
+
+    /// The images and classes, i64 `[n]`, of examples.
+    fn batch(&self, indices: &[i64]) -> (Tensor, Tensor) {
+        let classes: Vec<i64> = indices.iter().map(|&index| self.dataset.class(index as usize) as i64).collect();
+        (self.dataset.images(indices), Tensor::from_slice(&classes))
     }
 
     /// The learning rate of the next step.
@@ -127,7 +174,7 @@ impl<'a> ClassifierTrainer<'a> {
     pub fn validate(&self) -> Result<Option<ClassifierMetrics>, ExecuteError> {
         let mut sums = MetricSums::default();
         for indices in self.validation.chunks(self.settings.batch) {
-            let (images, classes) = self.dataset.batch(indices);
+            let (images, classes) = self.batch(indices);
             let _ = no_grad(|| sums.add(&self.executor, &self.class_weights, &images, &classes))?;
         }
         Ok((!self.validation.is_empty()).then(|| sums.metrics()))
@@ -164,9 +211,10 @@ impl MetricSums {
         let batch_weight = class_weights.index_select(0, &classes).sum(Kind::Double).double_value(&[]);
         self.loss += loss.double_value(&[]) * batch_weight;
         self.weight += batch_weight;
-        let predictions = scores.argmax(1, false);
+        let predicts_success = scores.softmax(1, Kind::Float).select(1, 0).lt(0.5);
+        let is_success = classes.gt(0);
         for [predicted, actual] in [[0, 0], [0, 1], [1, 0], [1, 1]] {
-            let both = predictions.eq(predicted).logical_and(&classes.eq(actual));
+            let both = predicts_success.eq(predicted).logical_and(&is_success.eq(actual));
             self.confusion[predicted as usize][actual as usize] += both.sum(Kind::Double).double_value(&[]);
         }
         Ok(loss)

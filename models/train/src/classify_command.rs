@@ -6,12 +6,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
 use clap::{Args, ValueEnum};
-use grasp::Patch;
 use grasp::gpd::Image;
+use grasp_data::DataError;
 use grasp_models::evaluator;
 use grasp_models::gpd::{describe, gpd};
 use grasp_models::onnx::ModelProto;
-use grasp_train::{CandidateDataset, ClassifierMetrics, ClassifierSettings, ClassifierTrainer};
+use grasp_train::{
+    CandidateDataset, ClassifierMetrics, ClassifierSettings, ClassifierTrainer, Examples, ProposalDataset,
+};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use time::OffsetDateTime;
@@ -25,7 +27,7 @@ pub(crate) struct Classify {
     /// Name of the network whose grasps the evaluator scores.
     #[arg(long, required_if_eq("network", "evaluator"))]
     proposals_of: Option<String>,
-    /// Files of `grasp-sim candidates`; several are mixed.
+    /// Files of `grasp-sim candidates`, or for the evaluator folders of `grasp-sim proposals`; several are mixed.
     #[arg(long, required = true, num_args = 1..)]
     data: Vec<PathBuf>,
     /// Output file of the classifier.
@@ -81,11 +83,11 @@ impl Kind {
         }
     }
 
-    fn shape(self) -> &'static [usize] {
-        match self {
-            Self::Gpd => &Image::SHAPE,
-            Self::Evaluator => &Patch::SHAPE,
-        }
+    fn read(self, data: &[PathBuf]) -> Result<Box<dyn Examples>, DataError> {
+        Ok(match self {
+            Self::Gpd => Box::new(CandidateDataset::read(data, &Image::SHAPE)?),
+            Self::Evaluator => Box::new(ProposalDataset::read(data)?),
+        })
     }
 }
 
@@ -106,7 +108,8 @@ impl Classify {
         if let Some(folder) = self.out.parent() {
             fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
         }
-        let examples = CandidateDataset::read(&self.data, self.network.shape())?;
+        let examples = self.network.read(&self.data)?;
+        let examples = examples.as_ref();
         let settings = ClassifierSettings {
             epochs: self.epochs,
             batch: usize::from(self.batch),
@@ -119,7 +122,7 @@ impl Classify {
             mirror: self.network == Kind::Evaluator,
             bf16: self.bf16,
         };
-        let mut trainer = ClassifierTrainer::new(self.network.build(self.seed), &examples, settings)?;
+        let mut trainer = ClassifierTrainer::new(self.network.build(self.seed), examples, settings)?;
         let (training, held_out) = trainer.candidates();
         ensure!(training > 0, "--val is {}, which leaves no scene for training; use a smaller share", self.val);
         eprintln!(
@@ -137,7 +140,7 @@ impl Classify {
             let loss = record.validation.map_or(f64::NEG_INFINITY, |validation| validation.loss);
             if loss <= best {
                 best = loss;
-                self.write(&trainer, &examples, &record)?;
+                self.write(&trainer, examples, &record)?;
             }
         }
         Ok(())
@@ -153,7 +156,7 @@ impl Classify {
     fn write(
         &self,
         trainer: &ClassifierTrainer,
-        examples: &CandidateDataset,
+        examples: &dyn Examples,
         record: &ClassifierEpochRecord,
     ) -> Result<()> {
         let name = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();

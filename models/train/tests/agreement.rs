@@ -81,8 +81,8 @@ fn the_classifier_agrees_with_onnx_runtime() {
     let input = Tensor::from_slice(&pixels).reshape([3, CHANNELS as i64, IMAGE_SIZE as i64, IMAGE_SIZE as i64]);
     let torch = no_grad(|| executor.output(&input, gpd::OUTPUT)).unwrap();
     let torch = Vec::<f32>::try_from(torch.select(1, 1) - torch.select(1, 0)).unwrap();
-    let pixels: Vec<&[u8]> = images.iter().map(Image::pixels).collect();
-    let onnx = Classifier::load(&path, &Image::SHAPE, &Options::default()).unwrap().score(&pixels).unwrap();
+    let mut onnx = Classifier::load(&path, &Image::SHAPE, &Options::default()).unwrap();
+    let onnx = onnx.score(images.len(), |index, values| images[index].write(values)).unwrap();
     assert_ne!(onnx[0], onnx[1], "the images differ");
     for (torch, onnx) in torch.iter().zip(onnx) {
         assert!((torch - onnx).abs() <= 1e-4, "{torch} and {onnx}");

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use grasp::gpd::{Candidate, Cloud, Image};
-use grasp::{DecodeParams, Patch, SurfacePoint};
-use grasp_data::Candidates;
+use grasp::{DecodeParams, Grasp, Patch, SurfacePoint, Volume};
+use grasp_data::{Candidates, Setup, Trial, packed};
 use grasp_models::gpd::gpd;
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Classifier, Metadata, Options};
@@ -17,8 +17,10 @@ use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::planner::PlannerSpec;
 use grasp_sim::scene::SceneKind;
 use grasp_sim::score::Summary;
-use grasp_train::{CandidateDataset, ClassifierSettings, ClassifierTrainer};
+use grasp_train::{CandidateDataset, ClassifierSettings, ClassifierTrainer, Examples};
 use nalgebra::{Isometry3, Point3, Vector3};
+
+mod support;
 
 /// Adds a candidate with a wall between the fingers. It succeeds if the wall is parallel to the approach, and fails if
 /// it is perpendicular.
@@ -120,18 +122,34 @@ fn a_trained_classifier_plans_in_the_benchmark() {
     assert!(summary.attempts > 0 || summary.nothing_proposed == 2, "{summary:?}");
 }
 
-#[test]
-fn an_evaluator_separates_full_from_empty_patches() {
-    let folder = tempfile::tempdir().unwrap();
-    let patch = |level: u8| vec![level; Patch::SHAPE.iter().product()];
-    let mut candidates = Candidates::default();
-    for number in 0..96 {
-        let success = number % 2 == 0;
-        let level = if success { 180 } else { 40 } + number as u8 % 32;
-        candidates.push(number / 4, &Patch::SHAPE, &patch(level), success);
+/// A data set of volumes that are full or empty between the fingers. Grasps in full volumes succeed.
+fn proposals(folder: &Path) -> PathBuf {
+    let path = folder.join("proposals");
+    let setup = Setup::benchmark(support::provenance());
+    let mut writer = packed::Writer::open(&path, &setup).unwrap();
+    for number in 0..24_u8 {
+        let success = number.is_multiple_of(2);
+        let volume = filled(if success { 0.7 } else { 0.2 } + 0.005 * f32::from(number));
+        let trial = |i: u8| Trial::new(&grasp(f64::from(i)), success, volume.voxel_size());
+        writer.append(u64::from(number), &[volume.values().to_vec()], &[0, 1, 2, 3].map(trial)).unwrap();
     }
-    candidates.write(&folder.path().join("patches.npz")).unwrap();
-    let arguments = "--network evaluator --proposals-of vgn-packed --data patches.npz --out evaluator.onnx --epochs 6 \
+    path
+}
+
+/// A volume with one value.
+fn filled(value: f32) -> Volume {
+    Volume::new(40, 0.0075, Isometry3::identity(), vec![value; 64_000]).unwrap()
+}
+
+fn grasp(shift: f64) -> Grasp {
+    Grasp { pose: Isometry3::translation(0.15 + 0.002 * shift, 0.15, 0.12), width: 0.04, quality: 1.0 }
+}
+
+#[test]
+fn an_evaluator_separates_full_from_empty_volumes() {
+    let folder = tempfile::tempdir().unwrap();
+    proposals(folder.path());
+    let arguments = "--network evaluator --proposals-of vgn-packed --data proposals --out evaluator.onnx --epochs 6 \
                      --batch 16";
     let output = classify(folder.path(), arguments);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -139,14 +157,15 @@ fn an_evaluator_separates_full_from_empty_patches() {
     let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
     assert_eq!((&*metadata.name, metadata.network.as_deref()), ("evaluator", Some("vgn-packed")));
     let mut evaluator = Classifier::load(&path, &Patch::SHAPE, &Options::default()).unwrap();
-    let scores = evaluator.score(&[&patch(200), &patch(50)]).unwrap();
+    let volumes = [filled(0.75), filled(0.25)];
+    let scores = evaluator.score(2, |index, patch| Patch::write(&volumes[index], &grasp(0.5).pose, patch)).unwrap();
     assert!(scores[0] > 0.0 && scores[1] < 0.0, "{scores:?}");
 
     candidate_file(folder.path(), 8);
     for (arguments, expected) in [
-        ("--network evaluator --data patches.npz --out x.onnx", "--proposals-of"),
-        ("--network evaluator --proposals-of vgn --data walls.npz --out x.onnx", "the images are of [12, 60, 60]"),
-        ("--data patches.npz --out x.onnx", "the images are of [2, 10, 20, 16]"),
+        ("--network evaluator --data proposals --out x.onnx", "--proposals-of"),
+        ("--network evaluator --proposals-of vgn --data walls.npz --out x.onnx", "walls.npz: "),
+        ("--data proposals --out x.onnx", "proposals: "),
     ] {
         let output = classify(folder.path(), arguments);
         let stderr = String::from_utf8_lossy(&output.stderr);

@@ -1,12 +1,8 @@
-use std::path::{Path, PathBuf};
-use std::sync::Mutex;
+use std::path::PathBuf;
 
 use anyhow::Context;
 use clap::Args;
-use grasp::DecodeParams;
 use grasp_data::Candidates as Tried;
-use grasp_models::{Network, Options};
-use grasp_planner::{Evaluator, NetworkPlanner, Planner};
 use grasp_sim::label::SceneConfig;
 use grasp_sim::ordered;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -20,17 +16,7 @@ pub struct Candidates {
     #[command(flatten)]
     scene: SceneArgs,
 
-    /// Try the grasps of this network, moved at random, for an evaluator [default: GPD's candidates, for its
-    /// classifier].
-    #[arg(long)]
-    network: Option<PathBuf>,
-
-    /// Try the grasps of the network that this evaluator has moved, so that the next evaluator learns from the errors of
-    /// this one.
-    #[arg(long, requires = "network")]
-    evaluator: Option<PathBuf>,
-
-    /// Number of scenes. All images are kept in memory: 43 kB per candidate of GPD, 6 kB per grasp of a network.
+    /// Number of scenes. All images are kept in memory: 43 kB per candidate.
     #[arg(long)]
     scenes: u64,
 
@@ -59,16 +45,12 @@ impl Candidates {
         }
         let style = "{wide_bar} {pos}/{len} scenes, {per_sec}, {eta} left";
         let progress = ProgressBar::new(self.scenes).with_style(ProgressStyle::with_template(style)?);
-        let planner = self.network.map(|path| planner(&path, self.evaluator.as_deref())).transpose()?;
         let mut tried = Tried::default();
         ordered::for_each(
             0..self.scenes,
-            |number| match &planner {
-                Some((planner, params)) => config.proposals(number, planner, params),
-                None => Ok(config.candidates(number)),
-            },
+            |number| config.candidates(number),
             |_, candidates| {
-                tried.append(candidates?);
+                tried.append(candidates);
                 progress.inc(1);
                 anyhow::Ok(())
             },
@@ -77,14 +59,4 @@ impl Candidates {
         eprintln!("{} candidates tried, {} of them successes", tried.len(), tried.successes());
         Ok(tried.write(&self.out)?)
     }
-}
-
-/// The planner whose grasps are tried, and its parameters.
-fn planner(network: &Path, evaluator: Option<&Path>) -> anyhow::Result<(Mutex<Box<dyn Planner + Send>>, DecodeParams)> {
-    let options = Options::default();
-    let network = Network::load(network, &options)?;
-    let params = DecodeParams { origin: network.metadata().voxel_origin, ..DecodeParams::benchmark() };
-    let evaluator = evaluator.map(|path| Evaluator::load(path, &options)).transpose()?;
-    let planner = NetworkPlanner::new(network, evaluator);
-    Ok((Mutex::new(Box::new(planner)), Evaluator::proposal_params(&params)))
 }

@@ -88,6 +88,8 @@ impl Label {
             noise: config.noise,
             seed: config.seed,
             observation_seed: None,
+            network: None,
+            evaluator: None,
             version: env!("CARGO_PKG_VERSION").to_owned(),
         });
         let mut writer = Writer::open(self.format, &self.out, &setup)?;

@@ -51,6 +51,11 @@ impl Observe {
 
         let missing = || format!("{}: setup.json has no provenance; label the scenes again", self.data.display());
         let made = Setup::read(&self.data)?.provenance.with_context(missing)?;
+        ensure!(
+            made.network.is_none(),
+            "{} holds the grasps of a network, which depend on the observation; observe a data set of `label`",
+            self.data.display()
+        );
         let scene = Scene::from_str(&made.scene, false).map_err(anyhow::Error::msg)?;
         let part = Part::from_str(&made.part, false).map_err(anyhow::Error::msg)?;
         let before = SceneConfig {

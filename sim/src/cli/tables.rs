@@ -11,7 +11,6 @@ use clap::Args;
 use grasp::DecodeParams;
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Metadata, Options, Store};
-use grasp_planner::Evaluator;
 use grasp_sim::benchmark::{Benchmark, Event};
 use grasp_sim::objects::ObjectSet;
 use grasp_sim::planner::PlannerSpec;
@@ -78,11 +77,6 @@ pub struct Tables {
 
 /// If no grasp of a network reaches ε, the best grasp is executed if its quality is at least this.
 const FORCE: f32 = 0.5;
-
-/// The smallest quality of a grasp that is executed because none reaches ε.
-fn force(planner: &PlannerSpec) -> f32 {
-    if matches!(planner, PlannerSpec::Evaluated { .. }) { Evaluator::FORCE } else { FORCE }
-}
 
 /// A planner and its name.
 #[derive(Clone)]
@@ -314,8 +308,7 @@ impl Tables {
     fn run_in_rapier(&self, task: &Task, progress: &ProgressBar) -> anyhow::Result<Measurement> {
         let benchmark = self.benchmark(&task.condition, task.seed)?;
         let planner = PlannerSpec::from(task.planner.as_str());
-        let mut params = params(task.condition.epsilon, task.condition.forced);
-        params.force = params.force.map(|_| force(&planner));
+        let params = params(task.condition.epsilon, task.condition.forced);
         let (mut summary, mut milliseconds) = (None, None);
         if task.timed {
             let mut planner = planner.build(&params, &Options::default())?;
@@ -389,7 +382,7 @@ impl Tables {
              - Scenes: {} per seed, seeds {} to {}, with five unseen procedural objects each. PyBullet, and views, ε and objects\n\
              \x20 that are not in the paper, use only the first seed.\n\
              - Observation: one side view with depth noise. Grasps: ε = 0.9, out_th 0.1, the best grasp first. If no grasp\n\
-             \x20 reaches ε, the best grasp is executed if its quality is at least 0.5, with an evaluator 0.1 (`force`).\n\
+             \x20 reaches ε, the best grasp is executed if its quality is at least 0.5 (`force`).\n\
              - GSR: share of the grasps that lifted an object. DR: share of the objects that were removed. Mean ± standard\n\
              \x20 deviation over the seeds.\n\
              - VGN-R: VGN's released weights. graspd: vgn with its evaluator.\n\

@@ -52,6 +52,8 @@ pub fn provenance() -> Provenance {
         noise: 0.0,
         seed: 0,
         observation_seed: None,
+        network: None,
+        evaluator: None,
         version: String::new(),
     }
 }

@@ -12,7 +12,7 @@ use grasp_sim::score::Summary;
 use grasp_sim::tables::Condition;
 use tempfile::TempDir;
 
-use super::{force, scene_of};
+use super::{FORCE, scene_of};
 
 /// Relative to the root of a checkout.
 pub(super) const FOLDER: &str = "sim/pybullet";
@@ -33,19 +33,16 @@ pub(super) struct Model<'a> {
     name: String,
     /// Smallest quality of a grasp, without `force`; `None` for networks, which use ε and `force`.
     threshold: Option<&'static str>,
-    /// Floor of `force`.
-    force: f32,
 }
 
 /// The served model of a planner; `None` if graspd does not serve it. `zoo` is the model folder for planners without a
 /// network.
 pub(super) fn model<'a>(planner: &'a PlannerSpec, zoo: &'a Path) -> Option<Model<'a>> {
-    let classical = |name: &str, threshold| {
-        Some(Model { folder: zoo, name: name.to_owned(), threshold: Some(threshold), force: force(planner) })
-    };
+    let classical =
+        |name: &str, threshold| Some(Model { folder: zoo, name: name.to_owned(), threshold: Some(threshold) });
     let network = |file: &Path, folder| {
         let name = file.file_stem()?.to_string_lossy().into_owned();
-        Some(Model { folder, name, threshold: None, force: force(planner) })
+        Some(Model { folder, name, threshold: None })
     };
     match planner {
         PlannerSpec::Highest => classical("shaf", "0.000001"),
@@ -86,7 +83,7 @@ impl PyBullet {
             let epsilon = format!("0.{}", condition.epsilon);
             let (threshold, force) = match model.threshold {
                 Some(threshold) => (threshold, "none".to_owned()),
-                None => (epsilon.as_str(), model.force.to_string()),
+                None => (epsilon.as_str(), FORCE.to_string()),
             };
             command.args(["--planner", &format!("grpc:{address}"), "--model", &model.name]);
             command.args(["--threshold", threshold, "--force", &force]);

@@ -1,0 +1,88 @@
+use std::path::PathBuf;
+
+use grasp::{Patch, Volume, WORKSPACE_SIZE};
+use grasp_data::{DataError, Dataset, value};
+use nalgebra::Isometry3;
+use tch::Tensor;
+
+use crate::Examples;
+
+/// The tried grasps of networks, with the volumes in which they were proposed. The images are patches of the volumes.
+///
+/// Class 0 is failure; 1 is success after a contact on the approach; 2 is success without a contact.
+pub struct ProposalDataset {
+    volumes: Vec<Volume>,
+    /// Folder index and scene name of each volume.
+    scenes: Vec<String>,
+    proposals: Vec<Proposal>,
+}
+
+struct Proposal {
+    volume: usize,
+    /// In the frame of the volume, metres.
+    pose: Isometry3<f64>,
+    class: usize,
+}
+
+impl ProposalDataset {
+    /// Reads data sets of `grasp-sim proposals`; several are mixed.
+    ///
+    /// # Errors
+    /// [`DataError`] names the folder that cannot be used.
+    pub fn read(folders: &[PathBuf]) -> Result<Self, DataError> {
+        let mut all = Self { volumes: Vec::new(), scenes: Vec::new(), proposals: Vec::new() };
+        for (folder, path) in folders.iter().enumerate() {
+            let dataset = Dataset::open(std::slice::from_ref(path))?;
+            let n = dataset.resolution();
+            let voxel_size = WORKSPACE_SIZE / n as f64;
+            for scene in 0..dataset.len() {
+                let values = dataset.volume(scene, 0).iter().copied().map(value).collect();
+                let volume = Volume::new(n, voxel_size, Isometry3::identity(), values).map_err(|error| {
+                    let reason = format!("scene {}: {error}", dataset.id(scene));
+                    DataError::Scene { path: path.clone(), reason, expected: "an observed volume" }
+                })?;
+                for trial in dataset.trials(scene) {
+                    let class = match (trial.success, trial.share > 0.5) {
+                        (true, _) => 2,
+                        (false, true) => 1,
+                        (false, false) => 0,
+                    };
+                    let pose = trial.grasp(voxel_size).pose;
+                    all.proposals.push(Proposal { volume: all.volumes.len(), pose, class });
+                }
+                all.volumes.push(volume);
+                all.scenes.push(format!("{folder}/{}", dataset.id(scene)));
+            }
+        }
+        Ok(all)
+    }
+}
+
+impl Examples for ProposalDataset {
+    fn len(&self) -> usize {
+        self.proposals.len()
+    }
+
+    fn class(&self, index: usize) -> usize {
+        self.proposals[index].class
+    }
+
+    fn classes(&self) -> usize {
+        3
+    }
+
+    fn scene(&self, index: usize) -> String {
+        self.scenes[self.proposals[index].volume].clone()
+    }
+
+    fn images(&self, indices: &[i64]) -> Tensor {
+        let mut patches = vec![0.0; indices.len() * Patch::SIZE];
+        for (&index, patch) in indices.iter().zip(patches.chunks_exact_mut(Patch::SIZE)) {
+            let Proposal { volume, pose, .. } = &self.proposals[index as usize];
+            Patch::write(&self.volumes[*volume], pose, patch);
+        }
+        let shape: Vec<i64> =
+            [&[indices.len()], &Patch::SHAPE[..]].concat().into_iter().map(|size| size as i64).collect();
+        Tensor::from_slice(&patches).reshape(shape)
+    }
+}

@@ -1,0 +1,108 @@
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+
+use clap::Args;
+use grasp::DecodeParams;
+use grasp_data::{Provenance, Setup, packed};
+use grasp_models::{Network, Options};
+use grasp_planner::{Evaluator, NetworkPlanner, Planner};
+use grasp_sim::label::SceneConfig;
+use grasp_sim::ordered;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::SceneArgs;
+
+/// Default of `--objects`.
+const OBJECTS: &str = "train";
+
+/// Writes the training data of `grasp-train classify --network evaluator`: a packed data set. Each scene is observed
+/// once. Each grasp is moved at random and executed with a pose error. An interrupted run continues where it stopped.
+#[derive(Args)]
+pub struct Proposals {
+    #[command(flatten)]
+    scene: SceneArgs,
+
+    /// The network that proposes grasps.
+    #[arg(long)]
+    network: PathBuf,
+
+    /// Try the grasps as this evaluator scores and moves them, so that the next evaluator learns from the errors of this
+    /// one.
+    #[arg(long)]
+    evaluator: Option<PathBuf>,
+
+    /// Number of scenes.
+    #[arg(long)]
+    scenes: u64,
+
+    /// Grasps tried per scene.
+    #[arg(long, default_value_t = 100)]
+    grasps: usize,
+
+    /// Output folder.
+    #[arg(long)]
+    out: PathBuf,
+}
+
+impl Proposals {
+    pub fn run(self) -> anyhow::Result<()> {
+        let config = SceneConfig {
+            kind: self.scene.kind(),
+            objects: self.scene.objects(OBJECTS)?,
+            points: self.grasps,
+            views: self.scene.views()?,
+            observations: 1,
+            noise: self.scene.noise,
+            seed: self.scene.seed,
+        };
+        let (planner, params) = planner(&self.network, self.evaluator.as_deref())?;
+        let setup = Setup::benchmark(Provenance {
+            scene: self.scene.scene.name().to_owned(),
+            objects: self.scene.objects.clone().unwrap_or_else(|| OBJECTS.to_owned()),
+            part: self.scene.part.name().to_owned(),
+            points: config.points,
+            views: self.scene.views.clone(),
+            observations: config.observations,
+            noise: config.noise,
+            seed: config.seed,
+            observation_seed: None,
+            network: Some(name(&self.network)),
+            evaluator: self.evaluator.as_deref().map(name),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+        });
+        let mut writer = packed::Writer::open(&self.out, &setup)?;
+        let next = writer.next().unwrap_or(0);
+        let style = "{wide_bar} {pos}/{len} scenes, {per_sec}, {eta} left";
+        let progress = ProgressBar::new(self.scenes).with_style(ProgressStyle::with_template(style)?);
+        progress.set_position(next);
+        progress.reset_eta();
+        ordered::for_each(
+            next..self.scenes.max(next),
+            |number| config.proposals(number, &planner, &params),
+            |number, scene| {
+                if let Some(scene) = scene? {
+                    writer.append(number, &[scene.volume], &scene.trials)?;
+                }
+                progress.inc(1);
+                anyhow::Ok(())
+            },
+        )?;
+        progress.finish();
+        Ok(())
+    }
+}
+
+/// The name of a model file in the provenance.
+fn name(path: &Path) -> String {
+    path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// The planner whose grasps are tried, and its parameters.
+fn planner(network: &Path, evaluator: Option<&Path>) -> anyhow::Result<(Mutex<Box<dyn Planner + Send>>, DecodeParams)> {
+    let options = Options::default();
+    let network = Network::load(network, &options)?;
+    let params = DecodeParams { origin: network.metadata().voxel_origin, ..DecodeParams::benchmark() };
+    let evaluator = evaluator.map(|path| Evaluator::load(path, &options)).transpose()?;
+    let planner = NetworkPlanner::new(network, evaluator);
+    Ok((Mutex::new(Box::new(planner)), Evaluator::proposal_params(&params)))
+}
