@@ -114,15 +114,17 @@ fn sort(grasps: &mut [Grasp]) {
     grasps.sort_by(|a, b| b.quality.total_cmp(&a.quality));
 }
 
-/// Number of [`variations`].
-const VARIATIONS: usize = 19;
+/// Shifts of the variations along the closing axis and along the approach, metres, and their rotations, radians.
+const SHIFTS: [f64; 4] = [-0.008, -0.004, 0.004, 0.008];
+const DEPTHS: [f64; 3] = [-0.015, -0.0075, 0.0075];
+const ANGLES: [f64; 4] = [-PI / 6.0, -PI / 12.0, PI / 12.0, PI / 6.0];
+
+/// Number of [`variations`]: the rotations are about three axes.
+const VARIATIONS: usize = SHIFTS.len() + DEPTHS.len() + 3 * ANGLES.len();
 
 /// The grasp moved along its closing axis and its approach, and rotated about its axes through the middle between the
 /// fingertips, so that the grasped part stays between them. `depth` is the distance of the fingertips from the origin.
 fn variations(grasp: &Grasp, depth: f64) -> impl Iterator<Item = Grasp> {
-    const SHIFTS: [f64; 4] = [-0.008, -0.004, 0.004, 0.008];
-    const DEPTHS: [f64; 3] = [-0.015, -0.0075, 0.0075];
-    const ANGLES: [f64; 4] = [-PI / 6.0, -PI / 12.0, PI / 12.0, PI / 6.0];
     let shifts = SHIFTS.map(|y| Isometry3::translation(0.0, y, 0.0));
     let depths = DEPTHS.map(|z| Isometry3::translation(0.0, 0.0, z));
     let tips = Translation3::new(0.0, 0.0, depth);
