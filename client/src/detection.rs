@@ -95,6 +95,8 @@ pub struct Detection {
     pub latency: pb::Latency,
     /// Number of voxels without a grasp, by reason. Set when `explain` is set or `grasps` is empty.
     pub dropped: Option<pb::Dropped>,
+    /// Signs that the geometry of the request is wrong, or that the network was not trained for it.
+    pub warnings: Vec<pb::GeometryWarning>,
 }
 
 /// A grasp with its pre-grasp and retreat poses.
@@ -224,6 +226,7 @@ impl TryFrom<pb::DetectGraspsResponse> for Detection {
             version: response.version,
             latency: response.latency.unwrap_or_default(),
             dropped: response.dropped,
+            warnings: response.warnings,
         })
     }
 }

@@ -123,16 +123,24 @@ impl<'a> DepthImage<'a> {
     /// Back-projects every pixel with a depth of at most [`DEPTH_MAX`] to a point of the task frame. The normal is the
     /// direction towards the camera. `camera_from_task` is `T_camera_task`.
     pub fn points(&self, camera_from_task: &Isometry3<f64>) -> impl Iterator<Item = SurfacePoint> {
+        self.points_of_every(1, camera_from_task)
+    }
+
+    /// As [`points`](Self::points), of one in `every` pixels.
+    pub(crate) fn points_of_every(
+        &self,
+        every: usize,
+        camera_from_task: &Isometry3<f64>,
+    ) -> impl Iterator<Item = SurfacePoint> {
         let Intrinsics { width, fx, fy, cx, cy, .. } = self.intrinsics;
         let task_from_camera = camera_from_task.inverse();
         let eye = Point3::from(task_from_camera.translation.vector);
-        self.depth.iter().enumerate().filter(|(_, depth)| (f32::MIN_POSITIVE..=DEPTH_MAX).contains(*depth)).map(
-            move |(pixel, &depth)| {
-                let (u, v, z) = ((pixel % width) as f64, (pixel / width) as f64, f64::from(depth));
-                let position = task_from_camera * Point3::new((u - cx) / fx * z, (v - cy) / fy * z, z);
-                SurfacePoint { position, normal: (eye - position).normalize() }
-            },
-        )
+        let pixels = self.depth.iter().enumerate().step_by(every);
+        pixels.filter(|(_, depth)| (f32::MIN_POSITIVE..=DEPTH_MAX).contains(*depth)).map(move |(pixel, &depth)| {
+            let (u, v, z) = ((pixel % width) as f64, (pixel / width) as f64, f64::from(depth));
+            let position = task_from_camera * Point3::new((u - cx) / fx * z, (v - cy) / fy * z, z);
+            SurfacePoint { position, normal: (eye - position).normalize() }
+        })
     }
 }
 

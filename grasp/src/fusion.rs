@@ -203,6 +203,40 @@ impl Fusion {
         if depth > 0.0 { Blind::Hidden { depth, distance } } else { Blind::NoReading { distance } }
     }
 
+    /// Share of the voxels that a view has measured, also as free space.
+    #[must_use]
+    pub fn measured(&self) -> f64 {
+        let measured = self.voxels.iter().filter(|voxel| voxel.weight > 0.0).count();
+        measured as f64 / self.voxels.len() as f64
+    }
+
+    /// Share of an image's surface in the cube that lies in space which the fused views saw as free. `None` if fewer
+    /// than 100 of the sampled pixels are in measured space.
+    #[must_use]
+    pub fn contradicted(&self, image: &DepthImage, camera_from_task: &Isometry3<f64>) -> Option<f64> {
+        /// About this many pixels are sampled.
+        const SAMPLES: usize = 5000;
+        const FEWEST: usize = 100;
+        /// Distance in front of a surface from which space counts as free, metres: beyond the noise of depth cameras.
+        const FREE: f32 = 0.024;
+        let size = self.voxel_size * self.resolution as f64;
+        // Odd, so that the sampled pixels are not in few columns.
+        let every = (image.depth().len() / SAMPLES) | 1;
+        let (mut compared, mut contradicted) = (0_usize, 0_usize);
+        for point in image.points_of_every(every, camera_from_task) {
+            if !point.position.iter().all(|c| (0.0..size).contains(c)) {
+                continue;
+            }
+            let [x, y, z]: [usize; 3] = point.position.coords.map(|c| (c / self.voxel_size) as usize).into();
+            let index = (x * self.resolution + y) * self.resolution + z;
+            // Rounding may reach the upper side of the cube.
+            let Some(voxel) = self.voxels.get(index).filter(|voxel| voxel.weight > 0.0) else { continue };
+            compared += 1;
+            contradicted += usize::from(voxel.distance * self.truncation > FREE);
+        }
+        (compared >= FEWEST).then(|| contradicted as f64 / compared as f64)
+    }
+
     /// The input values of a network, `[N, N, N]`, indexed `[x][y][z]`: `(tsdf + 1) / 2` near an observed surface, else
     /// 0.
     #[must_use]

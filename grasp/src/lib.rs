@@ -25,7 +25,9 @@ mod obstacles;
 mod patch;
 mod selection;
 mod surface;
+mod table;
 mod volume;
+mod warning;
 
 pub use camera::{CameraError, DepthImage, Intrinsics, Unit};
 pub use cloud::{View, seen_from};
@@ -40,7 +42,9 @@ pub use obstacles::{Clearance, Obstacles};
 pub use patch::Patch;
 pub use selection::{Decoded, Dropped, select};
 pub use surface::{SurfaceMesh, SurfacePoint};
+pub use table::Table;
 pub use volume::{Volume, VolumeError};
+pub use warning::{TARGET_HEIGHT, TRAINED_ANGLE, TRAINED_DISTANCE, Warning};
 
 /// Edge of the workspace cube, metres (the paper, section "Problem formulation").
 pub const WORKSPACE_SIZE: f64 = 0.3;

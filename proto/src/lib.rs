@@ -11,6 +11,7 @@ mod options;
 mod pose;
 mod views;
 mod volume;
+mod warning;
 
 /// Generated types, client and server of `grasp.v1`.
 #[allow(missing_docs, reason = "the .proto file documents them, and prost copies only existing comments")]

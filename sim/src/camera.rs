@@ -3,7 +3,7 @@
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_3, TAU};
 use std::ops::{Range, RangeInclusive};
 
-use grasp::{DepthImage, Fusion, Intrinsics, SurfacePoint};
+use grasp::{DepthImage, Fusion, Intrinsics, SurfacePoint, TARGET_HEIGHT, TRAINED_ANGLE, TRAINED_DISTANCE};
 pub use grasp_data::raw::View;
 use nalgebra::{Isometry3, Point3, Vector3};
 use rand::seq::IndexedRandom;
@@ -55,17 +55,19 @@ impl Views {
                 .collect(),
             Self::Random(count) => {
                 let count = rng.random_range(count.clone());
-                (0..count).map(|_| random_view(20.0..75.0, 0.0..TAU, rng)).collect()
+                let [low, high] = TRAINED_ANGLE;
+                (0..count).map(|_| random_view(low..high, 0.0..TAU, rng)).collect()
             }
         }
     }
 }
 
-/// A camera at a random distance of 0.48–0.72 m, at a random angle from the vertical (degrees) and azimuth (radians).
+/// A camera at a random distance, at a random angle from the vertical (degrees) and azimuth (radians).
 fn random_view(polar: Range<f64>, azimuth: Range<f64>, rng: &mut impl Rng) -> Isometry3<f64> {
-    let (distance, polar) = (rng.random_range(0.48..0.72), rng.random_range(polar).to_radians());
+    let [near, far] = TRAINED_DISTANCE;
+    let (distance, polar) = (rng.random_range(near..far), rng.random_range(polar).to_radians());
     let azimuth = rng.random_range(azimuth);
-    look_at(&Point3::new(0.15, 0.15, 0.08), distance, polar, azimuth)
+    look_at(&Point3::new(0.15, 0.15, TARGET_HEIGHT), distance, polar, azimuth)
 }
 
 /// `T_camera_task` of an upright camera at `distance` (metres) from `target`, at the angle `polar` from the vertical

@@ -3,6 +3,7 @@
 mod bench;
 mod candidates;
 mod convert;
+mod data;
 mod demo;
 mod label;
 mod merge;

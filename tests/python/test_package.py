@@ -124,6 +124,18 @@ class DetectTest(ServerTest):
         rounded = self.client.detect_from_depth(millimetres, workspace, LOW)
         np.testing.assert_allclose(positions(rounded)[0], positions(found)[0], atol=0.01)
 
+    def test_wrong_geometry_is_reported_and_logged_once(self):
+        wire.logged.clear()
+        view, height = views()[:1], graspd.Options(collision=graspd.CollisionCheck(table_height=0.02))
+        self.assertEqual(self.client.detect_from_depth(view, graspd.Workspace()).warnings, ())
+        with self.assertLogs("graspd", "WARNING") as logged:
+            for _ in range(2):
+                (warning,) = self.client.detect_from_depth(view, graspd.Workspace(), height).warnings
+        self.assertEqual((warning.code, warning.view), ("TABLE_HEIGHT", None))
+        self.assertAlmostEqual(warning.figures["height_m"], scene.TABLE, delta=0.005)
+        (line,) = logged.output
+        self.assertIn(warning.message, line)
+
     def test_point_clouds_give_grasps_at_the_block(self):
         clouds = [graspd.CloudView(scene.cloud(pose), (0, 0, 0), np.linalg.inv(pose)) for pose in CAMERAS]
         for model in ["vgn-packed", "gpd", "shaf"]:
@@ -571,6 +583,7 @@ class PackageTest(ServerTest):
             (graspd.Latency, grasp_pb2.Latency),
             (graspd.Dropped, grasp_pb2.Dropped),
             (graspd.Model, grasp_pb2.Model),
+            (graspd.GeometryWarning, grasp_pb2.GeometryWarning),
             (graspd.Workspace, grasp_pb2.Workspace),
         ]:
             with self.subTest(ours.__name__):

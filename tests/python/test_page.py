@@ -222,9 +222,9 @@ class PageTest(unittest.TestCase):
     def tearDown(self):
         self.assertEqual(self.browser.errors, [])
 
-    def detect(self, name, grasps=None, **options):
+    def detect(self, name, grasps=None, table_height=None, **options):
         """Sends a request with this id and returns the reply."""
-        check = self.pb.CollisionCheck(mode=self.pb.CollisionCheck.MODE_FLAG)
+        check = self.pb.CollisionCheck(mode=self.pb.CollisionCheck.MODE_FLAG, table_height=table_height)
         options = self.pb.Options(threshold=0.1, collision=check, **options)
         request = self.pb.DetectGraspsRequest(volume=self.volume, options=options, request_id=name)
         return (grasps or self.grasps).DetectGrasps(request, timeout=TIMEOUT)
@@ -264,6 +264,16 @@ class PageTest(unittest.TestCase):
         red, green, blue = map(int, re.findall(r"\d+", colour))
         self.assertGreater(red, 2 * max(green, blue))
         self.browser.screenshot("refused")
+
+    def test_warnings_are_shown_over_the_scene(self):
+        self.open(name="correct")
+        self.assertEqual(self.browser.text("#warnings"), "")
+        reply = self.detect("warned", table_height=0.01)
+        self.wait_for("warned")
+        (warning,) = reply.warnings
+        self.assertEqual(self.browser.text("#warnings"), warning.message)
+        self.assertEqual(self.browser.texts(f"{self.row('warned')} span")[2], "⚠")
+        self.browser.screenshot("warned")
 
     def test_requests_for_maps_are_marked(self):
         self.open(name="grasps")

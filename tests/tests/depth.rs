@@ -10,7 +10,7 @@ use grasp_client::{
 use grasp_proto::pb;
 use grasp_tests::scene::{BLOCK, CAMERA, TABLE, camera, depth, view};
 use grasp_tests::{RESOLUTION, Server, TestModel};
-use nalgebra::{Isometry3, Point3, Vector3};
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use tonic::Code;
 
 fn low() -> Options {
@@ -461,4 +461,46 @@ async fn poses_have_the_requested_convention_pre_grasp_and_retreat() {
     let (code, message) = refusal(client.detect_from_depth(&views, &Workspace::default(), with_options(bad)).await);
     assert_eq!(code, Code::InvalidArgument);
     assert_eq!(message, "options.gripper.max_opening is 85 m, must be above 0 and at most 0.5");
+}
+
+#[tokio::test]
+async fn wrong_geometry_is_reported_as_a_warning_and_counted() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let client = server.client().await;
+    let workspace = Workspace::default();
+    let camera = camera(30.0, -90.0);
+    let correct = client.detect_from_depth(&[view(&camera)], &workspace, low()).await.unwrap();
+    assert_eq!(correct.warnings, []);
+
+    let middle = Translation3::new(0.15, 0.15, TABLE);
+    let tilted = camera * middle * UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 0.2) * middle.inverse();
+    let tilted = DepthView { extrinsics: Extrinsics::CameraFromTask(tilted), ..view(&camera) };
+    let detection = client.detect_from_depth(std::slice::from_ref(&tilted), &workspace, low()).await.unwrap();
+    let [warning] = &detection.warnings[..] else { panic!("{:?}", detection.warnings) };
+    assert_eq!(warning.code(), pb::geometry_warning::Code::TableTilted);
+    assert!(warning.message.starts_with("the table is tilted by 11."), "{}", warning.message);
+    assert!((warning.figures["tilt_degrees"] - 0.2_f64.to_degrees()).abs() < 1.0, "{warning:?}");
+
+    // As DetectGrasps, and in a stream whose second view contradicts the first.
+    let volume = fused(&[camera], RESOLUTION, Isometry3::identity());
+    let lower =
+        DetectOptions { collision: Some(pb::CollisionCheck { mode: 0, table_height: Some(0.02) }), ..low().detect };
+    let detection = client.detect(&volume, with_options(lower)).await.unwrap();
+    let [warning] = &detection.warnings[..] else { panic!("{:?}", detection.warnings) };
+    assert_eq!(warning.code(), pb::geometry_warning::Code::TableHeight);
+    assert!((warning.figures["height_m"] - TABLE).abs() < 0.005 && warning.figures["expected_height_m"] == 0.02);
+    let none =
+        DetectOptions { collision: Some(pb::CollisionCheck { mode: 0, table_height: Some(-1.0) }), ..low().detect };
+    assert_eq!(client.detect(&volume, with_options(none)).await.unwrap().warnings, []);
+
+    let mut track = client.track(workspace).await.unwrap();
+    assert_eq!(track.add(&[view(&camera)], low()).await.unwrap().warnings, []);
+    let higher = camera * Translation3::new(0.0, 0.0, -0.04);
+    let moved = DepthView { extrinsics: Extrinsics::CameraFromTask(higher), ..view(&camera) };
+    let detection = track.add(&[moved], low()).await.unwrap();
+    let codes: Vec<_> = detection.warnings.iter().map(pb::GeometryWarning::code).collect();
+    assert!(codes.contains(&pb::geometry_warning::Code::ViewsDisagree), "{codes:?}");
+
+    let counted = |code: &str| server.metric(&format!("graspd_warnings_total{{code=\"{code}\",model=\"mirror 1\"}}"));
+    assert_eq!(["TABLE_TILTED", "VIEWS_DISAGREE", "NO_TABLE"].map(counted), [1.0, 1.0, 0.0]);
 }

@@ -45,6 +45,9 @@ pub struct Provenance {
     /// Part of the folder: `train`, `validation`, or `all`.
     #[serde(default = "all", skip_serializing_if = "is_all")]
     pub part: String,
+    /// Greatest factor by which objects were stretched along an axis; absent if they were not.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stretch: Option<f64>,
     /// Grasp points per scene.
     pub points: usize,
     /// Camera views of the scenes.

@@ -15,6 +15,7 @@ fn setup() -> Setup {
         scene: "pile".into(),
         objects: "train".into(),
         part: "all".to_owned(),
+        stretch: None,
         points: 2,
         views: "side".into(),
         observations: 2,

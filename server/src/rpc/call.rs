@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
+use grasp::Warning;
 use grasp_proto::{DetectParams, FieldError, pb};
 use opentelemetry::Context;
 use tokio::sync::watch;
@@ -73,8 +74,17 @@ pub(crate) struct PendingReply {
     params: DetectParams,
     /// Time until the scene was queued, without the fusion.
     preprocessing: Duration,
-    fusion: Option<Duration>,
+    observed: Observed,
     origin: FrameStamp,
+}
+
+/// What the fusion of a request's views showed. The default is a request with a volume.
+#[derive(Default)]
+pub(crate) struct Observed {
+    /// The time that the fusion took.
+    pub fusion: Option<Duration>,
+    /// Signs that the geometry of the request is wrong.
+    pub warnings: Vec<Warning>,
 }
 
 /// Frame id and time stamp of a request's views, echoed in the response.
@@ -167,18 +177,19 @@ impl Call {
         self.span.record("model", &engine.label);
     }
 
-    /// Queues a scene. `fusion` is the time that its fusion took.
+    /// Queues a scene.
     pub fn submit(
         &self,
         engine: &Engine,
         scene: Scene,
         params: DetectParams,
         origin: FrameStamp,
-        fusion: Option<Duration>,
+        mut observed: Observed,
     ) -> Result<PendingReply, Refusal> {
-        let preprocessing = self.started.elapsed().saturating_sub(fusion.unwrap_or_default());
+        observed.warnings.extend(params.table.and_then(|expected| Warning::of_table(&scene.volume, expected)));
+        let preprocessing = self.started.elapsed().saturating_sub(observed.fusion.unwrap_or_default());
         let reply = engine.detect(scene, params.clone(), self.deadline, self.span.clone())?;
-        Ok(PendingReply { reply, params, preprocessing, fusion, origin })
+        Ok(PendingReply { reply, params, preprocessing, observed, origin })
     }
 
     /// Waits for the session's result, and records the outcome in the log and the metrics.
@@ -230,7 +241,7 @@ impl Call {
     }
 
     async fn reply(&mut self, pending: PendingReply) -> Result<pb::DetectGraspsResponse, Refusal> {
-        let PendingReply { reply, params, preprocessing, fusion, origin } = pending;
+        let PendingReply { reply, params, preprocessing, observed: Observed { fusion, warnings }, origin } = pending;
         let SessionOutput { value, queue, inference, postprocessing } = reply.wait(self.deadline).await?;
         let Detection { grasps: found, collides, dropped, over_limit, volume } = value;
 
@@ -251,9 +262,16 @@ impl Call {
         let total = self.started.elapsed();
         let timings = StageTimings { queue, preprocessing, fusion, inference, postprocessing, total };
         self.succeeded(&timings, grasps.len());
+        let warnings: Vec<pb::GeometryWarning> = warnings.iter().map(Into::into).collect();
+        for warning in &warnings {
+            self.metrics.warned(&self.label, warning.code());
+            self.span.in_scope(|| debug!(code = warning.code().as_str_name(), "{}", warning.message));
+        }
         let (pose, size) = (*volume.pose(), volume.voxel_size() * volume.resolution() as f64);
         let volume = Some(volume).filter(|volume| volume.resolution() <= Detected::MAX_RESOLUTION);
-        let detected = Detected { timings, pose, size, volume, grasps: found, collides, finger_depth };
+        let messages = warnings.iter().map(|warning| warning.message.clone()).collect();
+        let detected =
+            Detected { timings, pose, size, volume, grasps: found, collides, finger_depth, warnings: messages };
         let outcome = Outcome::Detected(Box::new(detected));
         self.recent.add(self.id.clone(), self.label.clone(), outcome);
         Ok(pb::DetectGraspsResponse {
@@ -265,6 +283,7 @@ impl Call {
             version: std::mem::take(&mut self.version),
             latency: Some((&timings).into()),
             dropped,
+            warnings,
         })
     }
 

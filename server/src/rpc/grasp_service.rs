@@ -15,12 +15,12 @@ use tonic::codegen::BoxStream;
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::readiness::draining;
-use crate::rpc::call::{Call, CallContext, Calls, FrameStamp, PendingReply};
+use crate::rpc::call::{Call, CallContext, Calls, FrameStamp, Observed, PendingReply};
 use crate::rpc::refusal::Refusal;
 use crate::serving::engine::Engine;
 use crate::serving::job::EngineError;
 use crate::serving::registry::{ModelRegistry, check_voxel_size};
-use crate::serving::scene::{FusionGrid, camera_positions, rendered, size};
+use crate::serving::scene::{FusionGrid, Integrated, camera_positions, rendered, size};
 use crate::serving::tracking::{Track, TrackedVolumes};
 use crate::transport::deadline::Deadline;
 use grasp_planner::Scene;
@@ -103,7 +103,8 @@ impl GraspRpc {
             blocking(permits, move || Ok(Volume::try_from(&volume)?)).await?
         };
         check_voxel_size(&checked, &engine)?;
-        call.submit(&engine, Scene { volume: checked, points: None }, params, origin, None)
+        let scene = Scene { volume: checked, points: None };
+        call.submit(&engine, scene, params, origin, Observed::default())
     }
 
     async fn submit_depth(
@@ -159,8 +160,8 @@ impl GraspRpc {
             let views = make_views(&workspace, size(&selected.source, &workspace))?;
             fuse(&selected, params, &workspace, &views)
         });
-        let (scene, params, fusion) = fused.await?;
-        call.submit(&engine, scene, params, origin, Some(fusion))
+        let (scene, params, observed) = fused.await?;
+        call.submit(&engine, scene, params, origin, observed)
     }
 
     /// The status that ends a stream. The refusal is logged and counted.
@@ -210,24 +211,24 @@ impl GraspRpc {
         let (new, fused) =
             blocking(permit, move || Ok(Track::integrate(old, &selected, params, workspace, &views))).await?;
         *track = new;
-        let (scene, params, origin, fusion) = fused?;
-        call.submit(&engine, scene, params, origin, Some(fusion))
+        let (scene, params, origin, observed) = fused?;
+        call.submit(&engine, scene, params, origin, observed)
     }
 }
 
-/// Fuses views into a scene. Returns it with the updated parameters and the time that it took.
+/// Fuses views into a scene. Returns it with the updated parameters.
 fn fuse(
     engine: &Engine,
     mut params: DetectParams,
     workspace: &Workspace,
     views: &[View],
-) -> Result<(Scene, DetectParams, std::time::Duration), Refusal> {
+) -> Result<(Scene, DetectParams, Observed), Refusal> {
     let started = Instant::now();
     let grid = FusionGrid::of(&engine.source, workspace, &camera_positions(views))?;
     let mut fusion = grid.fusion();
-    let points = grid.integrate(&mut fusion, views)?;
+    let Integrated { points, warnings } = grid.integrate(&mut fusion, views)?;
     params.constraints = grid.within(params.constraints);
-    Ok((grid.scene(&fusion, Some(points))?, params, started.elapsed()))
+    Ok((grid.scene(&fusion, points)?, params, Observed { fusion: Some(started.elapsed()), warnings }))
 }
 
 /// Runs `work` on a thread for blocking tasks, to keep the async runtime's threads free.

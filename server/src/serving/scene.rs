@@ -2,7 +2,8 @@ use std::f64::consts::PI;
 use std::fmt::Display;
 
 use grasp::{
-    Constraints, DepthImage, Fusion, RESOLUTION, Region, SurfacePoint, View, VolumeError, WORKSPACE_SIZE, seen_from,
+    Constraints, DepthImage, Fusion, RESOLUTION, Region, SurfacePoint, View, VolumeError, WORKSPACE_SIZE, Warning,
+    seen_from,
 };
 use grasp_models::Metadata;
 use grasp_proto::{FieldError, Points, Workspace};
@@ -22,8 +23,16 @@ pub(crate) struct FusionGrid {
     task_from_grid: Isometry3<f64>,
     /// Azimuth of the camera in the grid, degrees, if the network was trained with a fixed one.
     azimuth: Option<f64>,
-    /// Whether the planner needs the observed points besides the volume.
-    needs_points: bool,
+    /// Whether the planner has a network. Planners without one need the observed points besides the volume.
+    is_of_network: bool,
+}
+
+/// What the views of a request show besides the fused volume.
+pub(crate) struct Integrated {
+    /// The observed points in the workspace, if the planner needs them.
+    pub points: Option<Vec<SurfacePoint>>,
+    /// Signs that the geometry is wrong.
+    pub warnings: Vec<Warning>,
 }
 
 impl FusionGrid {
@@ -39,7 +48,7 @@ impl FusionGrid {
                 frame_from_task,
                 task_from_grid,
                 azimuth: None,
-                needs_points: true,
+                is_of_network: false,
             });
         };
         let resolution = network.metadata.resolution;
@@ -52,7 +61,7 @@ impl FusionGrid {
         }
         let azimuth = network.metadata.camera_azimuth;
         let task_from_grid = azimuth.map_or_else(Isometry3::identity, |azimuth| rotated(azimuth, trained, cameras));
-        Ok(Self { resolution, size: trained, frame_from_task, task_from_grid, azimuth, needs_points: false })
+        Ok(Self { resolution, size: trained, frame_from_task, task_from_grid, azimuth, is_of_network: true })
     }
 
     /// Checks that a planner can use this grid.
@@ -87,25 +96,30 @@ impl FusionGrid {
         Fusion::new(self.resolution, self.size)
     }
 
-    /// Integrates views, each of which must see a part of the grid. Returns the observed points in the workspace, if
-    /// the planner needs them.
-    pub fn integrate(&self, fusion: &mut Fusion, views: &[View]) -> Result<Vec<SurfacePoint>, FieldError> {
+    /// Integrates views, each of which must see a part of the grid.
+    pub fn integrate(&self, fusion: &mut Fusion, views: &[View]) -> Result<Integrated, FieldError> {
         let mut points = PointSampler::default();
+        let mut warnings = Vec::new();
         for (index, view) in views.iter().enumerate() {
             let image = DepthImage::new(view.intrinsics, &view.depth);
             let image = image.map_err(|error| FieldError::refused(format!("views[{index}]"), error))?;
             let camera_from_grid = view.camera_from_task * self.task_from_grid;
+            if self.is_of_network {
+                warnings.extend(Warning::of_camera(index, &view.camera_from_task, self.size));
+            }
+            warnings.extend(Warning::of_view(index, fusion, &image, &camera_from_grid));
             if fusion.integrate(&image, &camera_from_grid) == 0 {
                 let reason = fusion.blind(&image, &camera_from_grid);
                 let camera = view.camera_from_task.inverse().translation;
                 return Err(sees_nothing(index, &camera.vector.into(), reason));
             }
-            if self.needs_points {
+            if !self.is_of_network {
                 let inside = |point: &SurfacePoint| point.position.iter().all(|c| (0.0..=self.size).contains(c));
                 image.points(&view.camera_from_task).filter(inside).for_each(|point| points.add(point));
             }
         }
-        Ok(points.points)
+        warnings.extend(Warning::of_coverage(fusion));
+        Ok(Integrated { points: (!self.is_of_network).then_some(points.points), warnings })
     }
 
     /// The scene for the planner.
@@ -117,7 +131,7 @@ impl FusionGrid {
             }
             error => FieldError::refused("workspace", error),
         })?;
-        Ok(Scene { volume, points: points.filter(|_| self.needs_points) })
+        Ok(Scene { volume, points })
     }
 }
 

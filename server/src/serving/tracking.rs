@@ -7,10 +7,10 @@ use nalgebra::Isometry3;
 use prometheus::IntGauge;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
-use crate::rpc::call::FrameStamp;
+use crate::rpc::call::{FrameStamp, Observed};
 use crate::rpc::refusal::Refusal;
 use crate::serving::engine::Engine;
-use crate::serving::scene::{FusionGrid, camera_positions};
+use crate::serving::scene::{FusionGrid, Integrated, camera_positions};
 use grasp_planner::Scene;
 
 /// Limits on TrackGrasps streams: their number, and the time without a request.
@@ -64,8 +64,8 @@ pub(crate) struct Track {
     pub params: DetectParams,
 }
 
-/// The scene, its parameters, frame and stamp, and the time that the fusion took.
-type Fused = (Scene, DetectParams, FrameStamp, Duration);
+/// The scene, its parameters, frame and stamp, and what the fusion showed.
+type Fused = (Scene, DetectParams, FrameStamp, Observed);
 
 impl Track {
     /// Adds views to the volume, or to a new one if a workspace is given. An invalid view is an error; views before it
@@ -118,11 +118,12 @@ impl Track {
     fn add(&mut self, engine: &Engine, params: DetectParams, views: &[View]) -> Result<Fused, Refusal> {
         let started = Instant::now();
         self.grid.check(&engine.source)?;
-        self.grid.integrate(&mut self.fusion, views)?;
+        let Integrated { warnings, .. } = self.grid.integrate(&mut self.fusion, views)?;
         // Without points: those of earlier views are not stored.
         let scene = self.grid.scene(&self.fusion, None)?;
         self.params = DetectParams { constraints: self.grid.within(params.constraints), ..params };
-        Ok((scene, self.params.clone(), self.origin.clone(), started.elapsed()))
+        let observed = Observed { fusion: Some(started.elapsed()), warnings };
+        Ok((scene, self.params.clone(), self.origin.clone(), observed))
     }
 }
 

@@ -1,6 +1,7 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
+use grasp_proto::pb::geometry_warning::Code as WarningCode;
 use prometheus::core::Collector;
 #[cfg(target_os = "linux")]
 use prometheus::process_collector::ProcessCollector;
@@ -33,6 +34,7 @@ pub(crate) struct Metrics {
     stages: HistogramVec,
     requests: IntCounterVec,
     grasps: IntCounterVec,
+    warnings: IntCounterVec,
     waiting: IntGaugeVec,
     batches: HistogramVec,
     models: IntGaugeVec,
@@ -86,6 +88,11 @@ impl Metrics {
             ),
             requests: counters("graspd_requests_total", "Requests by gRPC status code.", &["model", "code"]),
             grasps: counters("graspd_grasps_total", "Grasps returned to clients.", &["model"]),
+            warnings: counters(
+                "graspd_warnings_total",
+                "Signs that the geometry of a request is wrong, by the code of the warning.",
+                &["model", "code"],
+            ),
             waiting: gauges("graspd_queue_requests", "Queued requests.", &["model"]),
             batches: histograms("graspd_batch_size", "Volumes per batch.", &["model"], &BATCHES),
             models: gauges(
@@ -135,6 +142,11 @@ impl Metrics {
         self.requests.with_label_values(&[model, code_name(code)]).inc();
     }
 
+    /// Counts a warning in a response.
+    pub fn warned(&self, model: &str, code: WarningCode) {
+        self.warnings.with_label_values(&[model, warning_name(code)]).inc();
+    }
+
     /// Updates `graspd_model_info` after the served models have changed.
     pub fn replaced(&self, before: &[ModelLabels], now: &[ModelLabels]) {
         for ModelLabels(labels) in now {
@@ -163,6 +175,10 @@ impl Metrics {
         }
         for code in [Code::Ok, Code::Internal, Code::ResourceExhausted, Code::DeadlineExceeded, Code::Cancelled] {
             self.requests.with_label_values(&[model, code_name(code)]);
+        }
+        for code in 1.. {
+            let Ok(code) = WarningCode::try_from(code) else { break };
+            self.warnings.with_label_values(&[model, warning_name(code)]);
         }
         QueueMetrics {
             waiting: self.waiting.with_label_values(&[model]),
@@ -197,6 +213,11 @@ fn register<M: Collector + Clone + 'static>(registry: &Registry, metric: prometh
     let metric = metric.expect(VALID);
     registry.register(Box::new(metric.clone())).expect(VALID);
     metric
+}
+
+/// The name of a warning's code without its prefix, for example `TABLE_TILTED`.
+fn warning_name(code: WarningCode) -> &'static str {
+    code.as_str_name().trim_start_matches("CODE_")
 }
 
 /// The name of a status code in the gRPC specification, for the codes that this server returns.

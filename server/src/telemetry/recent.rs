@@ -54,6 +54,8 @@ pub(crate) struct Detected {
     pub collides: Option<Vec<bool>>,
     /// Length of the fingers, metres.
     pub finger_depth: f64,
+    /// Signs that the geometry of the request is wrong.
+    pub warnings: Vec<String>,
 }
 
 impl Detected {
@@ -118,6 +120,7 @@ impl RecentRequest {
                 "code": "OK",
                 "grasps": detected.grasps.len(),
                 "best": detected.grasps.first().map(|grasp| grasp.quality),
+                "warnings": detected.warnings,
                 "latency": detected.timings.stages().collect::<BTreeMap<_, _>>(),
             }),
             Outcome::Inferred(timings) => json!({

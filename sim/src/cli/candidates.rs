@@ -3,18 +3,17 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 use grasp_data::Candidates as Tried;
-use grasp_sim::label::SceneConfig;
 use grasp_sim::ordered;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::SceneArgs;
+use super::data::DataArgs;
 
 /// Writes the training data of `grasp-train classify`: an .npz with `images`, `labels` and `scenes`. The same seed
 /// gives the same file on any number of threads.
 #[derive(Args)]
 pub struct Candidates {
     #[command(flatten)]
-    scene: SceneArgs,
+    data: DataArgs,
 
     /// Number of scenes. All images are kept in memory: 43 kB per candidate.
     #[arg(long)]
@@ -31,15 +30,7 @@ pub struct Candidates {
 
 impl Candidates {
     pub fn run(self) -> anyhow::Result<()> {
-        let config = SceneConfig {
-            kind: self.scene.kind(),
-            objects: self.scene.objects("train")?,
-            points: self.candidates,
-            views: self.scene.views()?,
-            observations: 1,
-            noise: self.scene.noise,
-            seed: self.scene.seed,
-        };
+        let config = self.data.config(self.candidates, 1)?;
         if let Some(folder) = self.out.parent() {
             std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
         }

@@ -3,23 +3,21 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use clap::{Args, ValueEnum};
 use grasp::{RESOLUTION, WORKSPACE_SIZE};
-use grasp_data::{Provenance, Setup, Trial, packed, processed, raw};
+use grasp_data::{Setup, Trial, packed, processed, raw};
 use grasp_sim::export::{Export, Line};
-use grasp_sim::label::{LabelledScene, SceneConfig};
+use grasp_sim::label::LabelledScene;
 use grasp_sim::ordered;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{SceneArgs, refuse_looks};
-
-/// Default of `--objects`.
-const OBJECTS: &str = "train";
+use super::data::DataArgs;
+use super::refuse_looks;
 
 /// The same seed gives the same data on any number of threads. An interrupted run continues where it stopped, also with
 /// a larger number of scenes.
 #[derive(Args)]
 pub struct Label {
     #[command(flatten)]
-    scene: SceneArgs,
+    data: DataArgs,
 
     /// Number of scenes.
     #[arg(long)]
@@ -69,29 +67,12 @@ impl Label {
             "--observations is {}, must be greater than 0; only --format packed stores more than 1",
             self.observations
         );
-        let config = SceneConfig {
-            kind: self.scene.kind(),
-            objects: self.scene.objects(OBJECTS)?,
-            points: self.points,
-            views: self.scene.views()?,
-            observations: self.observations,
-            noise: self.scene.noise,
-            seed: self.scene.seed,
-        };
-        let setup = Setup::benchmark(Provenance {
-            scene: self.scene.scene.name().to_owned(),
-            objects: self.scene.objects.clone().unwrap_or_else(|| OBJECTS.to_owned()),
-            part: self.scene.part.name().to_owned(),
-            points: config.points,
-            views: self.scene.views.clone(),
-            observations: config.observations,
-            noise: config.noise,
-            seed: config.seed,
-            observation_seed: None,
-            network: None,
-            evaluator: None,
-            version: env!("CARGO_PKG_VERSION").to_owned(),
-        });
+        anyhow::ensure!(
+            self.export.is_none() || self.data.stretch.is_none(),
+            "--export names the objects of each scene, and does not describe stretched ones; leave out --stretch"
+        );
+        let config = self.data.config(self.points, self.observations)?;
+        let setup = Setup::benchmark(self.data.provenance(&config));
         let mut writer = Writer::open(self.format, &self.out, &setup)?;
         let next = writer.next().unwrap_or(0).max(self.first);
         let mut export = self.export.as_deref().map(|path| Export::open(path, next)).transpose()?;

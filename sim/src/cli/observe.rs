@@ -60,7 +60,7 @@ impl Observe {
         let part = Part::from_str(&made.part, false).map_err(anyhow::Error::msg)?;
         let before = SceneConfig {
             kind: scene.kind(),
-            objects: part.of(scene.objects(&made.objects)?, &made.objects)?,
+            objects: part.of(scene.objects(&made.objects)?, &made.objects)?.stretched(made.stretch),
             points: made.points,
             views: parse(&made.views)?,
             observations: made.observations,

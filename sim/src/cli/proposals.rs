@@ -6,21 +6,17 @@ use grasp::DecodeParams;
 use grasp_data::{Provenance, Setup, packed};
 use grasp_models::{Network, Options};
 use grasp_planner::{Evaluator, NetworkPlanner, Planner};
-use grasp_sim::label::SceneConfig;
 use grasp_sim::ordered;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::SceneArgs;
-
-/// Default of `--objects`.
-const OBJECTS: &str = "train";
+use super::data::DataArgs;
 
 /// Writes the training data of `grasp-train classify --network evaluator`: a packed data set. Each scene is observed
 /// once. Each grasp is moved at random and executed with a pose error. An interrupted run continues where it stopped.
 #[derive(Args)]
 pub struct Proposals {
     #[command(flatten)]
-    scene: SceneArgs,
+    data: DataArgs,
 
     /// The network that proposes grasps.
     #[arg(long)]
@@ -46,29 +42,12 @@ pub struct Proposals {
 
 impl Proposals {
     pub fn run(self) -> anyhow::Result<()> {
-        let config = SceneConfig {
-            kind: self.scene.kind(),
-            objects: self.scene.objects(OBJECTS)?,
-            points: self.grasps,
-            views: self.scene.views()?,
-            observations: 1,
-            noise: self.scene.noise,
-            seed: self.scene.seed,
-        };
+        let config = self.data.config(self.grasps, 1)?;
         let (planner, params) = planner(&self.network, self.evaluator.as_deref())?;
         let setup = Setup::benchmark(Provenance {
-            scene: self.scene.scene.name().to_owned(),
-            objects: self.scene.objects.clone().unwrap_or_else(|| OBJECTS.to_owned()),
-            part: self.scene.part.name().to_owned(),
-            points: config.points,
-            views: self.scene.views.clone(),
-            observations: config.observations,
-            noise: config.noise,
-            seed: config.seed,
-            observation_seed: None,
             network: Some(name(&self.network)),
             evaluator: self.evaluator.as_deref().map(name),
-            version: env!("CARGO_PKG_VERSION").to_owned(),
+            ..self.data.provenance(&config)
         });
         let mut writer = packed::Writer::open(&self.out, &setup)?;
         let next = writer.next().unwrap_or(0);

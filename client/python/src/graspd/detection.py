@@ -74,6 +74,21 @@ class Dropped:
 
 
 @dataclass(frozen=True)
+class GeometryWarning:
+    """A sign that the geometry of a request is wrong, or that the network was not trained for it. The grasps are
+    detected all the same."""
+
+    code: str
+    """One of NO_TABLE, TABLE_TILTED, TABLE_HEIGHT, MOSTLY_UNSEEN, VIEWS_DISAGREE, CAMERA_DISTANCE and CAMERA_ANGLE."""
+    message: str
+    """What was found, and what to check."""
+    figures: Mapping[str, float]
+    """The measured figures. The name of a figure ends with its unit, or with ``_share`` for a fraction."""
+    view: int | None
+    """Index of the view, if the warning is about one view."""
+
+
+@dataclass(frozen=True)
 class Detection:
     """The result of a request."""
 
@@ -92,6 +107,8 @@ class Detection:
     """Set if `Options.explain` is set or there is no grasp."""
     request_id: str
     """The request id of the caller, or the one that the server generated; it is in the server's log."""
+    warnings: tuple[GeometryWarning, ...] = ()
+    """Signs that the geometry of the request is wrong, or that the network was not trained for it."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
@@ -12,7 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from graspd import errors
 from graspd import grasp_pb2 as pb
-from graspd.detection import Detection, Dropped, Grasp, Latency, Model
+from graspd.detection import Detection, Dropped, GeometryWarning, Grasp, Latency, Model
 from graspd.geometry import Pose, PoseLike, Vector
 from graspd.options import Box, CollisionCheck, Cone, Convention, Gripper, Options, Retreat
 from graspd.seen import CloudView, DepthView, Volume, Workspace
@@ -22,6 +23,11 @@ Message = TypeVar("Message")
 
 WORKSPACE_SIZE = 0.3
 """Edge of the workspace of the published networks, metres."""
+
+logger = logging.getLogger("graspd")
+
+logged: set[str] = set()
+"""Codes of the warnings that were logged."""
 
 DTYPES = {
     np.dtype("<f4"): pb.DATA_TYPE_F32,
@@ -236,6 +242,20 @@ def detection(message: pb.DetectGraspsResponse) -> Detection:
         latency=latency(message.latency),
         dropped=dropped(message.dropped) if message.HasField("dropped") else None,
         request_id=message.request_id,
+        warnings=tuple(map(warning, message.warnings)),
+    )
+
+
+def warning(message: pb.GeometryWarning) -> GeometryWarning:
+    code = pb.GeometryWarning.Code.Name(message.code).removeprefix("CODE_")
+    if code not in logged:
+        logged.add(code)
+        logger.warning("%s (logged once; see Detection.warnings)", message.message)
+    return GeometryWarning(
+        code=code,
+        message=message.message,
+        figures=dict(message.figures),
+        view=message.view if message.HasField("view") else None,
     )
 
 

@@ -3,7 +3,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use comfy_table::{Cell, CellAlignment, Table, presets};
-use grasp_client::{Detection, Dropped, Latency, Model, Report};
+use grasp_client::{Detection, Dropped, GeometryWarning, Latency, Model, Report};
 use nalgebra::Isometry3;
 use serde_json::{Value, json};
 use tonic::Code;
@@ -35,6 +35,9 @@ pub(crate) fn detection(detection: &Detection) -> String {
         let reasons = reasons(dropped).map(|(reason, voxels)| format!("{} {voxels}", reason.replace('_', " ")));
         text += &format!("dropped: {}\n", reasons.join(", "));
     }
+    for warning in &detection.warnings {
+        text += &format!("warning: {}\n", warning.message);
+    }
     let stages = stages(&detection.latency).map(|(stage, seconds)| format!("{stage} {:.2}", seconds * 1e3));
     text += &format!("{} {}; in ms: {}", detection.model, detection.version, stages.join(", "));
     text
@@ -61,10 +64,24 @@ pub(crate) fn detection_json(detection: &Detection) -> String {
         "model": detection.model,
         "version": detection.version,
         "grasps": grasps.collect::<Vec<_>>(),
+        "warnings": detection.warnings.iter().map(warning_json).collect::<Vec<_>>(),
         "latency_seconds": object(&stages(&detection.latency).map(|(stage, seconds)| (stage, json!(seconds)))),
         "dropped": detection.dropped.as_ref().map(|d| object(&reasons(d).map(|(reason, n)| (reason, json!(n))))),
     });
     format!("{value:#}")
+}
+
+fn warning_json(warning: &GeometryWarning) -> Value {
+    json!({
+        "code": warning_code(warning),
+        "message": warning.message,
+        "figures": warning.figures,
+        "view": warning.view,
+    })
+}
+
+fn warning_code(warning: &GeometryWarning) -> &'static str {
+    warning.code().as_str_name().trim_start_matches("CODE_")
 }
 
 fn pose(pose: &Isometry3<f64>) -> Value {

@@ -46,6 +46,7 @@ pub fn provenance() -> Provenance {
         scene: "boxes".into(),
         objects: "boxes".into(),
         part: "all".to_owned(),
+        stretch: None,
         points: 2,
         views: "all".into(),
         observations: 1,

@@ -1,0 +1,59 @@
+use clap::Args;
+use grasp_data::Provenance;
+use grasp_sim::label::SceneConfig;
+
+use super::SceneArgs;
+
+/// Default of `--objects`.
+const OBJECTS: &str = "train";
+
+/// Scenes of a data set.
+#[derive(Args)]
+pub struct DataArgs {
+    #[command(flatten)]
+    pub scene: SceneArgs,
+
+    /// Stretch each object at random along its three axes, by factors between 1/STRETCH and STRETCH: more shapes from
+    /// few objects.
+    #[arg(long, value_parser = parse_stretch)]
+    pub stretch: Option<f64>,
+}
+
+impl DataArgs {
+    /// The configuration of the scenes.
+    pub fn config(&self, points: usize, observations: usize) -> anyhow::Result<SceneConfig> {
+        Ok(SceneConfig {
+            kind: self.scene.kind(),
+            objects: self.scene.objects(OBJECTS)?.stretched(self.stretch),
+            points,
+            views: self.scene.views()?,
+            observations,
+            noise: self.scene.noise,
+            seed: self.scene.seed,
+        })
+    }
+
+    /// The provenance of data with this configuration.
+    pub fn provenance(&self, config: &SceneConfig) -> Provenance {
+        Provenance {
+            scene: self.scene.scene.name().to_owned(),
+            objects: self.scene.objects.clone().unwrap_or_else(|| OBJECTS.to_owned()),
+            part: self.scene.part.name().to_owned(),
+            stretch: self.stretch,
+            points: config.points,
+            views: self.scene.views.clone(),
+            observations: config.observations,
+            noise: config.noise,
+            seed: config.seed,
+            observation_seed: None,
+            network: None,
+            evaluator: None,
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+        }
+    }
+}
+
+fn parse_stretch(text: &str) -> Result<f64, String> {
+    let stretch = text.parse().ok().filter(|stretch| (1.0..=2.0).contains(stretch));
+    stretch.ok_or_else(|| "must be from 1 to 2".to_owned())
+}
