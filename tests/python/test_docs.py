@@ -268,7 +268,8 @@ class DocsTest(unittest.TestCase):
                 SimpleNamespace(k=page.names["k"].ravel()),
                 SimpleNamespace(transform=SimpleNamespace(translation=at[0], rotation=at[1])),
             )
-            found = page.names["client"].detect_from_depth([view], page.names["workspace"])
+            client, workspace, options = (page.names[name] for name in ["client", "workspace", "options"])
+            found = client.detect_from_depth([view], workspace, options)
             np.testing.assert_allclose(found.grasps[0].pose.position, page.names["one"].grasps[0].pose.position)
 
 
