@@ -52,7 +52,8 @@ pub enum Depth {
 pub enum Extrinsics {
     /// `T_camera_task`: maps points of the task frame into the camera frame.
     CameraFromTask(Isometry3<f64>),
-    /// `T_frame_camera`: the camera's pose in the frame `frame_id`, as hand-eye calibration returns it.
+    /// `T_frame_camera`: the camera's pose in the frame `frame_id`, as hand-eye calibration returns it. The identity
+    /// if that frame is the camera's.
     FrameFromCamera(Isometry3<f64>),
 }
 
@@ -74,6 +75,16 @@ pub struct Workspace {
     pub pose: Isometry3<f64>,
     /// Edge length, metres. `None`: the size that the model was trained with.
     pub size: Option<f64>,
+    /// Find the table in the first depth image instead of using `pose`.
+    pub find_table: Option<FindTable>,
+}
+
+/// A search for the table in a depth image: the workspace is placed over what stands on it.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct FindTable {
+    /// Direction of gravity in the frame `frame_id`, of any length above 0. `None`: unknown; a wall that fills the image
+    /// is then taken for a table.
+    pub gravity: Option<[f64; 3]>,
 }
 
 /// The result of a request.
@@ -97,6 +108,8 @@ pub struct Detection {
     pub dropped: Option<pb::Dropped>,
     /// Signs that the geometry of the request is wrong, or that the network was not trained for it.
     pub warnings: Vec<pb::GeometryWarning>,
+    /// The table that was found, with [`Workspace::find_table`].
+    pub table: Option<pb::FoundTable>,
 }
 
 /// A grasp with its pre-grasp and retreat poses.
@@ -174,8 +187,15 @@ impl Options {
 
 impl Workspace {
     fn message(&self, frame_id: String, stamp: Option<SystemTime>) -> pb::Workspace {
-        let pose = Some((&self.pose).into());
-        pb::Workspace { pose, size: self.size.unwrap_or_default(), frame_id, stamp: stamp.map(Into::into) }
+        let gravity = self.find_table.and_then(|search| search.gravity);
+        pb::Workspace {
+            pose: self.find_table.is_none().then(|| (&self.pose).into()),
+            size: self.size.unwrap_or_default(),
+            frame_id,
+            stamp: stamp.map(Into::into),
+            find_table: self.find_table.is_some(),
+            gravity: gravity.map(|[x, y, z]| pb::Vector3 { x, y, z }),
+        }
     }
 }
 
@@ -227,6 +247,7 @@ impl TryFrom<pb::DetectGraspsResponse> for Detection {
             latency: response.latency.unwrap_or_default(),
             dropped: response.dropped,
             warnings: response.warnings,
+            table: response.table,
         })
     }
 }

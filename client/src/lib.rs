@@ -39,9 +39,11 @@ mod local;
 
 pub use access::{Access, Retry, Token};
 pub use client::{Client, Health, Tracking};
-pub use detection::{CloudView, Depth, DepthView, Detection, Extrinsics, Options, Proposal, Workspace};
+pub use detection::{CloudView, Depth, DepthView, Detection, Extrinsics, FindTable, Options, Proposal, Workspace};
 pub use error::Error;
-pub use grasp_proto::pb::{self, DataType, Dropped, GeometryWarning, Latency, Model, Options as DetectOptions};
+pub use grasp_proto::pb::{
+    self, DataType, Dropped, FoundTable, GeometryWarning, Latency, Model, Options as DetectOptions,
+};
 pub use load::{Arrivals, Report, Until, load};
 pub use local::{LocalServer, LocalServerError};
 pub use tonic::transport::{Certificate, Identity};

@@ -120,6 +120,16 @@ impl<'a> DepthImage<'a> {
         }
     }
 
+    /// The point that a pixel shows, in the camera frame, metres; `None` outside the image or without a depth of at most
+    /// [`DEPTH_MAX`].
+    #[must_use]
+    pub fn point(&self, u: usize, v: usize) -> Option<Point3<f64>> {
+        let Intrinsics { width, height, fx, fy, cx, cy } = self.intrinsics;
+        let depth = (u < width && v < height).then(|| self.depth[v * width + u])?;
+        let z = (f32::MIN_POSITIVE..=DEPTH_MAX).contains(&depth).then_some(f64::from(depth))?;
+        Some(Point3::new((u as f64 - cx) / fx * z, (v as f64 - cy) / fy * z, z))
+    }
+
     /// Back-projects every pixel with a depth of at most [`DEPTH_MAX`] to a point of the task frame. The normal is the
     /// direction towards the camera. `camera_from_task` is `T_camera_task`.
     pub fn points(&self, camera_from_task: &Isometry3<f64>) -> impl Iterator<Item = SurfacePoint> {

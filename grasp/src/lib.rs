@@ -26,6 +26,7 @@ mod patch;
 mod selection;
 mod surface;
 mod table;
+mod tabletop;
 mod volume;
 mod warning;
 
@@ -43,6 +44,7 @@ pub use patch::Patch;
 pub use selection::{Decoded, Dropped, select};
 pub use surface::{SurfaceMesh, SurfacePoint};
 pub use table::Table;
+pub use tabletop::{NoTabletop, Tabletop};
 pub use volume::{Volume, VolumeError};
 pub use warning::{TARGET_HEIGHT, TRAINED_ANGLE, TRAINED_DISTANCE, Warning};
 

@@ -4,6 +4,7 @@
 //! model files. A [`Network`] runs one of them. [`gpd`] defines the classifier of grasp candidates, [`evaluator`] that of
 //! the poses of a network's grasps. A [`Classifier`] runs both.
 
+mod calibration;
 mod evaluator;
 pub mod gpd;
 mod graph;
@@ -20,6 +21,7 @@ mod transformer;
 mod upsampling;
 mod vgn;
 
+pub use calibration::Calibration;
 pub use evaluator::evaluator;
 pub use half_weights::{with_full_weights, with_half_weights};
 pub use metadata::{Metadata, MetadataError};

@@ -5,6 +5,7 @@ use std::str::FromStr;
 use grasp::{DecodeParams, RESOLUTION, Volume, VoxelOrigin, WORKSPACE_SIZE};
 use thiserror::Error;
 
+use crate::calibration::Calibration;
 use crate::onnx::{DimensionValue, ModelProto, StringStringEntryProto, ValueInfoProto};
 
 /// Metadata of a model, stored in its file as properties named `graspd.…`.
@@ -122,6 +123,12 @@ impl Metadata {
                     metadata.camera_azimuth = Some(azimuth);
                 }
                 "network" => metadata.network = Some(value),
+                // Only checked here; the classifier reads it.
+                "calibration" => {
+                    if let Err(expected) = value.parse::<Calibration>() {
+                        return Err(MetadataError::Property { key: "calibration", value, expected });
+                    }
+                }
                 _ => {
                     if let Some(key) = key.strip_prefix(PROVENANCE) {
                         metadata.provenance.insert(key.to_owned(), value);

@@ -83,6 +83,8 @@ pub struct Picture {
     camera: Intrinsics,
     camera_from_task: Isometry3<f64>,
     table: Option<f64>,
+    /// Red, green and blue of each pixel behind the items; without it the background is white.
+    background: Option<Vec<u8>>,
     items: Vec<Item>,
 }
 
@@ -102,7 +104,7 @@ impl Picture {
     /// An empty picture with a camera. `camera_from_task` maps task points into the camera frame (z forward, x right, y
     /// down).
     pub fn new(camera: Intrinsics, camera_from_task: Isometry3<f64>) -> Picture {
-        Picture { camera, camera_from_task, table: None, items: Vec::new() }
+        Picture { camera, camera_from_task, table: None, background: None, items: Vec::new() }
     }
 
     /// An empty picture of `width` × `height` pixels from `eye` towards `target` (task frame, metres), with a vertical
@@ -120,6 +122,16 @@ impl Picture {
         let mut picture = Picture::looking_at(width, height, 0.42, eye, target);
         picture.table(table);
         picture
+    }
+
+    /// Draws the items over an image: red, green and blue of each pixel, row by row.
+    ///
+    /// # Panics
+    /// If the image does not have the size of the camera's images.
+    pub fn over(&mut self, image: Vec<u8>) -> &mut Self {
+        assert_eq!(image.len(), 3 * self.camera.width * self.camera.height, "the image has the size of the camera's");
+        self.background = Some(image);
+        self
     }
 
     /// Adds the table, an infinite plane at `height` (task frame, metres).
@@ -176,7 +188,9 @@ impl Picture {
             let pixel = v * fine.width + u;
             let (item, triangle) = seen[pixel];
             if item == BACKGROUND {
-                return linear(PAPER);
+                let index = 3 * (v / n * self.camera.width + u / n);
+                let image = self.background.as_ref().and_then(|image| image[index..].first_chunk());
+                return linear(image.copied().unwrap_or(PAPER));
             }
             let ray = Vector3::new((u as f64 - fine.cx) / fine.fx, (v as f64 - fine.cy) / fine.fy, 1.0);
             let depth = f64::from(view.depth[pixel]);

@@ -15,6 +15,7 @@ mod warning;
 
 /// Generated types, client and server of `grasp.v1`.
 #[allow(missing_docs, reason = "the .proto file documents them, and prost copies only existing comments")]
+#[allow(clippy::large_enum_variant, reason = "generated: a response is larger than an error")]
 pub mod pb {
     tonic::include_proto!("grasp.v1");
 }

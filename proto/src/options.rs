@@ -189,7 +189,8 @@ fn region(bounds: &pb::Box) -> Result<Region, FieldError> {
     Ok(Region { frame: Isometry3::identity(), lower, upper })
 }
 
-fn direction(vector: Option<pb::Vector3>, field: &'static str) -> Result<Unit<Vector3<f64>>, FieldError> {
+/// The direction of a vector of any length above 0.
+pub(crate) fn direction(vector: Option<pb::Vector3>, field: &'static str) -> Result<Unit<Vector3<f64>>, FieldError> {
     let pb::Vector3 { x, y, z } = vector.ok_or_else(|| FieldError::new(field, "absent", "must be given"))?;
     let vector = Vector3::new(x, y, z);
     // Scaled by the largest component first, so that the squares do not overflow.

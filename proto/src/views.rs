@@ -1,6 +1,7 @@
-use grasp::{DepthImage, Intrinsics, Unit, View};
-use nalgebra::{Isometry3, Point3};
+use grasp::{DepthImage, Intrinsics, Tabletop, Unit as DepthUnit, View};
+use nalgebra::{Isometry3, Point3, Unit, Vector3};
 
+use crate::options::direction;
 use crate::pb::depth_view::Extrinsics;
 use crate::pose::{self, PoseFields};
 use crate::{FieldError, pb};
@@ -35,6 +36,10 @@ pub struct Workspace {
     pub frame_id: String,
     /// Time at which the views were taken.
     pub stamp: Option<prost_types::Timestamp>,
+    /// Whether to find the table, which determines the pose.
+    pub find_table: bool,
+    /// Direction of gravity in the caller's frame.
+    pub gravity: Option<Unit<Vector3<f64>>>,
 }
 
 /// The points of one camera, in the task frame.
@@ -50,7 +55,7 @@ impl TryFrom<pb::Workspace> for Workspace {
     type Error = FieldError;
 
     fn try_from(workspace: pb::Workspace) -> Result<Self, FieldError> {
-        let pb::Workspace { pose, size, frame_id, stamp } = workspace;
+        let pb::Workspace { pose, size, frame_id, stamp, find_table, gravity } = workspace;
         if !(0.0..=100.0).contains(&size) {
             return Err(FieldError::new(
                 "workspace.size",
@@ -58,8 +63,64 @@ impl TryFrom<pb::Workspace> for Workspace {
                 "must be above 0 and at most 100 m, or 0 for the size of the model",
             ));
         }
+        if find_table && pose.is_some() {
+            return Err(FieldError::new("workspace.pose", "given", "must be absent with workspace.find_table"));
+        }
         let frame_from_task = pose.map_or(Ok(Isometry3::identity()), |pose| pose::decode(&pose, &WORKSPACE))?;
-        Ok(Self { frame_from_task, size: Some(size).filter(|size| *size > 0.0), frame_id, stamp })
+        let gravity = gravity.map(|gravity| direction(Some(gravity), "workspace.gravity")).transpose()?;
+        let size = Some(size).filter(|size| *size > 0.0);
+        Ok(Self { frame_from_task, size, frame_id, stamp, find_table, gravity })
+    }
+}
+
+impl Workspace {
+    /// Finds the table in the first of the request's views, if the request asks for it, and sets the pose of the
+    /// workspace. The table is at `height` in it, metres.
+    ///
+    /// # Errors
+    /// [`FieldError`] if the view is invalid or shows no table.
+    pub fn find_table(
+        &mut self,
+        views: &mut [pb::DepthView],
+        height: f64,
+    ) -> Result<Option<pb::FoundTable>, FieldError> {
+        let is_only = views.len() == 1;
+        match views.first_mut() {
+            Some(first) if self.find_table => {
+                let found = self.find_table_in(first, is_only, height);
+                found.map(Some).map_err(|error| error.inside("views[0]"))
+            }
+            _ => Ok(None),
+        }
+    }
+
+    /// Finds the table in a view and sets the pose of the workspace. If it is the only view and has no extrinsics, it
+    /// gets those of a camera at the origin of the caller's frame.
+    ///
+    /// # Errors
+    /// [`FieldError`] names the field of the view.
+    pub fn find_table_in(
+        &mut self,
+        view: &mut pb::DepthView,
+        is_only: bool,
+        height: f64,
+    ) -> Result<pb::FoundTable, FieldError> {
+        if is_only && view.extrinsics.is_none() {
+            view.extrinsics = Some(Extrinsics::FrameFromCamera((&Isometry3::identity()).into()));
+        }
+        let Some(Extrinsics::FrameFromCamera(pose)) = &view.extrinsics else {
+            let given = if view.extrinsics.is_some() { "camera_from_task" } else { "absent" };
+            let needed = "must be frame_from_camera with workspace.find_table; a single view may have none";
+            return Err(FieldError::new("extrinsics", given, needed));
+        };
+        let frame_from_camera = pose::decode(pose, &FRAME_FROM_CAMERA)?;
+        let (intrinsics, depth) = image(view)?;
+        let image = DepthImage::new(intrinsics, &depth).map_err(|error| FieldError::refused("camera", error))?;
+        let gravity = self.gravity.map(|gravity| frame_from_camera.rotation.inverse() * gravity);
+        let found = Tabletop::find(&image, gravity, height).map_err(|error| FieldError::refused("data", error))?;
+        self.frame_from_task = frame_from_camera * found.camera_from_task;
+        let Tabletop { distance, angle, share, deviation, tilt, .. } = found;
+        Ok(pb::FoundTable { workspace: Some((&self.frame_from_task).into()), distance, angle, share, deviation, tilt })
     }
 }
 
@@ -83,6 +144,20 @@ pub fn depth_view(view: &pb::DepthView, index: usize, frame_from_task: &Isometry
 }
 
 fn try_depth_view(view: &pb::DepthView, frame_from_task: &Isometry3<f64>) -> Result<View, FieldError> {
+    let (intrinsics, depth) = image(view)?;
+    let camera_from_task = match &view.extrinsics {
+        Some(Extrinsics::CameraFromTask(pose)) => pose::decode(pose, &CAMERA_FROM_TASK)?,
+        Some(Extrinsics::FrameFromCamera(pose)) => pose::decode(pose, &FRAME_FROM_CAMERA)?.inverse() * frame_from_task,
+        None => {
+            let needed = "camera_from_task (T_camera_task) or frame_from_camera (T_frame_camera) must be given";
+            return Err(FieldError::new("extrinsics", "absent", needed));
+        }
+    };
+    Ok(View { intrinsics, depth, camera_from_task })
+}
+
+/// The intrinsics and the depth, metres, row by row, of a view.
+fn image(view: &pb::DepthView) -> Result<(Intrinsics, Vec<f32>), FieldError> {
     let camera = view.camera.as_ref().ok_or_else(|| FieldError::new("camera", "absent", "must be given"))?;
     let intrinsics = intrinsics(camera)?;
     let pixels = intrinsics.width * intrinsics.height;
@@ -104,14 +179,6 @@ fn try_depth_view(view: &pb::DepthView, frame_from_task: &Isometry3<f64>) -> Res
         );
         return Err(FieldError::new("data", format_args!("{} bytes", view.data.len()), needed));
     }
-    let camera_from_task = match &view.extrinsics {
-        Some(Extrinsics::CameraFromTask(pose)) => pose::decode(pose, &CAMERA_FROM_TASK)?,
-        Some(Extrinsics::FrameFromCamera(pose)) => pose::decode(pose, &FRAME_FROM_CAMERA)?.inverse() * frame_from_task,
-        None => {
-            let needed = "camera_from_task (T_camera_task) or frame_from_camera (T_frame_camera) must be given";
-            return Err(FieldError::new("extrinsics", "absent", needed));
-        }
-    };
     let depth: Vec<f32> = match view.unit() {
         pb::DepthUnit::U16Millimetres => {
             view.data.as_chunks().0.iter().map(|&bytes| f32::from(u16::from_le_bytes(bytes)) * 1e-3).collect()
@@ -120,22 +187,22 @@ fn try_depth_view(view: &pb::DepthView, frame_from_task: &Isometry3<f64>) -> Res
     };
     let image = DepthImage::new(intrinsics, &depth).map_err(|error| FieldError::refused("camera", error))?;
     match (image.unit(), view.unit()) {
-        (Unit::Millimetres, _) => {
+        (DepthUnit::Millimetres, _) => {
             let needed = "must be metres but looks like millimetres: send u16 with DEPTH_UNIT_U16_MILLIMETRES, or divide \
                           by 1000";
             return Err(FieldError::new("data", "in metres, with a median above 20", needed));
         }
-        (Unit::Thousandths, pb::DepthUnit::U16Millimetres) => {
+        (DepthUnit::Thousandths, pb::DepthUnit::U16Millimetres) => {
             let needed = "must be millimetres but looks like metres: send f32 with DEPTH_UNIT_F32_METRES";
             return Err(FieldError::new("data", "in millimetres, with a median below 20", needed));
         }
-        (Unit::Thousandths, _) => {
+        (DepthUnit::Thousandths, _) => {
             let needed = "is closer than depth cameras measure: check that the values were not divided by 1000 twice";
             return Err(FieldError::new("data", "in metres, with a median below 0.02", needed));
         }
-        (Unit::Metres, _) => {}
+        (DepthUnit::Metres, _) => {}
     }
-    Ok(View { intrinsics, depth, camera_from_task })
+    Ok((intrinsics, depth))
 }
 
 /// Validates the intrinsic matrix.

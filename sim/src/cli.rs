@@ -1,6 +1,7 @@
 //! The command line, one file per command.
 
 mod bench;
+mod calibrate;
 mod candidates;
 mod convert;
 mod data;
@@ -58,6 +59,8 @@ pub enum Command {
     Bench(bench::Bench),
     /// Compare the predicted quality of executed grasps with their success rate.
     Reliability(reliability::ReliabilityArgs),
+    /// Fit the qualities of an evaluator to the success rate of executed grasps.
+    Calibrate(calibrate::Calibrate),
     /// Measure the paper's tables and write them with the published figures.
     Tables(tables::Tables),
     /// Run one scene end to end: camera, graspd, execution of the best grasp.
@@ -79,6 +82,7 @@ impl Command {
             Self::Proposals(command) => command.run(),
             Self::Bench(command) => command.run(),
             Self::Reliability(command) => command.run(),
+            Self::Calibrate(command) => command.run(),
             Self::Tables(command) => command.run(),
             Self::Demo(command) => command.run(),
         }

@@ -1,5 +1,7 @@
 //! Reliability of predicted qualities: does a grasp of quality 0.9 succeed in 90 % of its executions?
 
+use grasp_models::Calibration;
+use nalgebra::{Matrix2, Vector2};
 use serde::{Deserialize, Serialize};
 
 /// An executed grasp as written by `bench --attempts` and `sim/pybullet/clear.py --attempts`; other fields are ignored.
@@ -64,6 +66,40 @@ impl Reliability {
     }
 }
 
+/// The calibration that makes the qualities of these attempts their success rate: a logistic regression on the log-odds
+/// of the quality, by Newton's method. `None` if all attempts have the same outcome.
+#[must_use]
+pub fn calibration(attempts: &[Attempt]) -> Option<Calibration> {
+    const STEPS: usize = 50;
+    let lifted = attempts.iter().filter(|attempt| attempt.lifted).count();
+    if lifted == 0 || lifted == attempts.len() {
+        return None;
+    }
+    // Platt's targets, which keep the regression finite.
+    let [n, m] = [lifted as f64, (attempts.len() - lifted) as f64];
+    let target = |attempt: &Attempt| if attempt.lifted { (n + 1.0) / (n + 2.0) } else { 1.0 / (m + 2.0) };
+    let log_odds = |attempt: &Attempt| {
+        let quality = attempt.quality.clamp(1e-4, 1.0 - 1e-4);
+        (quality / (1.0 - quality)).ln()
+    };
+    let mut weights = Vector2::new(1.0, 0.0);
+    for _ in 0..STEPS {
+        let (mut gradient, mut curvature) = (Vector2::zeros(), Matrix2::identity() * 1e-9);
+        for attempt in attempts {
+            let row = Vector2::new(log_odds(attempt), 1.0);
+            let probability = 1.0 / (1.0 + (-weights.dot(&row)).exp());
+            gradient += row * (probability - target(attempt));
+            curvature += row * row.transpose() * (probability * (1.0 - probability));
+        }
+        let step = curvature.try_inverse()? * gradient;
+        weights -= step;
+        if step.norm() < 1e-9 {
+            break;
+        }
+    }
+    Some(Calibration { slope: weights.x as f32, offset: weights.y as f32 }).filter(|found| found.slope > 0.0)
+}
+
 impl Bin {
     /// The success rate and its 95 % Wilson score interval (Wilson 1927), which is also valid near 0 and 1; `None`
     /// without attempts.
@@ -97,6 +133,26 @@ mod tests {
         assert!((Reliability::of(&other).error - (0.1 * 0.2 + 0.9 * 0.1)).abs() < 1e-12);
         assert_eq!(Reliability::of(&other).bins[BINS - 1].attempts, 10, "quality 1 is in the last bin");
         assert_eq!(Reliability::of(&[]).error, 0.0);
+    }
+
+    #[test]
+    fn overconfident_qualities_are_calibrated() {
+        // The log-odds are twice those of the success rates, and 0.5 higher.
+        let rates = [0.2, 0.5, 0.8, 0.9];
+        let quality = |rate: f64| 1.0 / (1.0 + (-(2.0 * (rate / (1.0 - rate)).ln() + 0.5)).exp());
+        let all: Vec<Attempt> =
+            rates.iter().flat_map(|&rate| attempts(quality(rate), 10_000, (1e4 * rate) as u64)).collect();
+        let fitted = calibration(&all).unwrap();
+        assert!((fitted.slope - 0.5).abs() < 0.01 && (fitted.offset + 0.25).abs() < 0.01, "{fitted:?}");
+        let calibrated = |quality: f64| {
+            let score = fitted.apply((quality / (1.0 - quality)).ln() as f32);
+            1.0 / (1.0 + f64::from(-score).exp())
+        };
+        assert!(rates.iter().all(|&rate| (calibrated(quality(rate)) - rate).abs() < 0.005));
+
+        let falling: Vec<Attempt> = attempts(0.2, 100, 90).chain(attempts(0.8, 100, 10)).collect();
+        assert_eq!(calibration(&falling), None);
+        assert_eq!(calibration(&attempts(0.7, 10, 10).collect::<Vec<_>>()), None);
     }
 
     #[test]

@@ -124,6 +124,31 @@ class DetectTest(ServerTest):
         rounded = self.client.detect_from_depth(millimetres, workspace, LOW)
         np.testing.assert_allclose(positions(rounded)[0], positions(found)[0], atol=0.01)
 
+    def test_the_table_is_found_without_a_camera_pose(self):
+        (camera, _), depth = CAMERAS, scene.depth(CAMERAS[0])
+        # A single view, as an array of any type.
+        view = graspd.DepthView(np.rint(1000 * depth).astype(np.int32), scene.K)
+        found = self.client.find_table(view)
+        camera_from_task = found.workspace.matrix()
+        up = np.linalg.inv(camera)[:3, :3] @ camera_from_task[:3, 2]
+        self.assertGreater(up[2], np.cos(np.radians(1)))
+        self.assertAlmostEqual(found.angle, np.radians(30), delta=0.02)
+        self.assertGreater(found.share, 0.5)
+        self.assertIsNone(found.tilt)
+        detected = self.client.detect_from_depth(view, graspd.Workspace(find_table=True, frame_id="camera"), LOW)
+        self.assertEqual((detected.table, detected.warnings, detected.frame_id), (found, (), "camera"))
+        between = positions(detected)[0] + 0.03 * detected.grasps[0].pose.matrix()[:3, 2]
+        at = np.linalg.inv(camera) @ [*between, 1]
+        self.assertTrue(np.all(at[:3] > scene.BLOCK[0] - 0.04) and np.all(at[:3] < scene.BLOCK[1] + 0.04), at)
+        # In the robot's frame, with gravity.
+        frame_from_camera = np.linalg.inv(camera)
+        view = graspd.DepthView(depth, scene.K, frame_from_camera=frame_from_camera)
+        found = self.client.find_table(view, graspd.Workspace(gravity=(0, 0, -9.8)), table_height=0.02)
+        self.assertLess(found.tilt, np.radians(1))
+        self.assertAlmostEqual(found.workspace.position[2], scene.TABLE - 0.02, delta=0.004)
+        with self.assertRaisesRegex(graspd.InvalidArgument, "view.data: the largest level plane"):
+            self.client.find_table(view, graspd.Workspace(gravity=(1, 0, 0)))
+
     def test_wrong_geometry_is_reported_and_logged_once(self):
         wire.logged.clear()
         view, height = views()[:1], graspd.Options(collision=graspd.CollisionCheck(table_height=0.02))
@@ -259,7 +284,7 @@ class ErrorsTest(ServerTest):
             (lambda: graspd.Volume(volume[:-1]), r"must be a cube .* got shape \(39, 40, 40\)"),
             (lambda: graspd.Volume(np.zeros((0, 0, 0))), "must be a cube"),
             (lambda: graspd.DepthView(depth[None], scene.K, camera_from_task=pose), "row"),
-            (lambda: graspd.DepthView(depth, scene.K), "one of camera_from_task and frame_from_camera"),
+            (lambda: graspd.DepthView(depth, scene.K, camera_from_task=pose, frame_from_camera=pose), "got both"),
             (lambda: graspd.CloudView(depth, (0, 0, 0)), "x, y, z"),
             (lambda: graspd.Pose.from_matrix(2 * pose), "a rotation and a translation"),
             (lambda: graspd.Pose.from_matrix(pose[:3]), "4 × 4"),
@@ -584,6 +609,7 @@ class PackageTest(ServerTest):
             (graspd.Dropped, grasp_pb2.Dropped),
             (graspd.Model, grasp_pb2.Model),
             (graspd.GeometryWarning, grasp_pb2.GeometryWarning),
+            (graspd.FoundTable, grasp_pb2.FoundTable),
             (graspd.Workspace, grasp_pb2.Workspace),
         ]:
             with self.subTest(ours.__name__):

@@ -544,3 +544,65 @@ fn watch_detects_again_when_the_file_changes() {
     let answers = serde_json::Deserializer::from_slice(&output.stdout).into_iter::<Value>();
     assert_eq!(answers.map(|answer| answer.unwrap()["grasps"].as_array().unwrap().len()).collect::<Vec<_>>(), [2, 2]);
 }
+
+#[tokio::test]
+async fn one_depth_image_and_its_intrinsics_suffice() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let camera = camera(35.0, -90.0);
+    // In tenths of a millimetre.
+    let tenths: Vec<u16> = depth(&camera).iter().map(|metres| (metres * 1e4).round() as u16).collect();
+    let image = png::Encoder::new(File::create(path("depth.png")).unwrap(), CAMERA.width as u32, CAMERA.height as u32);
+    let mut image = png_header(image, png::ColorType::Grayscale, png::BitDepth::Sixteen);
+    image.write_image_data(&tenths.iter().flat_map(|depth| depth.to_be_bytes()).collect::<Vec<_>>()).unwrap();
+    drop(image);
+    let color = png::Encoder::new(File::create(path("color.png")).unwrap(), CAMERA.width as u32, CAMERA.height as u32);
+    let mut color = png_header(color, png::ColorType::Rgb, png::BitDepth::Eight);
+    color.write_image_data(&vec![30; 3 * CAMERA.width * CAMERA.height]).unwrap();
+    drop(color);
+    let k = format!("{},{},{},{}", CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy);
+    let given = [&*path("depth.png"), "--intrinsics", &k, "--depth-scale", "0.0001"].map(str::to_owned);
+    let with = |command: &str, rest: &[&str]| {
+        let args = [command].into_iter().chain(given.iter().map(String::as_str)).chain(rest.iter().copied());
+        run(&server, &args.collect::<Vec<_>>())
+    };
+
+    let found = with("table", &["--out", &path("corner.json"), "--picture", &path("table.png"), "--json"]);
+    let table: Value = serde_json::from_slice(&found.stdout).unwrap_or_else(|_| panic!("{found:?}"));
+    assert!((table["angle"].as_f64().unwrap().to_degrees() - 35.0).abs() < 1.0, "{table}");
+    assert!(std::fs::read(path("table.png")).unwrap().starts_with(b"\x89PNG"));
+
+    let found = with("detect", &["--workspace", &path("corner.json"), "--threshold", "0.6", "--json"]);
+    let of_file: Value = serde_json::from_slice(&found.stdout).unwrap_or_else(|_| panic!("{found:?}"));
+    let found = with("detect", &["--find-table", "--threshold", "0.6", "--json"]);
+    let of_server: Value = serde_json::from_slice(&found.stdout).unwrap_or_else(|_| panic!("{found:?}"));
+    assert_eq!(of_server["table"]["workspace"]["position"], table["workspace"]["position"]);
+    let qualities = |found: &Value| -> Vec<Value> {
+        found["grasps"].as_array().unwrap().iter().map(|grasp| grasp["quality"].clone()).collect()
+    };
+    assert_eq!(qualities(&of_server), qualities(&of_file));
+    assert!(!qualities(&of_file).is_empty());
+
+    let color = path("color.png");
+    let drawn = with("view", &["--find-table", "--threshold", "0.6", "--color", &color, "--out", &path("over.png")]);
+    assert!(drawn.status.success(), "{drawn:?}");
+    let mut picture = png::Decoder::new(BufReader::new(File::open(path("over.png")).unwrap())).read_info().unwrap();
+    let mut pixels = vec![0; picture.output_buffer_size().unwrap()];
+    picture.next_frame(&mut pixels).unwrap();
+    let background = pixels.as_chunks::<3>().0.iter().filter(|pixel| **pixel == [30; 3]).count();
+    assert!((1000..CAMERA.width * CAMERA.height - 100).contains(&background), "{background} pixels of the image");
+
+    let without = with("detect", &[]);
+    assert!(String::from_utf8_lossy(&without.stderr).contains("`grasp table` finds"), "{without:?}");
+}
+
+fn png_header(
+    mut encoder: png::Encoder<'static, File>,
+    color: png::ColorType,
+    bits: png::BitDepth,
+) -> png::Writer<File> {
+    encoder.set_color(color);
+    encoder.set_depth(bits);
+    encoder.write_header().unwrap()
+}

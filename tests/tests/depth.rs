@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use grasp::{DepthImage, Fusion, RESOLUTION as PAPERS, Volume, WORKSPACE_SIZE};
 use grasp_client::{
-    Client, CloudView, Depth, DepthView, DetectOptions, Detection, Error, Extrinsics, Options, Proposal, Workspace,
+    Client, CloudView, Depth, DepthView, DetectOptions, Detection, Error, Extrinsics, FindTable, Options, Proposal,
+    Workspace,
 };
 use grasp_proto::pb;
 use grasp_tests::scene::{BLOCK, CAMERA, TABLE, camera, depth, view};
@@ -59,7 +60,7 @@ async fn depth_images_give_the_grasps_of_the_fused_volume() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let client = server.client().await;
     let pose = Isometry3::new(Vector3::new(0.4, -0.2, 1.1), Vector3::new(0.0, 0.0, 2.0));
-    let workspace = Workspace { pose, size: Some(0.3) };
+    let workspace = Workspace { pose, size: Some(0.3), ..Workspace::default() };
     let cameras = [camera(30.0, -90.0), camera(45.0, 60.0)];
     let expected = client.detect(&fused(&cameras, RESOLUTION, pose), low()).await.unwrap();
 
@@ -90,7 +91,7 @@ async fn the_grid_is_rotated_to_the_camera_azimuth_of_the_network() {
     let server = Server::run(&[TestModel::new("mirror"), turned], &[]);
     let client = server.client().await;
     let pose = Isometry3::new(Vector3::new(0.4, -0.2, 1.1), Vector3::new(0.0, 0.0, 2.0));
-    let workspace = Workspace { pose, size: None };
+    let workspace = Workspace { pose, ..Workspace::default() };
     let eye = camera(40.0, -90.0);
     let options = || with_options(DetectOptions { model: "turned".to_owned(), ..low().detect });
     let detection = client.detect_from_depth(&[view(&eye)], &workspace, options()).await.unwrap();
@@ -209,7 +210,7 @@ async fn invalid_views_are_refused_with_the_field_and_the_value() {
     .await;
     refused(&[good()], Workspace { size: Some(-1.0), ..workspace }, "workspace.size is -1, must be above 0").await;
     // A workspace above the scene, in front of the camera.
-    let above = Workspace { pose: Isometry3::translation(0.0, 0.0, 0.25), size: None };
+    let above = Workspace { pose: Isometry3::translation(0.0, 0.0, 0.25), ..Workspace::default() };
     let hand_eye = Extrinsics::FrameFromCamera(pose.inverse());
     let elsewhere = DepthView { extrinsics: hand_eye, ..good() };
     refused(&[elsewhere], above, "views: none shows a surface in the workspace").await;
@@ -503,4 +504,61 @@ async fn wrong_geometry_is_reported_as_a_warning_and_counted() {
 
     let counted = |code: &str| server.metric(&format!("graspd_warnings_total{{code=\"{code}\",model=\"mirror 1\"}}"));
     assert_eq!(["TABLE_TILTED", "VIEWS_DISAGREE", "NO_TABLE"].map(counted), [1.0, 1.0, 0.0]);
+}
+
+#[tokio::test]
+async fn the_table_is_found_in_the_first_view() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let client = server.client().await;
+    let camera_from_task = camera(35.0, -90.0);
+    let of_frame = |pose| DepthView { extrinsics: Extrinsics::FrameFromCamera(pose), ..view(&camera_from_task) };
+    let auto = Workspace { find_table: Some(FindTable::default()), ..Workspace::default() };
+
+    // In the frame of the camera.
+    let shaf = || with_options(DetectOptions { model: "shaf".to_owned(), ..DetectOptions::default() });
+    let detection = client.detect_from_depth(&[of_frame(Isometry3::identity())], &auto, shaf()).await.unwrap();
+    let table = detection.table.unwrap();
+    let camera_from_found = grasp_proto::pose(table.workspace.as_ref().unwrap(), "workspace").unwrap();
+    let height = (camera_from_task.inverse() * camera_from_found * Point3::new(0.15, 0.15, TABLE)).z;
+    assert!((height - TABLE).abs() < 0.003, "{height}");
+    assert!((table.angle.to_degrees() - 35.0).abs() < 1.0 && table.tilt.is_none(), "{table:?}");
+    assert_eq!(detection.warnings, []);
+    let best = detection.grasps[0];
+    assert_at_the_block(&Proposal { pose: camera_from_task.inverse() * best.pose, ..best });
+
+    // In the frame of the robot, with gravity, and with a second view.
+    let gravity = FindTable { gravity: Some([0.0, 0.0, -9.81]) };
+    let auto = Workspace { find_table: Some(gravity), ..Workspace::default() };
+    let second = camera(45.0, 60.0);
+    let views = [
+        of_frame(camera_from_task.inverse()),
+        DepthView { extrinsics: Extrinsics::FrameFromCamera(second.inverse()), ..view(&second) },
+    ];
+    let detection = client.detect_from_depth(&views, &auto, shaf()).await.unwrap();
+    assert!(detection.table.unwrap().tilt.unwrap() < 0.02);
+    assert_at_the_block(&detection.grasps[0]);
+    let mut tracking = client.track(auto).await.unwrap();
+    let tracked = tracking.add(&views[..1], low()).await.unwrap();
+    assert!(tracked.table.is_some());
+    assert!(tracking.add(&views[1..], low()).await.unwrap().table.is_none(), "it is found once");
+
+    let refused = async |views: &[DepthView], find_table: FindTable, expected: &str| {
+        let auto = Workspace { find_table: Some(find_table), ..Workspace::default() };
+        let (code, message) = refusal(client.detect_from_depth(views, &auto, low()).await);
+        assert_eq!(code, Code::InvalidArgument);
+        assert!(message.contains(expected), "{message}");
+    };
+    let any = FindTable::default();
+    refused(&[view(&camera_from_task)], any, "views[0].extrinsics is camera_from_task, must be frame_from_camera")
+        .await;
+    let sideways = FindTable { gravity: Some([1.0, 0.0, 0.0]) };
+    refused(&views[..1], sideways, "views[0].data: the largest level plane near the middle").await;
+    let nowhere = FindTable { gravity: Some([0.0; 3]) };
+    refused(&views[..1], nowhere, "workspace.gravity is (0, 0, 0), must be finite and of a length above 0").await;
+    let nothing = DepthView { depth: Depth::Metres(vec![0.0; 160 * 120]), ..views[0].clone() };
+    refused(&[nothing], any, "views[0].data: only 0 % of the image has a depth").await;
+    let cloud =
+        CloudView { points: vec![[0.1, 0.1, 0.1]], frame_from_cloud: Isometry3::identity(), camera_position: [0.0; 3] };
+    let (_, message) = refusal(client.detect_from_cloud(&[cloud], &auto, low()).await);
+    assert!(message.starts_with("workspace.find_table is true, needs depth images"), "{message}");
 }

@@ -27,7 +27,7 @@ async fn each_view_is_added_to_those_before_it() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let client = server.client().await;
     let pose = Isometry3::translation(0.4, 0.0, 0.2);
-    let workspace = Workspace { pose, size: None };
+    let workspace = Workspace { pose, ..Workspace::default() };
     let views = [-90.0, 0.0, 90.0].map(|azimuth| view(&camera(40.0, azimuth)));
 
     let mut tracking = client.track(workspace).await.unwrap();

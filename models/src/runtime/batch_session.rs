@@ -13,7 +13,7 @@ use super::{INPUT, LoadReason, OUTPUTS, Options, runtime};
 use crate::gpd;
 use crate::onnx::ModelProto;
 use crate::upsampling::with_upsampling_folded;
-use crate::with_full_weights;
+use crate::{Calibration, MetadataError, with_full_weights};
 
 /// A model file with the properties that are needed to load it.
 pub(super) struct ModelFile<'a> {
@@ -29,6 +29,8 @@ pub(super) struct ModelFile<'a> {
     pub external_weights: Option<String>,
     /// Name of the batch dimension.
     batch: Option<String>,
+    /// The calibration of a classifier.
+    pub calibration: Result<Calibration, MetadataError>,
 }
 
 /// A session with its buffers.
@@ -56,19 +58,21 @@ impl<'a> ModelFile<'a> {
     pub fn new(path: &'a Path, bytes: &'a [u8], options: &Options) -> Self {
         let model = ModelProto::from_bytes(bytes).unwrap_or_default();
         let optimized = optimized(&model, bytes);
+        let calibration = Calibration::of(&model);
         let graph = model.graph.unwrap_or_default();
         let is_int8 = graph.node.iter().any(|node| node.op_type() == "QuantizeLinear");
         let is_batch = |name: &str| name == INPUT || name == gpd::INPUT;
         let batch = graph.input.iter().find(|input| is_batch(input.name())).and_then(|input| input.free(0));
         let batch = batch.map(str::to_owned);
         let external_weights = graph.initializer.iter().find_map(|tensor| tensor.external_file()).map(str::to_owned);
-        Self { path, bytes, optimized, threads: options.threads, is_int8, external_weights, batch }
+        Self { path, bytes, optimized, threads: options.threads, is_int8, external_weights, batch, calibration }
     }
 
     /// The unmodified file, if an optimized graph is used.
     pub fn original(&self) -> Option<Self> {
         self.optimized.as_ref()?;
-        Some(Self { optimized: None, external_weights: None, batch: self.batch.clone(), ..*self })
+        let (batch, calibration) = (self.batch.clone(), self.calibration.clone());
+        Some(Self { optimized: None, external_weights: None, batch, calibration, ..*self })
     }
 
     /// Creates a session, for one fixed batch size if given.

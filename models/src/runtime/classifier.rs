@@ -8,8 +8,8 @@ use tracing::warn;
 use super::backend::AvailableBackends;
 use super::batch_session::ModelFile;
 use super::{Backend, LoadError, LoadReason, Options, Provider, RuntimeError, run_error, runtime};
-use crate::Entry;
 use crate::gpd::{INPUT, OUTPUT};
+use crate::{Calibration, Entry};
 
 /// Batch size, which bounds the memory: 5.5 MB of input for GPD.
 const BATCH: usize = 32;
@@ -26,6 +26,7 @@ pub struct Classifier {
     shape: &'static [usize],
     /// Name in error messages.
     name: String,
+    calibration: Calibration,
 }
 
 impl Classifier {
@@ -98,7 +99,9 @@ impl Classifier {
         let wrong = |what| LoadReason::Classifier { what, shape };
         check(session.inputs(), INPUT, &shape.iter().map(|&size| size..=size).collect::<Vec<_>>()).map_err(wrong)?;
         check(session.outputs(), OUTPUT, &[2..=usize::MAX]).map_err(wrong)?;
-        let mut classifier = Self { session, backend, shape, name: model.path.display().to_string() };
+        let calibration = model.calibration.clone()?;
+        let name = model.path.display().to_string();
+        let mut classifier = Self { session, backend, shape, name, calibration };
         classifier.run(BATCH, vec![0.0; BATCH * classifier.size()])?;
         Ok(classifier)
     }
@@ -114,7 +117,7 @@ impl Classifier {
         self.backend
     }
 
-    /// The scores of `count` images: the log-odds of success. Above 0, success is more likely. `write` writes the image
+    /// The scores of `count` images: the calibrated log-odds of success. Above 0, success is more likely. `write` writes the image
     /// of an index, whose values have the classifier's shape and are in [0, 1].
     ///
     /// The first class is failure, all others are successes.
@@ -132,7 +135,8 @@ impl Classifier {
                 write(first + index, image);
             }
             let logits = self.run(batch, pixels).map_err(|error| run_error(&self.name, &error))?;
-            scores.extend(logits.chunks_exact(logits.len() / batch).take(images).map(log_odds));
+            let logits = logits.chunks_exact(logits.len() / batch).take(images);
+            scores.extend(logits.map(|logits| self.calibration.apply(log_odds(logits))));
         }
         Ok(scores)
     }

@@ -71,6 +71,8 @@ pub struct ClassifierSettings {
     pub batch: usize,
     /// Adam's initial learning rate.
     pub learning_rate: f64,
+    /// Decoupled weight decay.
+    pub weight_decay: f64,
     /// Share of the scenes used for validation.
     pub validation: f64,
     /// Seed of the order of the candidates.
@@ -118,7 +120,7 @@ impl<'a> ClassifierTrainer<'a> {
         };
         let class_weights: Vec<f32> = (0..dataset.classes()).map(class_weight).collect();
         let class_weights = Tensor::from_slice(&class_weights).to_device(executor.device());
-        let adam = Adam::new(executor.parameters(), 0.0);
+        let adam = Adam::new(executor.parameters(), settings.weight_decay);
         let rng = ChaCha8Rng::seed_from_u64(seed);
         Ok(Self { executor, adam, dataset, training, validation, class_weights, settings, rng })
     }

@@ -42,6 +42,9 @@ pub(crate) struct Classify {
     /// Adam's initial learning rate; it falls to 0 along half a cosine.
     #[arg(long, default_value_t = 1e-3)]
     lr: f64,
+    /// Decoupled weight decay.
+    #[arg(long, default_value_t = 0.0)]
+    weight_decay: f64,
     /// Share of the scenes used for validation.
     #[arg(long, default_value_t = 0.1)]
     val: f64,
@@ -105,6 +108,7 @@ impl Classify {
             tch::set_num_threads(i32::try_from(threads).context("--threads is too large")?);
         }
         ensure!((0.0..1.0).contains(&self.val), "--val is {}, must be at least 0 and less than 1", self.val);
+        ensure!(self.weight_decay >= 0.0, "--weight-decay is {}, must be at least 0", self.weight_decay);
         if let Some(folder) = self.out.parent() {
             fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
         }
@@ -114,6 +118,7 @@ impl Classify {
             epochs: self.epochs,
             batch: usize::from(self.batch),
             learning_rate: self.lr,
+            weight_decay: self.weight_decay,
             validation: self.val,
             seed: self.seed,
             // GPD's classifier ranks candidates. The evaluator predicts a probability, so its classes keep their
@@ -169,6 +174,7 @@ impl Classify {
         note("epochs", record.epoch.to_string());
         note("batch", self.batch.to_string());
         note("learning_rate", self.lr.to_string());
+        note("weight_decay", self.weight_decay.to_string());
         note("bf16", self.bf16.to_string());
         note("seed", self.seed.to_string());
         note("date", OffsetDateTime::now_utc().date().to_string());

@@ -58,6 +58,7 @@ fn a_small_data_set_is_memorized() {
         epochs: 16,
         batch: 16,
         learning_rate: 2e-3,
+        weight_decay: 0.0,
         validation: 0.25,
         seed: 1,
         balance: true,

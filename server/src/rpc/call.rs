@@ -85,6 +85,8 @@ pub(crate) struct Observed {
     pub fusion: Option<Duration>,
     /// Signs that the geometry of the request is wrong.
     pub warnings: Vec<Warning>,
+    /// The table that determined the workspace.
+    pub table: Option<pb::FoundTable>,
 }
 
 /// Frame id and time stamp of a request's views, echoed in the response.
@@ -229,6 +231,18 @@ impl Call {
         Ok((maps, timings))
     }
 
+    /// Ends a call that needs no model, and records the outcome.
+    pub fn finish_without_model<T>(mut self, outcome: Result<T, Refusal>) -> Result<T, Refusal> {
+        let value = match outcome {
+            Ok(value) => value,
+            Err(refusal) => return Err(self.end(refusal)),
+        };
+        self.metrics.ended(&self.label, Code::Ok);
+        self.span.in_scope(|| debug!("request succeeded"));
+        self.ended = true;
+        Ok(value)
+    }
+
     /// Ends the call with a refusal.
     pub fn end(mut self, refusal: Refusal) -> Refusal {
         self.refused(&refusal);
@@ -241,7 +255,8 @@ impl Call {
     }
 
     async fn reply(&mut self, pending: PendingReply) -> Result<pb::DetectGraspsResponse, Refusal> {
-        let PendingReply { reply, params, preprocessing, observed: Observed { fusion, warnings }, origin } = pending;
+        let PendingReply { reply, params, preprocessing, observed, origin } = pending;
+        let Observed { fusion, warnings, table } = observed;
         let SessionOutput { value, queue, inference, postprocessing } = reply.wait(self.deadline).await?;
         let Detection { grasps: found, collides, dropped, over_limit, volume } = value;
 
@@ -284,6 +299,7 @@ impl Call {
             latency: Some((&timings).into()),
             dropped,
             warnings,
+            table,
         })
     }
 

@@ -3,10 +3,12 @@ use std::sync::Arc;
 use std::thread;
 use std::time::Instant;
 
-use grasp::{View, Volume};
+use grasp::{View, Volume, WORKSPACE_SIZE};
 use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::grasp_service_server::GraspService;
-use grasp_proto::{DetectParams, FieldError, Workspace, check_count, cloud_view, depth_view, pb, resolution};
+use grasp_proto::{
+    DetectParams, FieldError, TABLE_HEIGHT, Workspace, check_count, cloud_view, depth_view, pb, resolution,
+};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::time::timeout_at;
 use tokio_stream::StreamExt;
@@ -45,6 +47,9 @@ pub(crate) struct GraspRpc {
     /// is fused, which bounds the memory of waiting requests.
     conversion_permits: Arc<Semaphore>,
 }
+
+/// Views, and the table that determined their workspace.
+type Made = (Vec<View>, Option<pb::FoundTable>);
 
 /// A call that is queued, or refused with its refusal not yet sent.
 struct PendingCall {
@@ -112,11 +117,13 @@ impl GraspRpc {
         request: pb::DetectGraspsFromDepthRequest,
         call: &mut Call,
     ) -> Result<PendingReply, Refusal> {
-        let pb::DetectGraspsFromDepthRequest { views, workspace, options, .. } = request;
+        let pb::DetectGraspsFromDepthRequest { mut views, workspace, options, .. } = request;
         let count = views.len();
-        let make_views = move |workspace: &Workspace, _: f64| -> Result<Vec<View>, FieldError> {
+        let make_views = move |workspace: &mut Workspace, table: f64, _: f64| -> Result<Made, FieldError> {
+            let table = workspace.find_table(&mut views, table)?;
             let views = views.iter().enumerate();
-            views.map(|(index, view)| depth_view(view, index, &workspace.frame_from_task)).collect()
+            let views = views.map(|(index, view)| depth_view(view, index, &workspace.frame_from_task));
+            Ok((views.collect::<Result<_, _>>()?, table))
         };
         self.submit_views(count, workspace, options, call, make_views).await
     }
@@ -128,23 +135,26 @@ impl GraspRpc {
     ) -> Result<PendingReply, Refusal> {
         let pb::DetectGraspsFromCloudRequest { views, workspace, options, .. } = request;
         let count = views.len();
-        let make_views = move |workspace: &Workspace, size: f64| -> Result<Vec<View>, FieldError> {
+        let make_views = move |workspace: &mut Workspace, _: f64, size: f64| -> Result<Made, FieldError> {
+            if workspace.find_table {
+                return Err(FieldError::new("workspace.find_table", true, "needs depth images; send those instead"));
+            }
             let views = views.iter().enumerate();
             let clouds = views.map(|(index, view)| cloud_view(view, index, &workspace.frame_from_task));
-            rendered(&clouds.collect::<Result<Vec<_>, _>>()?, size)
+            Ok((rendered(&clouds.collect::<Result<Vec<_>, _>>()?, size)?, None))
         };
         self.submit_views(count, workspace, options, call, make_views).await
     }
 
-    /// Fuses `count` views and queues the scene. `make_views` returns the views in a workspace and a cube of that size,
-    /// metres.
+    /// Fuses `count` views and queues the scene. `make_views` returns the views in a workspace with the table at a
+    /// height, in a cube of a size, metres.
     async fn submit_views(
         &self,
         count: usize,
         workspace: Option<pb::Workspace>,
         options: Option<pb::Options>,
         call: &mut Call,
-        make_views: impl FnOnce(&Workspace, f64) -> Result<Vec<View>, FieldError> + Send + 'static,
+        make_views: impl FnOnce(&mut Workspace, f64, f64) -> Result<Made, FieldError> + Send + 'static,
     ) -> Result<PendingReply, Refusal> {
         check_count(count)?;
         let params = DetectParams::try_from(&options.unwrap_or_default())?;
@@ -157,11 +167,35 @@ impl GraspRpc {
         engine.check_capacity()?;
         let selected = Arc::clone(&engine);
         let fused = blocking(permits, move || {
-            let views = make_views(&workspace, size(&selected.source, &workspace))?;
-            fuse(&selected, params, &workspace, &views)
+            let size = size(&selected.source, &workspace);
+            let (views, table) = make_views(&mut workspace, params.table.unwrap_or(TABLE_HEIGHT), size)?;
+            fuse(&selected, params, &workspace, &views, table)
         });
         let (scene, params, observed) = fused.await?;
         call.submit(&engine, scene, params, origin, observed)
+    }
+
+    /// Finds the table in a view.
+    async fn table(&self, request: pb::FindTableRequest, call: &mut Call) -> Result<pb::FindTableResponse, Refusal> {
+        let pb::FindTableRequest { view, workspace, table_height, .. } = request;
+        let mut view = view.ok_or_else(|| FieldError::new("view", "absent", "must be given"))?;
+        let height = table_height.unwrap_or(TABLE_HEIGHT);
+        if !(0.0..=WORKSPACE_SIZE).contains(&height) {
+            let needed = format_args!("must be from 0 to {WORKSPACE_SIZE} m");
+            return Err(FieldError::new("table_height", height, needed).into());
+        }
+        let workspace = pb::Workspace { find_table: true, ..workspace.unwrap_or_default() };
+        let mut workspace = Workspace::try_from(workspace)?;
+        let frame_id = std::mem::take(&mut workspace.frame_id);
+        let origin = FrameStamp::checked("workspace.frame_id", frame_id, workspace.stamp)?;
+        let permit = self.fusion_permit(call).await?;
+        let find = move || {
+            let found = workspace.find_table_in(&mut view, true, height);
+            found.map(Some).map_err(|error| error.inside("view").into())
+        };
+        let table = blocking(permit, find).await?;
+        let FrameStamp { frame_id, stamp } = origin;
+        Ok(pb::FindTableResponse { request_id: call.id.clone(), frame_id, stamp, table })
     }
 
     /// The status that ends a stream. The refusal is logged and counted.
@@ -196,7 +230,7 @@ impl GraspRpc {
         track: &mut Option<Track>,
         call: &mut Call,
     ) -> Result<PendingReply, Refusal> {
-        let pb::TrackGraspsRequest { views, workspace, options, .. } = request;
+        let pb::TrackGraspsRequest { mut views, workspace, options, .. } = request;
         let before = track.as_ref().map(|track| track.params.clone());
         let params = match (options, before) {
             (None, Some(before)) => before,
@@ -209,7 +243,7 @@ impl GraspRpc {
         let (selected, old) = (Arc::clone(&engine), track.take());
         // The volume is returned in any case, so an invalid view does not lose it.
         let (new, fused) =
-            blocking(permit, move || Ok(Track::integrate(old, &selected, params, workspace, &views))).await?;
+            blocking(permit, move || Ok(Track::integrate(old, &selected, params, workspace, &mut views))).await?;
         *track = new;
         let (scene, params, origin, observed) = fused?;
         call.submit(&engine, scene, params, origin, observed)
@@ -222,13 +256,15 @@ fn fuse(
     mut params: DetectParams,
     workspace: &Workspace,
     views: &[View],
+    table: Option<pb::FoundTable>,
 ) -> Result<(Scene, DetectParams, Observed), Refusal> {
     let started = Instant::now();
     let grid = FusionGrid::of(&engine.source, workspace, &camera_positions(views))?;
     let mut fusion = grid.fusion();
     let Integrated { points, warnings } = grid.integrate(&mut fusion, views)?;
     params.constraints = grid.within(params.constraints);
-    Ok((grid.scene(&fusion, points)?, params, Observed { fusion: Some(started.elapsed()), warnings }))
+    let observed = Observed { fusion: Some(started.elapsed()), warnings, table };
+    Ok((grid.scene(&fusion, points)?, params, observed))
 }
 
 /// Runs `work` on a thread for blocking tasks, to keep the async runtime's threads free.
@@ -275,6 +311,21 @@ impl GraspService for GraspRpc {
         let mut request = request.into_inner();
         let id = std::mem::take(&mut request.request_id);
         self.begin(id, context, async |call| self.submit_cloud(request, call).await).await.respond().await
+    }
+
+    async fn find_table(
+        &self,
+        request: Request<pb::FindTableRequest>,
+    ) -> Result<Response<pb::FindTableResponse>, Status> {
+        let context = CallContext::of(&request);
+        let request = request.into_inner();
+        let (mut call, checked) = self.calls.open(request.request_id.clone(), context);
+        let found = match checked {
+            Ok(()) => self.table(request, &mut call).await,
+            Err(refusal) => Err(refusal),
+        };
+        let id = call.id.clone();
+        call.finish_without_model(found).map(Response::new).map_err(|refusal| refusal.status(&id))
     }
 
     type DetectGraspsStreamStream = BoxStream<pb::DetectGraspsStreamResponse>;

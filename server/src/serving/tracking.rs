@@ -2,7 +2,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use grasp::{Fusion, View};
-use grasp_proto::{DetectParams, FieldError, MAX_VIEWS, Workspace, check_count, depth_view, pb};
+use grasp_proto::{DetectParams, FieldError, MAX_VIEWS, TABLE_HEIGHT, Workspace, check_count, depth_view, pb};
 use nalgebra::Isometry3;
 use prometheus::IntGauge;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
@@ -75,7 +75,7 @@ impl Track {
         engine: &Engine,
         params: DetectParams,
         workspace: Option<pb::Workspace>,
-        views: &[pb::DepthView],
+        views: &mut [pb::DepthView],
     ) -> (Option<Self>, Result<Fused, Refusal>) {
         match (track, workspace) {
             (None, None) => {
@@ -84,12 +84,12 @@ impl Track {
             }
             (Some(mut track), None) => {
                 let views = converted(views, &track.frame_from_task);
-                let fused = views.map_err(Refusal::from).and_then(|views| track.add(engine, params, &views));
+                let fused = views.map_err(Refusal::from).and_then(|views| track.add(engine, params, &views, None));
                 (Some(track), fused)
             }
             (track, Some(workspace)) => match Self::start(engine, &params, workspace, views) {
-                Ok((mut track, views)) => {
-                    let fused = track.add(engine, params, &views);
+                Ok((mut track, views, table)) => {
+                    let fused = track.add(engine, params, &views, table);
                     (Some(track), fused)
                 }
                 Err(refusal) => (track, Err(refusal)),
@@ -97,32 +97,39 @@ impl Track {
         }
     }
 
-    /// An empty volume, and its first views.
+    /// An empty volume, its first views, and the table that determined its pose.
     fn start(
         engine: &Engine,
         params: &DetectParams,
         workspace: pb::Workspace,
-        views: &[pb::DepthView],
-    ) -> Result<(Self, Vec<View>), Refusal> {
+        views: &mut [pb::DepthView],
+    ) -> Result<(Self, Vec<View>, Option<pb::FoundTable>), Refusal> {
         let mut workspace = Workspace::try_from(workspace)?;
         let origin =
             FrameStamp::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
-        let frame_from_task = workspace.frame_from_task;
         // The rotation of the grid may depend on the camera positions.
         check_count(views.len())?;
+        let table = workspace.find_table(views, params.table.unwrap_or(TABLE_HEIGHT))?;
+        let frame_from_task = workspace.frame_from_task;
         let views = converted(views, &frame_from_task)?;
         let grid = FusionGrid::of(&engine.source, &workspace, &camera_positions(&views))?;
-        Ok((Self { fusion: grid.fusion(), grid, frame_from_task, origin, params: params.clone() }, views))
+        Ok((Self { fusion: grid.fusion(), grid, frame_from_task, origin, params: params.clone() }, views, table))
     }
 
-    fn add(&mut self, engine: &Engine, params: DetectParams, views: &[View]) -> Result<Fused, Refusal> {
+    fn add(
+        &mut self,
+        engine: &Engine,
+        params: DetectParams,
+        views: &[View],
+        table: Option<pb::FoundTable>,
+    ) -> Result<Fused, Refusal> {
         let started = Instant::now();
         self.grid.check(&engine.source)?;
         let Integrated { warnings, .. } = self.grid.integrate(&mut self.fusion, views)?;
         // Without points: those of earlier views are not stored.
         let scene = self.grid.scene(&self.fusion, None)?;
         self.params = DetectParams { constraints: self.grid.within(params.constraints), ..params };
-        let observed = Observed { fusion: Some(started.elapsed()), warnings };
+        let observed = Observed { fusion: Some(started.elapsed()), warnings, table };
         Ok((scene, self.params.clone(), self.origin.clone(), observed))
     }
 }

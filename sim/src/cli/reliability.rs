@@ -41,7 +41,7 @@ impl ReliabilityArgs {
     }
 }
 
-fn read(path: &Path) -> anyhow::Result<Vec<Attempt>> {
+pub(super) fn read(path: &Path) -> anyhow::Result<Vec<Attempt>> {
     let text = fs::read_to_string(path).with_context(|| path.display().to_string())?;
     let attempts: Vec<Attempt> = text
         .lines()

@@ -6,7 +6,7 @@ frame b into frame a. Arrays of voxels are indexed ``[x][y][z]``.
 """
 
 from graspd.client import Client, Tracking
-from graspd.detection import Detection, Dropped, GeometryWarning, Grasp, Latency, Model
+from graspd.detection import Detection, Dropped, FoundTable, GeometryWarning, Grasp, Latency, Model
 from graspd.errors import (
     Aborted,
     DeadlineExceeded,
@@ -36,6 +36,7 @@ __all__ = [
     "Detection",
     "Dropped",
     "Error",
+    "FoundTable",
     "GeometryWarning",
     "Grasp",
     "Gripper",

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from graspd import grasp_pb2 as pb
 from graspd import methods, wire
 from graspd.connection import OPTIONS, Connection
-from graspd.detection import Detection, Model
+from graspd.detection import Detection, FoundTable, Model
 from graspd.errors import Error, from_status
 from graspd.methods import Answer, Method, Request, Response
 from graspd.options import Options
@@ -51,7 +51,7 @@ class Client(Connection[grpc.Channel]):
 
     def detect_from_depth(
         self,
-        views: Iterable[DepthView],
+        views: DepthView | Iterable[DepthView],
         workspace: Workspace = Workspace(),
         options: Options | None = None,
         *,
@@ -62,7 +62,7 @@ class Client(Connection[grpc.Channel]):
 
     def detect_from_cloud(
         self,
-        views: Iterable[CloudView],
+        views: CloudView | Iterable[CloudView],
         workspace: Workspace = Workspace(),
         options: Options | None = None,
         *,
@@ -96,6 +96,18 @@ class Client(Connection[grpc.Channel]):
     def track(self, workspace: Workspace = Workspace()) -> Tracking:
         """Opens a tracked volume for a moving camera."""
         return Tracking(lambda requests: self._stream(methods.TRACK, requests), workspace)
+
+    def find_table(
+        self,
+        view: DepthView,
+        workspace: Workspace = Workspace(),
+        *,
+        table_height: float | None = None,
+        request_id: str = "",
+    ) -> FoundTable:
+        """Finds the table in a depth image, and the workspace over what stands on it. Of `workspace` only `gravity` is
+        used. `table_height` is the height of the table above the bottom of the workspace, metres; None: 0.05."""
+        return self._call(methods.FIND_TABLE, wire.table_request(view, workspace, table_height, request_id))
 
     def models(self) -> tuple[Model, ...]:
         """The models that the server serves; the default model is first."""
@@ -153,7 +165,7 @@ class Tracking:
         self._replies.cancel()
 
     def add(
-        self, views: Iterable[DepthView] = (), options: Options | None = None, *, request_id: str = ""
+        self, views: DepthView | Iterable[DepthView] = (), options: Options | None = None, *, request_id: str = ""
     ) -> Detection:
         """Adds views to the volume and detects grasps in everything observed so far. `views` may be empty. With
         `options` of None the options of the previous call apply.

@@ -89,6 +89,25 @@ class GeometryWarning:
 
 
 @dataclass(frozen=True)
+class FoundTable:
+    """A table in a depth image, and the workspace over what stands on it."""
+
+    workspace: Pose
+    """``T_frame_task``: pose of the workspace's corner. z is the normal of the table, x points to the right of the
+    image."""
+    distance: float
+    """Distance of the camera from the plane of the table, metres."""
+    angle: float
+    """Angle between the optical axis and the normal of the table, radians: 0 if the camera looks straight down."""
+    share: float
+    """Share of the image on the table, weighted towards its middle."""
+    deviation: float
+    """Root mean square distance of these pixels from the plane, metres."""
+    tilt: float | None
+    """Angle between the normal of the table and the vertical, radians; None if gravity is unknown."""
+
+
+@dataclass(frozen=True)
 class Detection:
     """The result of a request."""
 
@@ -109,6 +128,8 @@ class Detection:
     """The request id of the caller, or the one that the server generated; it is in the server's log."""
     warnings: tuple[GeometryWarning, ...] = ()
     """Signs that the geometry of the request is wrong, or that the network was not trained for it."""
+    table: FoundTable | None = None
+    """The table that was found, if the workspace has `find_table`."""
 
 
 @dataclass(frozen=True)

@@ -40,11 +40,12 @@ class Volume:
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """A rectified depth image with its camera pose: exactly one of `camera_from_task` and `frame_from_camera`."""
+    """A rectified depth image with its camera pose: one of `camera_from_task` and `frame_from_camera`. A single view may
+    have neither if the workspace has `find_table`: the frame is then that of the camera."""
 
-    depth: NDArray[Any]
-    """``[row][column]``: distance along the optical axis, floats in metres or uint16 in millimetres. 0, NaN and
-    infinity mean no reading."""
+    depth: Any
+    """``[row][column]``, an array or an image of PIL: distance along the optical axis, floats in metres or integers in
+    millimetres. 0, NaN and infinity mean no reading."""
     k: NDArray[np.floating[Any]]
     """The 3 × 3 intrinsic matrix, pixels (ROS: ``CameraInfo.k``). Pixel centres have integer coordinates."""
     _: KW_ONLY
@@ -56,8 +57,8 @@ class DepthView:
     def __post_init__(self) -> None:
         if np.ndim(self.depth) != 2:
             raise ValueError(f"a depth image must be an array [row][column], got shape {np.shape(self.depth)}")
-        if (self.camera_from_task is None) == (self.frame_from_camera is None):
-            raise ValueError("a depth image needs exactly one of camera_from_task and frame_from_camera")
+        if self.camera_from_task is not None and self.frame_from_camera is not None:
+            raise ValueError("a depth image has one of camera_from_task and frame_from_camera, got both")
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,3 +90,9 @@ class Workspace:
     """Name of the frame of `pose` and of the grasps."""
     stamp: int | None = None
     """Time of the observation, nanoseconds since 1970. The server returns it unchanged."""
+    find_table: bool = False
+    """Find the table in the first depth image, and place the cube over what stands on it near the middle of the image.
+    `pose` must be None; the pose that was found is in `Detection.table`."""
+    gravity: Vector | None = None
+    """For `find_table`: direction of gravity in `frame_id`, of any length above 0. An accelerometer at rest measures the
+    opposite. None: unknown; a wall that fills the image is then taken for a table."""

@@ -65,7 +65,7 @@ class Adding:
         # None once the server has accepted it.
         self._workspace: Workspace | None = workspace
 
-    def request(self, views: Iterable[DepthView], options: Options | None, request_id: str) -> pb.TrackGraspsRequest:
+    def request(self, views: DepthView | Iterable[DepthView], options: Options | None, request_id: str) -> pb.TrackGraspsRequest:
         return wire.track_request(views, self._workspace, options, request_id)
 
     def answer(self, reply: pb.DetectGraspsStreamResponse | None) -> Detection:

@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from graspd import errors
 from graspd import grasp_pb2 as pb
-from graspd.detection import Detection, Dropped, GeometryWarning, Grasp, Latency, Model
+from graspd.detection import Detection, Dropped, FoundTable, GeometryWarning, Grasp, Latency, Model
 from graspd.geometry import Pose, PoseLike, Vector
 from graspd.options import Box, CollisionCheck, Cone, Convention, Gripper, Options, Retreat
 from graspd.seen import CloudView, DepthView, Volume, Workspace
@@ -50,35 +50,46 @@ def detect_request(volume: Volume | NDArray[Any], options: Options | None, reque
 
 
 def depth_request(
-    views: Iterable[DepthView], workspace: Workspace, options: Options | None, request_id: str
+    views: DepthView | Iterable[DepthView], workspace: Workspace, options: Options | None, request_id: str
 ) -> pb.DetectGraspsFromDepthRequest:
     return pb.DetectGraspsFromDepthRequest(
         request_id=request_id,
-        views=map(depth_message, views),
+        views=map(depth_message, [views] if isinstance(views, DepthView) else views),
         workspace=workspace_message(workspace),
         options=given(options_message, options),
     )
 
 
 def cloud_request(
-    views: Iterable[CloudView], workspace: Workspace, options: Options | None, request_id: str
+    views: CloudView | Iterable[CloudView], workspace: Workspace, options: Options | None, request_id: str
 ) -> pb.DetectGraspsFromCloudRequest:
     return pb.DetectGraspsFromCloudRequest(
         request_id=request_id,
-        views=map(cloud_message, views),
+        views=map(cloud_message, [views] if isinstance(views, CloudView) else views),
         workspace=workspace_message(workspace),
         options=given(options_message, options),
     )
 
 
 def track_request(
-    views: Iterable[DepthView], workspace: Workspace | None, options: Options | None, request_id: str
+    views: DepthView | Iterable[DepthView], workspace: Workspace | None, options: Options | None, request_id: str
 ) -> pb.TrackGraspsRequest:
     return pb.TrackGraspsRequest(
         request_id=request_id,
-        views=map(depth_message, views),
+        views=map(depth_message, [views] if isinstance(views, DepthView) else views),
         workspace=given(workspace_message, workspace),
         options=given(options_message, options),
+    )
+
+
+def table_request(
+    view: DepthView, workspace: Workspace, table_height: float | None, request_id: str
+) -> pb.FindTableRequest:
+    return pb.FindTableRequest(
+        request_id=request_id,
+        view=depth_message(view),
+        workspace=workspace_message(workspace),
+        table_height=table_height,
     )
 
 
@@ -121,13 +132,19 @@ def encoded(values: NDArray[Any], dtype: DTypeLike | None) -> NDArray[Any]:
 
 
 def depth_message(view: DepthView) -> pb.DepthView:
-    height, width = view.depth.shape
-    if view.depth.dtype == np.uint16:
-        unit, depth = pb.DEPTH_UNIT_U16_MILLIMETRES, view.depth.astype("<u2", copy=False)
-    elif np.issubdtype(view.depth.dtype, np.floating):
-        unit, depth = pb.DEPTH_UNIT_F32_METRES, view.depth.astype("<f4", copy=False)
+    image = np.asarray(view.depth)
+    height, width = image.shape
+    if np.issubdtype(image.dtype, np.integer):
+        if image.size and not (0 <= image.min() and image.max() <= 65535):
+            raise ValueError(
+                f"integer depths are millimetres from 0 to 65535, got {image.min()} to {image.max()}; send other units "
+                "as floats in metres"
+            )
+        unit, depth = pb.DEPTH_UNIT_U16_MILLIMETRES, image.astype("<u2", copy=False)
+    elif np.issubdtype(image.dtype, np.floating):
+        unit, depth = pb.DEPTH_UNIT_F32_METRES, image.astype("<f4", copy=False)
     else:
-        raise ValueError(f"a depth image must be floats (metres) or uint16 (millimetres), got {view.depth.dtype}")
+        raise ValueError(f"a depth image must be floats (metres) or integers (millimetres), got {image.dtype}")
     return pb.DepthView(
         data=depth.tobytes(),
         unit=unit,
@@ -151,6 +168,8 @@ def workspace_message(workspace: Workspace) -> pb.Workspace:
         size=workspace.size,
         frame_id=workspace.frame_id,
         stamp=given(stamp_message, workspace.stamp),
+        find_table=workspace.find_table,
+        gravity=None if workspace.gravity is None else vector_message(workspace.gravity),
     )
 
 
@@ -243,6 +262,22 @@ def detection(message: pb.DetectGraspsResponse) -> Detection:
         dropped=dropped(message.dropped) if message.HasField("dropped") else None,
         request_id=message.request_id,
         warnings=tuple(map(warning, message.warnings)),
+        table=table(message.table) if message.HasField("table") else None,
+    )
+
+
+def found_table(message: pb.FindTableResponse) -> FoundTable:
+    return table(message.table)
+
+
+def table(message: pb.FoundTable) -> FoundTable:
+    return FoundTable(
+        workspace=pose(message.workspace),
+        distance=message.distance,
+        angle=message.angle,
+        share=message.share,
+        deviation=message.deviation,
+        tilt=message.tilt if message.HasField("tilt") else None,
     )
 
 

@@ -1,11 +1,9 @@
-use std::path::PathBuf;
-
 use anyhow::ensure;
 use clap::{Args, ValueEnum};
 use grasp_client::{DetectOptions, pb};
 
 use crate::numbers::Numbers;
-use crate::pose;
+use crate::pose::Poses;
 
 /// Options of the detection.
 #[derive(Args, Clone)]
@@ -71,10 +69,9 @@ pub(crate) struct DetectArgs {
     #[arg(long, value_enum, default_value_t = Closing::Y)]
     closing: Closing,
 
-    /// T_parent_grasp for `--origin parent`: pose of the finger base in the parent link. A file with one pose, as for
-    /// --workspace.
-    #[arg(long, value_name = "FILE", required_if_eq("origin", "parent"))]
-    parent_from_grasp: Option<PathBuf>,
+    /// T_parent_grasp for `--origin parent`: pose of the finger base in the parent link. Formats as for --workspace.
+    #[arg(long, value_name = "FILE|NUMBERS", required_if_eq("origin", "parent"), allow_hyphen_values = true)]
+    parent_from_grasp: Option<Poses>,
 
     /// Distance of the pre-grasp from the grasp, back along the approach, metres. Default: 0.05.
     #[arg(long, value_name = "METRES")]
@@ -122,7 +119,7 @@ impl DetectArgs {
             self.parent_from_grasp.is_none() || self.origin == Origin::Parent,
             "--parent-from-grasp needs --origin parent"
         );
-        let parent_from_grasp = self.parent_from_grasp.as_deref().map(pose::one).transpose()?;
+        let parent_from_grasp = self.parent_from_grasp.as_ref().map(Poses::one).transpose()?;
         let vector = |[x, y, z]: [f64; 3]| Some(pb::Vector3 { x, y, z });
         let corners = |Numbers([a, b, c, x, y, z])| pb::Box { min: vector([a, b, c]), max: vector([x, y, z]) };
         let Self { model, version, threshold, force, max_grasps, explain, min_height, table_height, .. } = self.clone();

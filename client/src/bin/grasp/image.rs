@@ -5,12 +5,30 @@ use std::path::Path;
 use anyhow::{Context, bail, ensure};
 use grasp_client::Depth;
 use npyz::TypeChar;
+use tiff::decoder::{Decoder, DecodingResult};
 
 use crate::files;
 
-/// Reads a depth image from a .png or .npy file. Returns the depth, the width and the height.
-pub(crate) fn read(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
-    files::in_file(path, if files::has_extension(path, "png") { png } else { npy })
+/// The unit of integer depths of most cameras, metres.
+pub(crate) const MILLIMETRE: f32 = 1e-3;
+
+/// Reads a depth image from a .png, .tiff or .npy file, with integer depths in units of `scale` metres. Returns the depth, the
+/// width and the height.
+pub(crate) fn read(path: &Path, scale: f32) -> anyhow::Result<(Depth, u32, u32)> {
+    files::in_file(path, |path| {
+        let (depth, width, height) = match path.extension().and_then(|extension| extension.to_str()) {
+            Some("png") => png(path)?,
+            Some("tif" | "tiff") => tiff(path)?,
+            _ => npy(path)?,
+        };
+        let depth = match depth {
+            Depth::Millimetres(depth) if scale != MILLIMETRE => {
+                Depth::Metres(depth.into_iter().map(|depth| f32::from(depth) * scale).collect())
+            }
+            depth => depth,
+        };
+        Ok((depth, width, height))
+    })
 }
 
 fn npy(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
@@ -27,8 +45,28 @@ fn npy(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
     Ok((depth, u32::try_from(width)?, u32::try_from(height)?))
 }
 
+fn tiff(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
+    let mut decoder = Decoder::new(BufReader::new(File::open(path)?)).context("not a TIFF file")?;
+    let (width, height) = decoder.dimensions()?;
+    let depth = match decoder.read_image()? {
+        DecodingResult::U16(depth) => Depth::Millimetres(depth),
+        DecodingResult::F32(depth) => Depth::Metres(depth),
+        _ => bail!("TIFF is {:?}; a depth image must have one channel of u16 or f32", decoder.colortype()?),
+    };
+    let pixels = u64::from(width) * u64::from(height);
+    let values = match &depth {
+        Depth::Metres(depth) => depth.len(),
+        Depth::Millimetres(depth) => depth.len(),
+    };
+    ensure!(
+        values as u64 == pixels,
+        "TIFF has {values} values for {pixels} pixels; a depth image must have one channel"
+    );
+    Ok((depth, width, height))
+}
+
 fn png(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
-    let mut reader = png::Decoder::new(BufReader::new(File::open(path)?)).read_info()?;
+    let mut reader = png::Decoder::new(BufReader::new(File::open(path)?)).read_info().context("not a PNG file")?;
     let png::Info { width, height, bit_depth, color_type, .. } = *reader.info();
     ensure!(
         (color_type, bit_depth) == (png::ColorType::Grayscale, png::BitDepth::Sixteen),

@@ -6,10 +6,12 @@ mod export;
 mod files;
 mod image;
 mod numbers;
+mod overlay;
 mod pose;
 mod record;
 mod scene;
 mod show;
+mod table;
 mod view;
 mod volume;
 
@@ -32,6 +34,7 @@ use tonic::Code;
 
 use crate::detect_args::DetectArgs;
 use crate::scene::SceneArgs;
+use crate::table::Table;
 use crate::view::ViewArgs;
 
 /// Detects grasps with a graspd server.
@@ -78,6 +81,8 @@ enum Command {
     Detect(Detect),
     /// Detect grasps again whenever an input file changes.
     Watch(Watch),
+    /// Find the table in a depth image, and the workspace over what stands on it. Needs no server.
+    Table(Table),
     /// Draw the grasps, or record them for Foxglove and Rerun.
     View(View),
     /// Measure latency and throughput of the server with repeated requests.
@@ -253,7 +258,10 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             let table = detect.collision.and_then(|collision| collision.table_height);
             let depth = detect.gripper.as_ref().map(|gripper| gripper.finger_depth);
             let detection = scene.detect(&connect().await?, options(&args, detect)).await?;
-            let path = view.write(&scene.volume()?, table, depth, &detection)?;
+            let path = match view.write_over_color(&scene, depth, &detection)? {
+                Some(path) => path,
+                None => view.write(&scene.volume(&detection)?, table, depth, &detection)?,
+            };
             show::print(&format!("{} grasps in {}", detection.grasps.len(), path.display()))?;
         }
         Command::Bench(Bench { scene: args, detect, callers, rate, seconds }) => {
@@ -276,6 +284,7 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             let report = with_progress(seconds, !json, report).await;
             show::print(&if json { show::report_json(&report) } else { show::report(&report) })?;
         }
+        Command::Table(table) => table.run(json)?,
         Command::Models => {
             let models = connect().await?.list_models().await?;
             show::print(&if json { show::models_json(&models) } else { show::models(&models) })?;

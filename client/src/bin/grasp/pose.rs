@@ -2,13 +2,69 @@
 
 use std::fs::File;
 use std::io::BufReader;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
 use anyhow::{Context, bail, ensure};
-use nalgebra::{Isometry3, Matrix3, Matrix4, Quaternion, Rotation3, Translation3, UnitQuaternion};
+use nalgebra::{Isometry3, Matrix3, Matrix4, Quaternion, Rotation3, Translation3, UnitQuaternion, Vector3};
 use serde_json::Value;
 
 use crate::files::{self, has_extension, in_file};
+use crate::numbers::Numbers;
+
+/// Poses as given on the command line: the numbers of one pose, or a file.
+#[derive(Clone, Debug)]
+pub(crate) enum Poses {
+    Numbers(Isometry3<f64>),
+    File(PathBuf),
+}
+
+impl FromStr for Poses {
+    type Err = String;
+
+    /// X,Y,Z or X,Y,Z,QX,QY,QZ,QW; anything else is a file.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let pose = |position: [f64; 3], [x, y, z, w]: [f64; 4]| {
+            let rotation = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-6);
+            let rotation = rotation.ok_or("the norm of the quaternion is 0; it must be 1")?;
+            Ok(Self::Numbers(Isometry3::from_parts(Translation3::from(Vector3::from(position)), rotation)))
+        };
+        if let Ok(Numbers(position)) = text.parse::<Numbers<3>>() {
+            pose(position, [0.0, 0.0, 0.0, 1.0])
+        } else if let Ok(Numbers([x, y, z, qx, qy, qz, qw])) = text.parse::<Numbers<7>>() {
+            pose([x, y, z], [qx, qy, qz, qw])
+        } else {
+            Ok(Self::File(PathBuf::from(text)))
+        }
+    }
+}
+
+impl Poses {
+    /// The file, if they are in one.
+    pub fn file(&self) -> Option<&PathBuf> {
+        match self {
+            Self::Numbers(_) => None,
+            Self::File(path) => Some(path),
+        }
+    }
+
+    /// The only pose.
+    pub fn one(&self) -> anyhow::Result<Isometry3<f64>> {
+        match self {
+            Self::Numbers(pose) => Ok(*pose),
+            Self::File(path) => one(path),
+        }
+    }
+
+    /// One pose for each of `count` inputs; `inputs` names them in the error.
+    pub fn each(&self, count: usize, inputs: &str) -> anyhow::Result<Vec<Isometry3<f64>>> {
+        match self {
+            Self::Numbers(pose) if count == 1 => Ok(vec![*pose]),
+            Self::Numbers(_) => bail!("the numbers of 1 pose for {count} {inputs}; give a file with one pose for each"),
+            Self::File(path) => each(path, count, inputs),
+        }
+    }
+}
 
 /// The only pose of a file.
 pub(crate) fn one(path: &Path) -> anyhow::Result<Isometry3<f64>> {
@@ -19,7 +75,7 @@ pub(crate) fn one(path: &Path) -> anyhow::Result<Isometry3<f64>> {
 }
 
 /// One pose for each of `count` inputs; `inputs` names them in the error.
-pub(crate) fn each(path: &Path, count: usize, inputs: &str) -> anyhow::Result<Vec<Isometry3<f64>>> {
+fn each(path: &Path, count: usize, inputs: &str) -> anyhow::Result<Vec<Isometry3<f64>>> {
     let poses = in_file(path, poses)?;
     ensure!(
         poses.len() == count,
@@ -30,9 +86,21 @@ pub(crate) fn each(path: &Path, count: usize, inputs: &str) -> anyhow::Result<Ve
     Ok(poses)
 }
 
-/// The nine numbers of an intrinsic matrix in row-major order.
-pub(crate) fn intrinsics(path: &Path) -> anyhow::Result<[f64; 9]> {
-    in_file(path, matrix_k)
+/// The nine numbers of an intrinsic matrix in row-major order: FX,FY,CX,CY, nine numbers, or a file.
+pub(crate) fn intrinsics(text: &str) -> anyhow::Result<[f64; 9]> {
+    if let Ok(Numbers([fx, fy, cx, cy])) = text.parse::<Numbers<4>>() {
+        return Ok([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]);
+    }
+    if let Ok(Numbers(k)) = text.parse::<Numbers<9>>() {
+        return Ok(k);
+    }
+    in_file(Path::new(text), matrix_k)
+}
+
+/// The file of intrinsics, if they are in one.
+pub(crate) fn intrinsics_file(text: &str) -> Option<PathBuf> {
+    let is_numbers = text.split(',').all(|number| number.trim().parse::<f64>().is_ok());
+    (!is_numbers).then(|| PathBuf::from(text))
 }
 
 /// The numbers of a .npy file.
@@ -54,18 +122,35 @@ fn flat(value: &Value) -> Vec<f64> {
 }
 
 fn matrix_k(path: &Path) -> anyhow::Result<[f64; 9]> {
-    let numbers = if has_extension(path, "npy") {
-        numbers(path)?
-    } else {
-        let value = json(path)?;
-        let k = ["k", "K"].iter().find_map(|key| value.get(key)).unwrap_or(&value);
-        flat(k)
-    };
+    let numbers =
+        if has_extension(path, "npy") { numbers(path)? } else { intrinsic_numbers(&std::fs::read_to_string(path)?)? };
     let count = numbers.len();
     numbers
         .try_into()
         .ok()
         .with_context(|| format!("{count} numbers in the file; an intrinsic matrix has nine, in row-major order"))
+}
+
+/// The numbers of an intrinsic matrix in JSON or YAML, in row-major order.
+fn intrinsic_numbers(text: &str) -> anyhow::Result<Vec<f64>> {
+    // YAML includes JSON. `rostopic echo` separates messages by `---`.
+    let first = text.trim_start_matches("---").split("\n---").next().unwrap_or_default();
+    let value: Value = serde_saphyr::from_str(first).context("neither JSON nor YAML")?;
+    // ROS's CameraInfo and calibration file, librealsense and Open3D.
+    let of_ros = value.get("camera_matrix").and_then(|matrix| matrix.get("data"));
+    if let Some(k) = ["k", "K"].iter().find_map(|key| value.get(key)).or(of_ros) {
+        return Ok(flat(k));
+    }
+    if let Some(columns) = value.get("intrinsic").unwrap_or(&value).get("intrinsic_matrix") {
+        // Column by column.
+        let numbers = flat(columns);
+        return Ok((0..numbers.len()).map(|i| numbers[i % 3 * 3 + i / 3]).collect());
+    }
+    let number = |names: [&str; 2]| names.iter().find_map(|name| value.get(name)?.as_f64());
+    if let [Some(fx), Some(fy), Some(cx), Some(cy)] = [["fx"; 2], ["fy"; 2], ["cx", "ppx"], ["cy", "ppy"]].map(number) {
+        return Ok(vec![fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]);
+    }
+    Ok(flat(&value))
 }
 
 fn poses(path: &Path) -> anyhow::Result<Vec<Isometry3<f64>>> {
@@ -108,4 +193,50 @@ fn matrices(numbers: &[f64]) -> anyhow::Result<Vec<Isometry3<f64>>> {
         Ok(Isometry3::from_parts(Translation3::new(numbers[3], numbers[7], numbers[11]), rotation))
     };
     numbers.chunks(16).map(pose).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Point3;
+
+    use super::*;
+
+    const K: [f64; 9] = [540.0, 0.0, 320.0, 0.0, 541.0, 240.0, 0.0, 0.0, 1.0];
+
+    #[test]
+    fn intrinsics_are_read_in_the_formats_of_other_tools() {
+        let texts = [
+            r#"{"k": [540, 0, 320, 0, 541, 240, 0, 0, 1]}"#,
+            "[[540, 0, 320], [0, 541, 240], [0, 0, 1]]",
+            // ROS 2, ROS 1, the calibration file of camera_calibration.
+            "header:\n  frame_id: camera\nk:\n- 540.0\n- 0.0\n- 320.0\n- 0.0\n- 541.0\n- 240.0\n- 0.0\n- 0.0\n- 1.0\nr: []\n---\n",
+            "height: 480\nK: [540.0, 0.0, 320.0, 0.0, 541.0, 240.0,\n  0.0, 0.0, 1.0]\nD: [0.1]\n---\nheight: 1\n",
+            "image_width: 640\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [540, 0, 320, 0, 541, 240, 0, 0, 1]\n",
+            // Open3D, column by column, alone and in a PinholeCameraParameters; librealsense.
+            r#"{"width": 640, "height": 480, "intrinsic_matrix": [540, 0, 0, 0, 541, 0, 320, 240, 1]}"#,
+            r#"{"extrinsic": [1], "intrinsic": {"intrinsic_matrix": [540, 0, 0, 0, 541, 0, 320, 240, 1]}}"#,
+            r#"{"width": 640, "fx": 540, "fy": 541, "ppx": 320, "ppy": 240, "coeffs": [0, 0, 0, 0, 0]}"#,
+        ];
+        for text in texts {
+            assert_eq!(intrinsic_numbers(text).unwrap(), K, "{text}");
+        }
+        assert!(intrinsic_numbers("k: [1, 2").is_err());
+        assert_eq!(intrinsics("540, 541,320,240").unwrap(), [540.0, 0.0, 320.0, 0.0, 541.0, 240.0, 0.0, 0.0, 1.0]);
+        assert_eq!(intrinsics("540,0,320,0,541,240,0,0,1").unwrap(), K);
+        assert_eq!(intrinsics_file("540,541,320,240"), None);
+        assert_eq!(intrinsics_file("k,1.json"), Some(PathBuf::from("k,1.json")));
+    }
+
+    #[test]
+    fn poses_are_numbers_or_files() {
+        let Ok(Poses::Numbers(pose)) = "-0.2,-0.28,-0.05".parse() else { panic!("three numbers are a position") };
+        assert_eq!(pose, Isometry3::translation(-0.2, -0.28, -0.05));
+        let Ok(Poses::Numbers(pose)) = "1,2,3, 0,0,2,0".parse() else { panic!("seven numbers are a pose") };
+        assert!((pose * Point3::new(1.0, 0.0, 0.0) - Point3::new(0.0, 2.0, 3.0)).norm() < 1e-12);
+        let Ok(Poses::File(path)) = "corner.json".parse() else { panic!("other texts are files") };
+        assert_eq!(path.to_str(), Some("corner.json"));
+        assert!("1,2,3,0,0,0,0".parse::<Poses>().unwrap_err().contains("the norm of the quaternion is 0"));
+        let error = Poses::Numbers(pose).each(2, "images").unwrap_err().to_string();
+        assert!(error.contains("1 pose for 2 images"), "{error}");
+    }
 }

@@ -1,12 +1,13 @@
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, bail};
 use clap::Args;
 use grasp::{DepthImage, Fusion, Intrinsics, RESOLUTION, View, Volume, WORKSPACE_SIZE, seen_from};
-use grasp_client::{Client, CloudView, Depth, DepthView, Detection, Error, Extrinsics, Options, Workspace};
+use grasp_client::{Client, CloudView, Depth, DepthView, Detection, Error, Extrinsics, FindTable, Options, Workspace};
 use nalgebra::{Isometry3, Point3};
 
 use crate::numbers::Numbers;
+use crate::pose::Poses;
 use crate::{cloud, image, pose, volume};
 
 /// The observation: a volume, depth images with camera poses, or point clouds with camera positions.
@@ -14,8 +15,8 @@ use crate::{cloud, image, pose, volume};
 pub(crate) struct SceneArgs {
     /// Volume, depth images or point clouds. A volume is a .npy file, or a .npz file with one array or an array `grid`:
     /// N×N×N values in [0, 1] (u8: 0 to 255), indexed x, y, z, 0.5 on the surface, 0 if unobserved. With --intrinsics
-    /// the files are depth images: 16-bit PNG or u16 .npy in millimetres, or f32 .npy in metres; 0 and NaN mean no
-    /// reading. With --camera-position they are point clouds: .npy, or .npz with one array or an array `points`, N×3 or
+    /// the files are depth images: PNG, TIFF or .npy with 16 bits per pixel (see --depth-scale), or TIFF or .npy with
+    /// floats in metres; 0 and NaN mean no reading. With --camera-position they are point clouds: .npy, or .npz with one array or an array `points`, N×3 or
     /// H×W×3, metres.
     #[arg(required = true)]
     files: Vec<PathBuf>,
@@ -24,18 +25,39 @@ pub(crate) struct SceneArgs {
     #[arg(long, value_name = "METRES", conflicts_with_all = ["intrinsics", "camera_position"])]
     voxel_size: Option<f64>,
 
-    /// Intrinsic matrix of the cameras: 3×3 .npy, or JSON with the nine numbers `k` of ROS's CameraInfo.
-    #[arg(long, value_name = "FILE", conflicts_with = "camera_position")]
-    intrinsics: Option<PathBuf>,
+    /// Intrinsic matrix of the cameras: 3×3 .npy, JSON or YAML of ROS's CameraInfo, JSON of Open3D or librealsense, or
+    /// the numbers FX,FY,CX,CY.
+    #[arg(long, value_name = "FILE|NUMBERS", conflicts_with = "camera_position")]
+    intrinsics: Option<String>,
+
+    /// Unit of integer depths, metres.
+    #[arg(long, value_name = "METRES", default_value_t = image::MILLIMETRE, requires = "intrinsics")]
+    depth_scale: f32,
 
     /// T_camera_task of each image: 4×4 or N×4×4 .npy, JSON with such matrices, or JSON with poses
-    /// {"position": [x, y, z], "orientation": [x, y, z, w]}.
-    #[arg(long, value_name = "FILE", requires = "intrinsics", conflicts_with = "frame_from_camera")]
-    camera_from_task: Option<PathBuf>,
+    /// {"position": [x, y, z], "orientation": [x, y, z, w]}; of one image also the numbers X,Y,Z or X,Y,Z,QX,QY,QZ,QW.
+    #[arg(
+        long,
+        value_name = "FILE|NUMBERS",
+        requires = "intrinsics",
+        conflicts_with = "frame_from_camera",
+        allow_hyphen_values = true
+    )]
+    camera_from_task: Option<Poses>,
 
     /// T_frame_camera of each image, as hand-eye calibration returns it, instead of T_camera_task. Same formats.
-    #[arg(long, value_name = "FILE", requires = "intrinsics")]
-    frame_from_camera: Option<PathBuf>,
+    /// Default for one image: identity, the grasps are then in the frame of the camera.
+    #[arg(long, value_name = "FILE|NUMBERS", requires = "intrinsics", allow_hyphen_values = true)]
+    frame_from_camera: Option<Poses>,
+
+    /// Find the table in the first depth image, and place the workspace over what stands on it.
+    #[arg(long, requires = "intrinsics", conflicts_with_all = ["workspace", "camera_from_task"])]
+    find_table: bool,
+
+    /// Direction of gravity in the frame of the grasps, for --find-table: the reversed reading of an accelerometer at
+    /// rest. Without it a wall that fills the image is taken for a table.
+    #[arg(long, value_name = "X,Y,Z", requires = "find_table", allow_hyphen_values = true)]
+    gravity: Option<Numbers<3>>,
 
     /// Camera position of a point cloud in the frame of its points, metres: 0,0,0 for points in the camera frame. Give
     /// it once for all point clouds, or once for each.
@@ -43,12 +65,12 @@ pub(crate) struct SceneArgs {
     camera_position: Vec<Numbers<3>>,
 
     /// T_frame_cloud of each point cloud, formats as for --camera-from-task. Default: identity.
-    #[arg(long, value_name = "FILE", requires = "camera_position")]
-    frame_from_cloud: Option<PathBuf>,
+    #[arg(long, value_name = "FILE|NUMBERS", requires = "camera_position", allow_hyphen_values = true)]
+    frame_from_cloud: Option<Poses>,
 
     /// T_frame_task: pose of the workspace's corner, formats as for --camera-from-task. Default: identity.
-    #[arg(long, value_name = "FILE")]
-    workspace: Option<PathBuf>,
+    #[arg(long, value_name = "FILE|NUMBERS", allow_hyphen_values = true)]
+    workspace: Option<Poses>,
 
     /// Name of the frame of the grasps.
     #[arg(long, default_value = "", hide_default_value = true)]
@@ -65,15 +87,11 @@ pub(crate) enum Scene {
 
 impl SceneArgs {
     /// All input files.
-    pub fn files(&self) -> impl Iterator<Item = &PathBuf> {
+    pub fn files(&self) -> impl Iterator<Item = PathBuf> {
         let Self { files, intrinsics, camera_from_task, frame_from_camera, frame_from_cloud, workspace, .. } = self;
-        files
-            .iter()
-            .chain(intrinsics)
-            .chain(camera_from_task)
-            .chain(frame_from_camera)
-            .chain(frame_from_cloud)
-            .chain(workspace)
+        let poses = [camera_from_task, frame_from_camera, frame_from_cloud, workspace].into_iter().flatten();
+        let intrinsics = intrinsics.as_deref().and_then(pose::intrinsics_file);
+        files.iter().cloned().chain(intrinsics).chain(poses.filter_map(Poses::file).cloned())
     }
 
     pub fn frame_id(&self) -> String {
@@ -81,8 +99,9 @@ impl SceneArgs {
     }
 
     pub fn read(&self) -> anyhow::Result<Scene> {
-        let pose = self.workspace.as_deref().map(pose::one).transpose()?.unwrap_or_default();
-        let workspace = Workspace { pose, size: None };
+        let pose = self.workspace.as_ref().map(Poses::one).transpose()?.unwrap_or_default();
+        let find_table = self.find_table.then(|| FindTable { gravity: self.gravity.map(|Numbers(gravity)| gravity) });
+        let workspace = Workspace { pose, size: None, find_table };
         if let Some(intrinsics) = &self.intrinsics {
             return Ok(Scene::Depth(self.images(intrinsics)?, workspace));
         }
@@ -99,17 +118,24 @@ impl SceneArgs {
         Ok(Scene::Volume(Box::new(volume::read(file, self.voxel_size, pose)?)))
     }
 
-    fn images(&self, intrinsics: &Path) -> anyhow::Result<Vec<DepthView>> {
+    fn images(&self, intrinsics: &str) -> anyhow::Result<Vec<DepthView>> {
         let k = pose::intrinsics(intrinsics)?;
-        let (path, direction): (_, fn(Isometry3<f64>) -> Extrinsics) =
+        let of_camera = Poses::Numbers(Isometry3::identity());
+        let (poses, direction): (_, fn(Isometry3<f64>) -> Extrinsics) =
             match (&self.camera_from_task, &self.frame_from_camera) {
-                (Some(path), _) => (path, Extrinsics::CameraFromTask),
-                (None, Some(path)) => (path, Extrinsics::FrameFromCamera),
-                (None, None) => bail!("depth images need --camera-from-task or --frame-from-camera"),
+                (Some(poses), _) => (poses, Extrinsics::CameraFromTask),
+                (None, Some(poses)) => (poses, Extrinsics::FrameFromCamera),
+                (None, None) if self.files.len() == 1 && (self.find_table || self.workspace.is_some()) => {
+                    (&of_camera, Extrinsics::FrameFromCamera)
+                }
+                (None, None) => bail!(
+                    "depth images need --camera-from-task or --frame-from-camera; one image without them needs \
+                     --find-table, or the --workspace in the frame of the camera that `grasp table` finds"
+                ),
             };
-        let poses = pose::each(path, self.files.len(), "images")?;
+        let poses = poses.each(self.files.len(), "images")?;
         let view = |(file, pose): (&PathBuf, Isometry3<f64>)| {
-            let (depth, width, height) = image::read(file)?;
+            let (depth, width, height) = image::read(file, self.depth_scale)?;
             Ok(DepthView { depth, width, height, k, extrinsics: direction(pose) })
         };
         self.files.iter().zip(poses).map(view).collect()
@@ -126,7 +152,7 @@ impl SceneArgs {
             ),
         };
         let poses = match &self.frame_from_cloud {
-            Some(path) => pose::each(path, count, "point clouds")?,
+            Some(poses) => poses.each(count, "point clouds")?,
             None => vec![Isometry3::identity(); count],
         };
         let view = |((file, Numbers(camera_position)), frame_from_cloud): ((&PathBuf, _), _)| {
@@ -137,6 +163,14 @@ impl SceneArgs {
 }
 
 impl Scene {
+    /// The first depth image and the pose of the workspace, to draw over an image of that camera.
+    pub fn first_view(&self, detection: &Detection) -> anyhow::Result<(View, Isometry3<f64>)> {
+        let Self::Depth(views, workspace) = self else { bail!("--color needs depth images") };
+        let workspace = found(workspace, detection)?;
+        let view = views.first().context("no depth image")?;
+        Ok((depth_view(view, &workspace), workspace.pose))
+    }
+
     /// Detects grasps in the observation.
     pub async fn detect(&self, client: &Client, options: Options) -> Result<Detection, Error> {
         match self {
@@ -147,15 +181,16 @@ impl Scene {
     }
 
     /// The volume to draw: the given one, or the fused images or points.
-    pub fn volume(&self) -> anyhow::Result<Volume> {
+    pub fn volume(&self, detection: &Detection) -> anyhow::Result<Volume> {
         let (views, workspace) = match self {
             Self::Volume(volume) => return Ok((**volume).clone()),
             Self::Depth(views, workspace) => {
-                (views.iter().map(|view| depth_view(view, workspace)).collect(), workspace)
+                let workspace = found(workspace, detection)?;
+                (views.iter().map(|view| depth_view(view, &workspace)).collect(), workspace)
             }
             Self::Clouds(views, workspace) => {
                 let views = views.iter().map(|view| rendered_view(view, workspace));
-                (views.collect::<anyhow::Result<Vec<_>>>()?, workspace)
+                (views.collect::<anyhow::Result<Vec<_>>>()?, *workspace)
             }
         };
         let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
@@ -166,11 +201,23 @@ impl Scene {
     }
 }
 
-fn depth_view(view: &DepthView, workspace: &Workspace) -> View {
-    let depth = match &view.depth {
+/// The workspace, with the pose that the server found if it searched the table.
+fn found(workspace: &Workspace, detection: &Detection) -> anyhow::Result<Workspace> {
+    let found = detection.table.as_ref().and_then(|table| table.workspace.as_ref());
+    let pose = found.map(|pose| grasp_proto::pose(pose, "table.workspace")).transpose()?;
+    Ok(Workspace { pose: pose.unwrap_or(workspace.pose), ..*workspace })
+}
+
+/// The depths of an image, metres.
+pub(crate) fn metres(depth: &Depth) -> Vec<f32> {
+    match depth {
         Depth::Metres(depth) => depth.clone(),
         Depth::Millimetres(depth) => depth.iter().map(|&depth| f32::from(depth) * 1e-3).collect(),
-    };
+    }
+}
+
+pub(crate) fn depth_view(view: &DepthView, workspace: &Workspace) -> View {
+    let depth = metres(&view.depth);
     let [fx, _, cx, _, fy, cy, ..] = view.k;
     let (width, height) = (view.width as usize, view.height as usize);
     let camera_from_task = match view.extrinsics {

@@ -3,7 +3,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use comfy_table::{Cell, CellAlignment, Table, presets};
-use grasp_client::{Detection, Dropped, GeometryWarning, Latency, Model, Report};
+use grasp_client::{Detection, Dropped, FoundTable, GeometryWarning, Latency, Model, Report};
 use nalgebra::Isometry3;
 use serde_json::{Value, json};
 use tonic::Code;
@@ -35,6 +35,14 @@ pub(crate) fn detection(detection: &Detection) -> String {
         let reasons = reasons(dropped).map(|(reason, voxels)| format!("{} {voxels}", reason.replace('_', " ")));
         text += &format!("dropped: {}\n", reasons.join(", "));
     }
+    if let Some(table) = &detection.table {
+        text += &format!(
+            "table: {:.3} m from the camera, {:.1}° from its optical axis, {:.0} % of the image\n",
+            table.distance,
+            table.angle.to_degrees(),
+            table.share * 100.0
+        );
+    }
     for warning in &detection.warnings {
         text += &format!("warning: {}\n", warning.message);
     }
@@ -64,11 +72,24 @@ pub(crate) fn detection_json(detection: &Detection) -> String {
         "model": detection.model,
         "version": detection.version,
         "grasps": grasps.collect::<Vec<_>>(),
+        "table": detection.table.as_ref().map(table_json),
         "warnings": detection.warnings.iter().map(warning_json).collect::<Vec<_>>(),
         "latency_seconds": object(&stages(&detection.latency).map(|(stage, seconds)| (stage, json!(seconds)))),
         "dropped": detection.dropped.as_ref().map(|d| object(&reasons(d).map(|(reason, n)| (reason, json!(n))))),
     });
     format!("{value:#}")
+}
+
+fn table_json(table: &FoundTable) -> Value {
+    let workspace = table.workspace.as_ref().and_then(|pose| grasp_proto::pose(pose, "table.workspace").ok());
+    json!({
+        "workspace": workspace.as_ref().map(pose),
+        "distance": table.distance,
+        "angle": table.angle,
+        "share": table.share,
+        "deviation": table.deviation,
+        "tilt": table.tilt,
+    })
 }
 
 fn warning_json(warning: &GeometryWarning) -> Value {

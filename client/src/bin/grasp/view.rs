@@ -8,13 +8,15 @@ use grasp_picture::{Color, Mesh, Picture, quality_color};
 use grasp_proto::TABLE_HEIGHT;
 use nalgebra::{Isometry3, Point3, Translation3};
 
+use crate::overlay::Overlay;
 use crate::record;
+use crate::scene::Scene;
 
 /// Width and height of the picture, pixels.
 const SIZE: [usize; 2] = [1200, 900];
 
 /// Number of grasps that are drawn, best first. More would hide each other.
-const SHOWN: usize = 40;
+pub(crate) const SHOWN: usize = 40;
 
 /// Edges of the workspace.
 const EDGE: Color = [170, 170, 170];
@@ -31,9 +33,27 @@ pub(crate) struct ViewArgs {
     /// Output file: a picture (.png), or a recording for Foxglove and Rerun (.mcap).
     #[arg(long, value_name = "FILE", default_value = "grasps.png")]
     out: PathBuf,
+
+    /// Draw the grasps over this colour image, PNG, which is aligned to the first depth image.
+    #[arg(long, value_name = "FILE")]
+    color: Option<PathBuf>,
 }
 
 impl ViewArgs {
+    /// Draws the grasps over the colour image, if one is given. Returns the path of the picture.
+    pub fn write_over_color(
+        &self,
+        scene: &Scene,
+        depth: Option<f64>,
+        detection: &Detection,
+    ) -> anyhow::Result<Option<&Path>> {
+        let Some(color) = &self.color else { return Ok(None) };
+        let (view, pose) = scene.first_view(detection)?;
+        let mut overlay = Overlay::of_color(color, view.intrinsics, view.camera_from_task)?;
+        overlay.grasps(detection, &pose, depth.unwrap_or(FINGER_DEPTH)).save(&self.out)?;
+        Ok(Some(&self.out))
+    }
+
     /// Draws or records the observed surface and the grasps. `table` is the height of the table above the volume's
     /// bottom and `depth` the length of the fingers, metres; `None` means the default.
     pub fn write(
@@ -77,7 +97,7 @@ fn draw(volume: &Volume, mesh: SurfaceMesh, table: f64, depth: f64, detection: &
 }
 
 /// The edges of the workspace, the height of the table on its sides, and the axes of the task frame.
-fn frame(picture: &mut Picture, size: f64, table: f64) {
+pub(crate) fn frame(picture: &mut Picture, size: f64, table: f64) {
     let thickness = size / 300.0;
     let corner = |index: usize| Point3::from([0, 1, 2].map(|axis| if index >> axis & 1 == 1 { size } else { 0.0 }));
     // From each corner along the axes for which it is on the lower side.

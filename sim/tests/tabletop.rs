@@ -1,0 +1,132 @@
+//! The table in depth images of simulated scenes, from cameras in random poses.
+
+use grasp::{DepthImage, Intrinsics, NoTabletop, Tabletop, WORKSPACE_SIZE};
+use grasp_sim::TABLE_HEIGHT;
+use grasp_sim::benchmark::Benchmark;
+use grasp_sim::camera::{View, Views, look};
+use grasp_sim::objects::{ObjectSet, Split};
+use grasp_sim::physics::World;
+use grasp_sim::scene::SceneKind;
+use nalgebra::{Isometry3, Point3, Unit, Vector3};
+use rand::{Rng, RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// Scenes, each with a view from a random camera.
+fn scenes(views: &Views) -> Vec<(World, View, ChaCha8Rng)> {
+    let kinds = [(SceneKind::Packed, Split::PackedTest), (SceneKind::Pile, Split::PileTest)];
+    let of_kind = |(kind, split)| {
+        let objects = ObjectSet::procedural(split);
+        let bench = Benchmark { kind, objects, count: 5, views: views.clone(), noise: 0.0, rounds: 12, seed: 11 };
+        (0..bench.rounds).map(move |number| {
+            let (world, mut rng) = bench.scene(number);
+            let camera = bench.views.sample(&mut rng);
+            let view = look(&world, &camera).remove(0);
+            (world, view, rng)
+        })
+    };
+    kinds.into_iter().flat_map(of_kind).collect()
+}
+
+/// The noise of a stereo camera: errors that grow with the square of the depth, in steps, holes at the edges of objects,
+/// and flying pixels between them and what is behind.
+fn add_stereo_noise(view: &mut View, rng: &mut impl Rng) {
+    let width = Intrinsics::BENCHMARK.width;
+    let clean = view.depth.clone();
+    for (index, depth) in view.depth.iter_mut().enumerate() {
+        let behind = clean.get(index + 2).filter(|_| index % width + 2 < width).copied().unwrap_or(*depth);
+        let edge = (behind - *depth).abs() > 0.02;
+        *depth = if rng.random_bool(if edge { 0.5 } else { 0.02 }) {
+            0.0
+        } else if edge {
+            rng.random_range(depth.min(behind)..=depth.max(behind))
+        } else {
+            // A disparity of a fifth of a pixel, at a baseline of 50 mm and a focal length of 540 pixels.
+            let step = *depth * *depth / (540.0 * 0.05) * 0.2;
+            ((*depth + step * rng.random_range(-1.0..1.0)) / step).round() * step
+        };
+    }
+}
+
+fn found(view: &View, gravity: Option<Unit<Vector3<f64>>>) -> Result<Tabletop, NoTabletop> {
+    Tabletop::find(&DepthImage::new(Intrinsics::BENCHMARK, &view.depth).unwrap(), gravity, TABLE_HEIGHT)
+}
+
+/// Height error of the table, metres, and tilt, radians, of a found workspace.
+fn errors(table: &Tabletop, view: &View) -> (f64, f64) {
+    let true_from_found = view.camera_from_task.inverse() * table.camera_from_task;
+    let middle = true_from_found * Point3::new(WORKSPACE_SIZE / 2.0, WORKSPACE_SIZE / 2.0, TABLE_HEIGHT);
+    ((middle.z - TABLE_HEIGHT).abs(), (true_from_found.rotation * Vector3::z()).angle(&Vector3::z()))
+}
+
+#[test]
+fn the_table_is_found_from_any_camera_and_the_workspace_holds_the_objects() {
+    let scenes = scenes(&Views::Random(1..=1));
+    let (count, mut all_inside) = (2 * scenes.len(), 0);
+    for (number, (world, mut view, mut rng)) in scenes.into_iter().enumerate() {
+        let down = Unit::new_normalize(view.camera_from_task * -Vector3::z());
+        let clean = found(&view, None).unwrap();
+        let (height, tilt) = errors(&clean, &view);
+        assert!(height < 0.002 && tilt.to_degrees() < 0.3, "scene {number}: {height} m, {tilt}, {clean:?}");
+        add_stereo_noise(&mut view, &mut rng);
+        for gravity in [None, Some(down)] {
+            let table = found(&view, gravity).unwrap();
+            let (height, tilt) = errors(&table, &view);
+            assert!(height < 0.005 && tilt.to_degrees() < 1.0, "scene {number}: {height} m, {tilt}, {table:?}");
+            let true_from_found = view.camera_from_task.inverse() * table.camera_from_task;
+            let inside = |at: Point3<f64>| {
+                let at = true_from_found.inverse() * at;
+                at.coords.xy().iter().all(|c| (0.0..WORKSPACE_SIZE).contains(c))
+            };
+            let objects = world.objects().iter().map(|body| world.pose(body.id).translation.vector.into());
+            let outside = objects.filter(|at| !inside(*at)).count();
+            assert!(outside <= 1, "scene {number}: {outside} objects are outside");
+            all_inside += usize::from(outside == 0);
+            assert_eq!(table.tilt.is_some(), gravity.is_some());
+        }
+    }
+    assert!(all_inside * 10 >= count * 9, "all objects are inside in {all_inside} of {count}");
+}
+
+#[test]
+fn gravity_tells_a_wall_from_the_table() {
+    // Seen from the side, the wall of the next room is larger than the table.
+    for (_, mut view, _) in scenes(&Views::Side { azimuth: 0.0 }).into_iter().take(4) {
+        let down = Unit::new_normalize(view.camera_from_task * -Vector3::z());
+        let task_from_camera = view.camera_from_task.inverse();
+        let eye = task_from_camera * Point3::origin();
+        let camera = Intrinsics::BENCHMARK;
+        for (index, depth) in view.depth.iter_mut().enumerate() {
+            let (u, v) = ((index % camera.width) as f64, (index / camera.width) as f64);
+            let ray = Vector3::new((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0);
+            let to_wall = ((0.26 - eye.y) / (task_from_camera * ray).y) as f32;
+            if to_wall > 0.0 && (*depth == 0.0 || to_wall < *depth) {
+                *depth = to_wall;
+            }
+        }
+        let table = found(&view, Some(down)).unwrap();
+        let (height, tilt) = errors(&table, &view);
+        assert!(height < 0.005 && tilt.to_degrees() < 1.0, "{height} {tilt} {table:?}");
+    }
+}
+
+#[test]
+fn an_image_without_a_table_is_refused() {
+    let bumps: Vec<f32> = {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let coarse: Vec<f32> = (0..16 * 12).map(|_| rng.random_range(0.3..1.5)).collect();
+        (0..640 * 480).map(|index| coarse[index / 640 / 40 * 16 + index % 640 / 40]).collect()
+    };
+    let view = |depth| View { depth, camera_from_task: Isometry3::identity() };
+    let refused = found(&view(bumps), None).unwrap_err();
+    assert!(matches!(refused, NoTabletop::NoPlane { share, with_gravity: false } if share < 0.12), "{refused:?}");
+    let mut dark = vec![0.0; 640 * 480];
+    dark[..1000].fill(0.5);
+    let refused = found(&view(dark), None).unwrap_err();
+    assert!(matches!(refused, NoTabletop::FewReadings { share } if share < 0.05), "{refused:?}");
+    // A table, but gravity along it.
+    let flat = vec![0.6; 640 * 480];
+    let refused = found(&view(flat.clone()), Some(Vector3::x_axis())).unwrap_err();
+    assert!(refused.to_string().contains("largest level plane near the middle of the image covers 0 %"), "{refused}");
+    let table = found(&view(flat), None).unwrap();
+    assert!((table.distance - 0.6).abs() < 1e-6 && table.angle < 1e-6, "{table:?}");
+}
