@@ -148,6 +148,8 @@ class DetectTest(ServerTest):
         self.assertAlmostEqual(found.workspace.position[2], scene.TABLE - 0.02, delta=0.004)
         with self.assertRaisesRegex(graspd.InvalidArgument, "view.data: the largest level plane"):
             self.client.find_table(view, graspd.Workspace(gravity=(1, 0, 0)))
+        with self.assertRaisesRegex(graspd.InvalidArgument, "table_height is -1, must be from 0 to 0.3 m"):
+            self.client.find_table(view, table_height=-1)
 
     def test_wrong_geometry_is_reported_and_logged_once(self):
         wire.logged.clear()

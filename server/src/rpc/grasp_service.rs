@@ -49,7 +49,7 @@ pub(crate) struct GraspRpc {
 }
 
 /// Views, and the table that determined their workspace.
-type Made = (Vec<View>, Option<pb::FoundTable>);
+type PlacedViews = (Vec<View>, Option<pb::FoundTable>);
 
 /// A call that is queued, or refused with its refusal not yet sent.
 struct PendingCall {
@@ -119,7 +119,7 @@ impl GraspRpc {
     ) -> Result<PendingReply, Refusal> {
         let pb::DetectGraspsFromDepthRequest { mut views, workspace, options, .. } = request;
         let count = views.len();
-        let make_views = move |workspace: &mut Workspace, table: f64, _: f64| -> Result<Made, FieldError> {
+        let make_views = move |workspace: &mut Workspace, table: f64, _: f64| -> Result<PlacedViews, FieldError> {
             let table = workspace.find_table(&mut views, table)?;
             let views = views.iter().enumerate();
             let views = views.map(|(index, view)| depth_view(view, index, &workspace.frame_from_task));
@@ -135,7 +135,7 @@ impl GraspRpc {
     ) -> Result<PendingReply, Refusal> {
         let pb::DetectGraspsFromCloudRequest { views, workspace, options, .. } = request;
         let count = views.len();
-        let make_views = move |workspace: &mut Workspace, _: f64, size: f64| -> Result<Made, FieldError> {
+        let make_views = move |workspace: &mut Workspace, _: f64, size: f64| -> Result<PlacedViews, FieldError> {
             if workspace.find_table {
                 return Err(FieldError::new("workspace.find_table", true, "needs depth images; send those instead"));
             }
@@ -154,7 +154,7 @@ impl GraspRpc {
         workspace: Option<pb::Workspace>,
         options: Option<pb::Options>,
         call: &mut Call,
-        make_views: impl FnOnce(&mut Workspace, f64, f64) -> Result<Made, FieldError> + Send + 'static,
+        make_views: impl FnOnce(&mut Workspace, f64, f64) -> Result<PlacedViews, FieldError> + Send + 'static,
     ) -> Result<PendingReply, Refusal> {
         check_count(count)?;
         let params = DetectParams::try_from(&options.unwrap_or_default())?;
@@ -188,12 +188,14 @@ impl GraspRpc {
         let mut workspace = Workspace::try_from(workspace)?;
         let frame_id = std::mem::take(&mut workspace.frame_id);
         let origin = FrameStamp::checked("workspace.frame_id", frame_id, workspace.stamp)?;
-        let permit = self.fusion_permit(call).await?;
+        // The retry hint of a refusal is that of the default model.
+        let engine = self.models.select("", "", None)?;
+        let permits = (self.conversion_permit(&engine)?, self.fusion_permit(call).await?);
         let find = move || {
             let found = workspace.find_table_in(&mut view, true, height);
             found.map(Some).map_err(|error| error.inside("view").into())
         };
-        let table = blocking(permit, find).await?;
+        let table = blocking(permits, find).await?;
         let FrameStamp { frame_id, stamp } = origin;
         Ok(pb::FindTableResponse { request_id: call.id.clone(), frame_id, stamp, table })
     }

@@ -2,7 +2,7 @@
 
 #![no_main]
 
-use grasp::{DepthImage, Fusion, seen_from};
+use grasp::{DepthImage, Fusion, Tabletop, Warning, seen_from};
 use grasp_proto::{DetectParams, Workspace, cloud_view, depth_view, pb};
 use libfuzzer_sys::fuzz_target;
 use nalgebra::Isometry3;
@@ -31,8 +31,12 @@ fn options(bytes: &[u8]) {
 
 fn depth(bytes: &[u8]) {
     let Ok(request) = pb::DetectGraspsFromDepthRequest::decode(bytes) else { return };
-    let Ok(workspace) = Workspace::try_from(request.workspace.unwrap_or_default()) else { return };
-    for (index, view) in request.views.iter().enumerate() {
+    let Ok(mut workspace) = Workspace::try_from(request.workspace.unwrap_or_default()) else { return };
+    let mut views = request.views;
+    if let Err(error) = workspace.find_table(&mut views, 0.05) {
+        assert!(error.message.starts_with(&*error.field), "{error:?}");
+    }
+    for (index, view) in views.iter().enumerate() {
         check(view, index, &workspace.frame_from_task);
     }
 }
@@ -80,11 +84,16 @@ fn check(view: &pb::DepthView, index: usize, frame_from_task: &Isometry3<f64>) {
 /// Every valid view gives a valid volume, or a reason why nothing was measured.
 fn integrate(view: &grasp::View) {
     let image = DepthImage::new(view.intrinsics, &view.depth).expect("the image was checked");
+    if let Ok(table) = Tabletop::find(&image, None, 0.05) {
+        assert!(table.camera_from_task.translation.vector.iter().all(|c| c.is_finite()), "{table:?}");
+    }
     let mut fusion = Fusion::new(8, 0.3);
+    let _ = fusion.contradicted(&image, &view.camera_from_task);
     if fusion.integrate(&image, &view.camera_from_task) == 0 {
         assert!(!fusion.blind(&image, &view.camera_from_task).to_string().is_empty());
     }
     if let Ok(volume) = fusion.volume(Isometry3::identity()) {
+        let _ = Warning::of_table(&volume, 0.05);
         let mesh = Fusion::of(&volume).mesh();
         assert!(mesh.triangles.iter().flatten().all(|&corner| (corner as usize) < mesh.vertices.len()));
     }
