@@ -82,7 +82,8 @@ pub fn calibration(attempts: &[Attempt]) -> Option<Calibration> {
         let quality = attempt.quality.clamp(1e-4, 1.0 - 1e-4);
         (quality / (1.0 - quality)).ln()
     };
-    let mut weights = Vector2::new(1.0, 0.0);
+    // From here Newton's method converges: the loss is convex, and the start has the right mean.
+    let mut weights = Vector2::new(0.0, ((n + 1.0) / (m + 1.0)).ln());
     for _ in 0..STEPS {
         let (mut gradient, mut curvature) = (Vector2::zeros(), Matrix2::identity() * 1e-9);
         for attempt in attempts {
