@@ -28,14 +28,14 @@ const TOLERANCE: f64 = 0.005;
 const PREFERRED: f64 = 0.5;
 
 impl Table {
-    /// The largest plane of a volume that is less than 45° from level; `None` if no plane has three points. `expected`
+    /// The largest plane of a volume that is less than 45° from level; `None` if none has three points. `expected`
     /// is the height at which a table is expected, metres above the volume's bottom.
     #[must_use]
     pub fn find(volume: &Volume, expected: f64) -> Option<Table> {
         let stride = volume.resolution().div_ceil(COLUMNS);
         let surface = Surface::of(volume, stride);
         let level = Plane { slope: [0.0; 2], offset: expected };
-        let largest = surface.largest_plane()?;
+        let largest = surface.largest_plane().unwrap_or(level);
         let preferred = surface.count(&level) as f64 >= PREFERRED * surface.count(&largest) as f64;
         let plane = surface.refined(if preferred { level } else { largest })?;
         let normal = plane.normal();
