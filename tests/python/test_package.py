@@ -153,7 +153,7 @@ class DetectTest(ServerTest):
 
     def test_wrong_geometry_is_reported_and_logged_once(self):
         wire.logged.clear()
-        view, height = views()[:1], graspd.Options(collision=graspd.CollisionCheck(table_height=0.02))
+        view, height = views()[:1], graspd.Options(collision=graspd.CollisionCheck("off", table_height=0.02))
         self.assertEqual(self.client.detect_from_depth(view, graspd.Workspace()).warnings, ())
         with self.assertLogs("graspd", "WARNING") as logged:
             for _ in range(2):
@@ -292,7 +292,8 @@ class ErrorsTest(ServerTest):
             (lambda: graspd.Pose.from_matrix(pose[:3]), "4 × 4"),
             (lambda: self.client.detect(graspd.Volume(volume, dtype=int)), "is int64, must be float32"),
             (lambda: self.client.detect(graspd.Volume(2 * volume, dtype=np.uint8)), r"in \[0, 1\]"),
-            (lambda: self.client.detect_from_depth([replace(views()[0], depth=depth.astype(int))]), "got int64"),
+            (lambda: self.client.detect_from_depth([replace(views()[0], depth=depth > 0)]), "got bool"),
+            (lambda: self.client.detect_from_depth([replace(views()[0], depth=depth.astype(int) - 1)]), "from 0 to 65535"),
             (lambda: self.client.detect(volume, graspd.Options(collision=never)), "MODE_NEVER"),
             (lambda: graspd.Client("127.0.0.1:1", tls_cert="a.pem"), "must be given together"),
             (lambda: graspd.Client("127.0.0.1:1", token=" "), "token is empty"),

@@ -152,7 +152,7 @@ fn invalid_combinations_of_flags_are_refused_before_files_are_read() {
     assert!(refused("a.npy --camera-position 0,0").contains("must be 3 numbers separated by commas"));
     assert!(refused("a.npy --frame-from-cloud pose.npy").contains("--camera-position <X,Y,Z>"));
     assert!(refused("a.npy --palm 0,0,0,1,1,1").contains("--gripper <OPENING,DEPTH,WIDTH,BREADTH>"));
-    assert!(refused("a.npy --origin parent").contains("--parent-from-grasp <FILE>"));
+    assert!(refused("a.npy --origin parent").contains("--parent-from-grasp <FILE|NUMBERS>"));
 }
 
 #[tokio::test]
