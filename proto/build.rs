@@ -18,6 +18,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         ".grasp.v1.Volume.data",
         ".grasp.v1.DepthView.data",
         ".grasp.v1.CloudView.points",
+        ".grasp.v1.Labels.data",
         ".inference.ModelInferRequest.raw_input_contents",
         ".inference.ModelInferResponse.raw_output_contents",
     ] {

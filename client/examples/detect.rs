@@ -23,6 +23,7 @@ async fn main() -> Result<(), Error> {
         height: HEIGHT,
         k: K,
         extrinsics: Extrinsics::FrameFromCamera(camera_pose()),
+        labels: None,
     };
     // The workspace: a cube of 0.3 m with the axes of the robot's base.
     let workspace = Workspace::default();

@@ -4,6 +4,7 @@ use grasp::Volume;
 use grasp_proto::pb;
 use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::grasp_service_client::GraspServiceClient;
+use nalgebra::Isometry3;
 use tokio::sync::mpsc;
 use tokio::time::{Instant, sleep, timeout_at};
 use tokio_stream::wrappers::ReceiverStream;
@@ -16,7 +17,7 @@ use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
 use crate::access::{Bearer, is_transient};
-use crate::{Access, CloudView, DepthView, Detection, Error, Options, Retry, Workspace};
+use crate::{Access, CloudView, DepthView, Detection, Error, Observation, Options, Retry, Scores, Workspace};
 
 /// Flow-control window, bytes. HTTP/2's default of 64 KiB stalls concurrent large replies.
 const WINDOW: u32 = 4 << 20;
@@ -107,7 +108,8 @@ impl Client {
             || (self.grasps(), message.clone()),
             async |(mut grasps, request)| grasps.detect_grasps(request).await,
         )
-        .await
+        .await?
+        .try_into()
     }
 
     /// Detects grasps in depth images. The server fuses them into the cube `workspace`. Transient failures are retried
@@ -128,7 +130,8 @@ impl Client {
             || (self.grasps(), message.clone()),
             async |(mut grasps, request)| grasps.detect_grasps_from_depth(request).await,
         )
-        .await
+        .await?
+        .try_into()
     }
 
     /// Detects grasps in point clouds, one per camera. The server fuses them into the cube `workspace`. Transient
@@ -149,7 +152,29 @@ impl Client {
             || (self.grasps(), message.clone()),
             async |(mut grasps, request)| grasps.detect_grasps_from_cloud(request).await,
         )
-        .await
+        .await?
+        .try_into()
+    }
+
+    /// Scores the caller's grasps in an observation: `candidates` are `T_frame_grasp`, in the convention of the options.
+    /// Transient failures are retried according to [`Retry`].
+    ///
+    /// # Errors
+    /// [`Error::Refused`] with the status of the last attempt.
+    pub async fn score(
+        &self,
+        observation: Observation<'_>,
+        candidates: &[Isometry3<f64>],
+        options: Options,
+    ) -> Result<Scores, Error> {
+        let timeout = options.timeout;
+        let message = options.score_request(observation, candidates);
+        let response = self.call(
+            timeout,
+            || (self.grasps(), message.clone()),
+            async |(mut grasps, request)| grasps.score_grasps(request).await,
+        );
+        Ok(response.await?.into())
     }
 
     /// Opens a tracked volume: the server keeps it and adds the views of a moving camera to it.
@@ -159,7 +184,16 @@ impl Client {
     pub async fn track(&self, workspace: Workspace) -> Result<Tracking, Error> {
         let (requests, waiting) = mpsc::channel(1);
         let replies = self.grasps().track_grasps(ReceiverStream::new(waiting)).await?.into_inner();
-        Ok(Tracking { requests, replies, workspace: Some(workspace) })
+        Ok(Tracking { requests, replies, workspace: Some(workspace), half_life: None })
+    }
+
+    /// Opens a tracked volume for a scene that moves: the weight of a measurement halves with every `half_life` further
+    /// views, and with every view that contradicts it.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] when the server's limit of tracked volumes is reached.
+    pub async fn track_moving(&self, workspace: Workspace, half_life: f64) -> Result<Tracking, Error> {
+        Ok(Tracking { half_life: Some(half_life), ..self.track(workspace).await? })
     }
 
     /// Detects grasps in each volume of a stream. The results come in the order of the volumes, one per volume. A
@@ -200,12 +234,12 @@ impl Client {
     }
 
     /// Calls the server and retries according to [`Retry`].
-    async fn call<S, M>(
+    async fn call<S, M, R>(
         &self,
         timeout: Option<Duration>,
         message: impl Fn() -> (S, M),
-        call: impl AsyncFn((S, tonic::Request<M>)) -> Result<tonic::Response<pb::DetectGraspsResponse>, Status>,
-    ) -> Result<Detection, Error> {
+        call: impl AsyncFn((S, tonic::Request<M>)) -> Result<tonic::Response<R>, Status>,
+    ) -> Result<R, Error> {
         let mut attempts = 0;
         loop {
             let (service, message) = message();
@@ -214,7 +248,7 @@ impl Client {
                 request.set_timeout(timeout);
             }
             let status = match call((service, request)).await {
-                Ok(response) => return response.into_inner().try_into(),
+                Ok(response) => return Ok(response.into_inner()),
                 Err(status) => status,
             };
             attempts += 1;
@@ -241,6 +275,8 @@ pub struct Tracking {
     replies: Streaming<pb::DetectGraspsStreamResponse>,
     /// `None` once the server has accepted it.
     workspace: Option<Workspace>,
+    /// Half-life of the measurements, views.
+    half_life: Option<f64>,
 }
 
 impl Tracking {
@@ -250,7 +286,7 @@ impl Tracking {
     /// [`Error::Refused`]. An invalid view does not end the tracking. With [`Code::ResourceExhausted`] the views have
     /// been added nevertheless: retry without them.
     pub async fn add(&mut self, views: &[DepthView], options: Options) -> Result<Detection, Error> {
-        let request = options.track_request(views, self.workspace.as_ref());
+        let request = options.track_request(views, self.workspace.as_ref(), self.half_life);
         // If the server has closed the stream, its last reply holds the reason.
         let _ = self.requests.send(request).await;
         let reply = self.replies.message().await?;

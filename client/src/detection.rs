@@ -36,6 +36,8 @@ pub struct DepthView {
     pub k: [f64; 9],
     /// The camera's pose.
     pub extrinsics: Extrinsics,
+    /// Label of the object that each pixel shows, `width * height`; 0 is no object.
+    pub labels: Option<Vec<u16>>,
 }
 
 /// Pixels of a depth image in row-major order: the distance along the optical axis. 0 and NaN mean no reading.
@@ -66,15 +68,31 @@ pub struct CloudView {
     pub frame_from_cloud: Isometry3<f64>,
     /// Position of the camera in the frame of the points, metres.
     pub camera_position: [f64; 3],
+    /// Label of the object of each point; 0 is no object.
+    pub labels: Option<Vec<u16>>,
 }
 
-/// The cube that views are fused into and in which grasps are detected.
+/// An observation of a scene.
+#[derive(Clone, Copy, Debug)]
+pub enum Observation<'a> {
+    /// A truncated signed distance field.
+    Volume(&'a Volume),
+    /// Depth images, which the server fuses into the workspace.
+    Depth(&'a [DepthView], &'a Workspace),
+    /// Point clouds, which the server fuses into the workspace.
+    Clouds(&'a [CloudView], &'a Workspace),
+}
+
+/// The cube that views are fused into and in which grasps are detected, or the part of a table that is covered with such
+/// cubes.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Workspace {
     /// `T_frame_task`: pose of the task frame (origin at a corner of the cube, z up) in the frame `frame_id`.
     pub pose: Isometry3<f64>,
     /// Edge length, metres. `None`: the size that the model was trained with.
     pub size: Option<f64>,
+    /// Lengths along x and y of a larger workspace, metres, which the server covers with cubes. `None`: one cube.
+    pub extent: Option<[f64; 2]>,
     /// Find the table in the first depth image instead of using `pose`.
     pub find_table: Option<FindTable>,
 }
@@ -127,6 +145,44 @@ pub struct Proposal {
     pub retreat: Isometry3<f64>,
     /// Whether the open hand would collide; `None` without a collision check.
     pub collides: Option<bool>,
+    /// Label of the object between the fingers, for views with labels.
+    pub object: Option<u32>,
+    /// Largest opening with which the hand is free of collisions, metres; `None` without a collision check, or if there
+    /// is none.
+    pub open_width: Option<f64>,
+}
+
+/// The scores of the caller's grasps.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scores {
+    /// The id of the request.
+    pub request_id: String,
+    /// One score for each candidate, in their order.
+    pub scores: Vec<pb::Score>,
+    /// Name of the model.
+    pub model: String,
+    /// Version of the model.
+    pub version: String,
+    /// Duration of each stage in the server, seconds.
+    pub latency: pb::Latency,
+    /// Signs that the geometry of the request is wrong.
+    pub warnings: Vec<pb::GeometryWarning>,
+    /// The table that was found, with [`Workspace::find_table`].
+    pub table: Option<pb::FoundTable>,
+}
+
+impl From<pb::ScoreGraspsResponse> for Scores {
+    fn from(response: pb::ScoreGraspsResponse) -> Self {
+        Self {
+            request_id: response.request_id,
+            scores: response.scores,
+            model: response.model,
+            version: response.version,
+            latency: response.latency.unwrap_or_default(),
+            warnings: response.warnings,
+            table: response.table,
+        }
+    }
 }
 
 impl From<&Proposal> for Grasp {
@@ -145,7 +201,8 @@ impl TryFrom<&pb::Grasp> for Proposal {
         };
         let pregrasp = optional(&message.pregrasp, "grasps.pregrasp")?;
         let retreat = optional(&message.retreat, "grasps.retreat")?;
-        Ok(Self { pose, width, quality, pregrasp, retreat, collides: message.collides })
+        let pb::Grasp { collides, object, open_width, .. } = *message;
+        Ok(Self { pose, width, quality, pregrasp, retreat, collides, object, open_width })
     }
 }
 
@@ -174,9 +231,46 @@ impl Options {
         }
     }
 
+    pub(crate) fn score_request(
+        self,
+        observation: Observation<'_>,
+        candidates: &[Isometry3<f64>],
+    ) -> pb::ScoreGraspsRequest {
+        use pb::score_grasps_request::Scene;
+        let candidate = |pose: &Isometry3<f64>| pb::Candidate { pose: Some(pose.into()), width: None };
+        let workspace = |workspace: &Workspace| Some(workspace.message(self.frame_id.clone(), self.stamp));
+        let scene = match observation {
+            Observation::Volume(volume) => {
+                let mut volume = encode(volume, self.dtype, self.frame_id.clone());
+                volume.stamp = self.stamp.map(Into::into);
+                Scene::Volume(volume)
+            }
+            Observation::Depth(views, of_views) => Scene::Depth(pb::DepthViews {
+                views: views.iter().map(Into::into).collect(),
+                workspace: workspace(of_views),
+            }),
+            Observation::Clouds(views, of_views) => Scene::Clouds(pb::CloudViews {
+                views: views.iter().map(Into::into).collect(),
+                workspace: workspace(of_views),
+            }),
+        };
+        pb::ScoreGraspsRequest {
+            request_id: self.request_id,
+            candidates: candidates.iter().map(candidate).collect(),
+            scene: Some(scene),
+            options: Some(self.detect),
+        }
+    }
+
     /// A request with a workspace starts a new volume.
-    pub(crate) fn track_request(self, views: &[DepthView], workspace: Option<&Workspace>) -> pb::TrackGraspsRequest {
+    pub(crate) fn track_request(
+        self,
+        views: &[DepthView],
+        workspace: Option<&Workspace>,
+        half_life: Option<f64>,
+    ) -> pb::TrackGraspsRequest {
         pb::TrackGraspsRequest {
+            half_life: half_life.filter(|_| workspace.is_some()),
             views: views.iter().map(Into::into).collect(),
             workspace: workspace.map(|workspace| workspace.message(self.frame_id, self.stamp)),
             request_id: self.request_id,
@@ -195,6 +289,7 @@ impl Workspace {
             stamp: stamp.map(Into::into),
             find_table: self.find_table.is_some(),
             gravity: gravity.map(|[x, y, z]| pb::Vector3 { x, y, z }),
+            extent: self.extent.map(|[x, y]| pb::Extent { x, y }),
         }
     }
 }
@@ -216,8 +311,19 @@ impl From<&DepthView> for pb::DepthView {
                 Extrinsics::CameraFromTask(pose) => Message::CameraFromTask(pose.into()),
                 Extrinsics::FrameFromCamera(pose) => Message::FrameFromCamera(pose.into()),
             }),
+            labels: view.labels.as_deref().map(labels),
         }
     }
+}
+
+/// Labels with one byte each if all fit.
+fn labels(labels: &[u16]) -> pb::Labels {
+    let narrow: Option<Vec<u8>> = labels.iter().map(|&label| u8::try_from(label).ok()).collect();
+    let (data, label_type) = match narrow {
+        Some(narrow) => (narrow, pb::LabelType::U8),
+        None => (labels.iter().flat_map(|label| label.to_le_bytes()).collect(), pb::LabelType::U16),
+    };
+    pb::Labels { data: data.into(), r#type: label_type.into() }
 }
 
 impl From<&CloudView> for pb::CloudView {
@@ -228,6 +334,7 @@ impl From<&CloudView> for pb::CloudView {
             points: points.into(),
             frame_from_cloud: Some((&view.frame_from_cloud).into()),
             camera_position: Some(pb::Vector3 { x, y, z }),
+            labels: view.labels.as_deref().map(labels),
         }
     }
 }

@@ -18,6 +18,7 @@
 //!     height: 480,
 //!     k,
 //!     extrinsics: Extrinsics::CameraFromTask(camera_from_task),
+//!     labels: None,
 //! };
 //! let detect = DetectOptions { max_grasps: 5, ..DetectOptions::default() };
 //! let detection = client.detect_from_depth(&[view], &Workspace::default(), Options { detect, ..Options::default() }).await?;
@@ -39,10 +40,12 @@ mod local;
 
 pub use access::{Access, Retry, Token};
 pub use client::{Client, Health, Tracking};
-pub use detection::{CloudView, Depth, DepthView, Detection, Extrinsics, FindTable, Options, Proposal, Workspace};
+pub use detection::{
+    CloudView, Depth, DepthView, Detection, Extrinsics, FindTable, Observation, Options, Proposal, Scores, Workspace,
+};
 pub use error::Error;
 pub use grasp_proto::pb::{
-    self, DataType, Dropped, FoundTable, GeometryWarning, Latency, Model, Options as DetectOptions,
+    self, DataType, Dropped, FoundTable, GeometryWarning, Latency, Model, Options as DetectOptions, Score,
 };
 pub use load::{Arrivals, Report, Until, load};
 pub use local::{LocalServer, LocalServerError};

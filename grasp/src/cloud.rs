@@ -2,7 +2,7 @@ use nalgebra::{Isometry3, Point3, Rotation3, Vector3};
 
 use crate::Intrinsics;
 
-/// A depth image with its camera's pose, rendered from a point cloud.
+/// A depth image with its camera's pose.
 #[derive(Clone, Debug)]
 pub struct View {
     /// Intrinsics of the camera.
@@ -11,6 +11,8 @@ pub struct View {
     pub depth: Vec<f32>,
     /// `T_camera_task`.
     pub camera_from_task: Isometry3<f64>,
+    /// Label of the object that each pixel shows, if it is known; 0 is no object.
+    pub labels: Option<Vec<u16>>,
 }
 
 /// Smallest and largest edge of the image, pixels.
@@ -74,7 +76,7 @@ pub fn seen_from(points: &[Point3<f64>], eye: &Point3<f64>, size: f64) -> Option
         }
     }
     let depth: Vec<f32> = sums.iter().map(|&(sum, count)| if count > 0.0 { sum / count } else { 0.0 }).collect();
-    Some(View { intrinsics, depth: filled(&depth, edge), camera_from_task })
+    Some(View { intrinsics, depth: filled(&depth, edge), camera_from_task, labels: None })
 }
 
 /// Fills pixels without depth with the median of their neighbours, if enough of these have depth.

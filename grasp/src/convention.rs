@@ -48,6 +48,12 @@ impl Convention {
             Origin::Parent(parent_from_grasp) => turned * parent_from_grasp.inverse(),
         }
     }
+
+    /// The grasp whose frame in this convention is at `pose`: the inverse of [`pose`](Self::pose).
+    #[must_use]
+    pub fn grasp(&self, pose: &Isometry3<f64>, depth: f64) -> Isometry3<f64> {
+        pose * self.pose(&Isometry3::identity(), depth).inverse()
+    }
 }
 
 /// The motion of the hand after it has closed.
@@ -99,6 +105,11 @@ mod tests {
             converted(Origin::Parent(parent_from_grasp), ClosingAxis::Y),
             parent_from_grasp * Point3::new(0.0, 0.04, 0.05),
         );
+        for origin in [Origin::FingerBase, Origin::Fingertips, Origin::Parent(parent_from_grasp)] {
+            let convention = Convention { origin, closing: ClosingAxis::X };
+            let back = convention.grasp(&convention.pose(&pose, 0.05), 0.05);
+            assert!((back.to_homogeneous() - pose.to_homogeneous()).norm() < 1e-12);
+        }
         same(before(&pose, 0.1), Point3::new(0.0, 0.04, 0.15));
     }
 }

@@ -110,6 +110,32 @@ pub fn decode(volume: &Volume, maps: &Maps, params: &DecodeParams) -> Result<Dec
     }
 }
 
+/// The smoothed quality at the voxels nearest to grasps at `poses`, which are in the frame of the volume's pose; 0 outside
+/// the volume.
+///
+/// # Errors
+/// [`DecodeError`] if the map has the wrong size.
+pub fn quality_at(
+    volume: &Volume,
+    maps: &Maps,
+    poses: &[Isometry3<f64>],
+    params: &DecodeParams,
+) -> Result<Vec<f32>, DecodeError> {
+    let n = volume.resolution();
+    maps.check_quality(n)?;
+    let smooth = gaussian(maps.quality, n, params.sigma, params.radius, f32::MIN_POSITIVE, *PROBABLE.end());
+    let quality = |pose: &Isometry3<f64>| {
+        // The inverse of `grasp_at`.
+        let pose = params.hand.map_or(*pose, |hand| before(pose, FINGER_DEPTH - hand.depth));
+        let position = volume.pose().inverse_transform_point(&pose.translation.vector.into());
+        let cell = position.coords.map(|c| (c / volume.voxel_size() - params.origin.offset()).round());
+        let is_inside = cell.iter().all(|c| (0.0..n as f64).contains(c));
+        let [x, y, z]: [usize; 3] = cell.map(|c| c as usize).into();
+        if is_inside { smooth[(x * n + y) * n + z] } else { 0.0 }
+    };
+    Ok(poses.iter().map(quality).collect())
+}
+
 /// The grasps of at least `threshold`, best first, and the reasons why the other voxels hold none.
 fn candidates(
     volume: &Volume,

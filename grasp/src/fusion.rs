@@ -15,7 +15,8 @@ const NEAR_SURFACE: f32 = 0.98;
 /// Voxels projected per step.
 const LANES: usize = 8;
 
-/// Fuses depth images into a truncated signed distance field over a cube. Every view has the same weight.
+/// Fuses depth images into a truncated signed distance field over a cube. Every view has the same weight, unless the
+/// field [forgets](Self::forgetting).
 ///
 /// Follows Open3D's `UniformTSDFVolume`, which produced the data of VGN and GIGA: a voxel is sampled at its centre, its
 /// pixel is `floor(u + 0.5)`, and the distance is measured along the ray of that pixel.
@@ -25,14 +26,27 @@ pub struct Fusion {
     voxel_size: f64,
     truncation: f32,
     voxels: Vec<Voxel>,
+    /// By this factor the weights of earlier views decrease with each view, if the field forgets.
+    decay: Option<f32>,
 }
 
-/// Signed distance as a fraction of the truncation distance, in [-1, 1], and the number of views that measured it.
+/// Signed distance as a fraction of the truncation distance, in [-1, 1], and the number of views that measured it, or
+/// [`HIDDEN`].
 #[derive(Clone, Copy, Debug, Default)]
 struct Voxel {
     distance: f32,
     weight: f32,
 }
+
+/// Weight of a voxel that no view has measured, and that lies behind a surface in at least one.
+const HIDDEN: f32 = -1.0;
+
+/// Weight below which a field that forgets drops a measurement.
+const FORGOTTEN: f32 = 0.1;
+
+/// Difference between a measurement and the field, as a fraction of the truncation distance, from which they contradict
+/// each other: beyond the noise of depth cameras.
+const CONTRADICTION: f32 = 0.5;
 
 /// Why a view measures no voxel of the workspace.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
@@ -86,7 +100,15 @@ impl Fusion {
             voxel_size,
             truncation: (TRUNCATION_VOXELS * voxel_size) as f32,
             voxels: vec![Voxel::default(); resolution.pow(3)],
+            decay: None,
         }
+    }
+
+    /// The field, which now forgets: the weight of a measurement halves with every `half_life` further views, and with
+    /// every view that contradicts it. So objects that have moved disappear from the field.
+    #[must_use]
+    pub fn forgetting(self, half_life: f64) -> Self {
+        Self { decay: Some(0.5_f64.powf(1.0 / half_life) as f32), ..self }
     }
 
     /// Restores the field from a volume: each voxel above 0 counts as measured by one view.
@@ -100,6 +122,7 @@ impl Fusion {
             voxel_size: volume.voxel_size(),
             truncation: (TRUNCATION_VOXELS * volume.voxel_size()) as f32,
             voxels: volume.values().iter().map(seen).collect(),
+            decay: None,
         }
     }
 
@@ -107,6 +130,8 @@ impl Fusion {
     ///
     /// Returns the number of measured voxels. If it is 0, [`blind`](Self::blind) gives the reason.
     pub fn integrate(&mut self, image: &DepthImage, camera_from_task: &Isometry3<f64>) -> usize {
+        self.fade();
+        let forgets = self.decay.is_some();
         let mut measured = 0;
         let camera = image.intrinsics();
         let (fx, fy) = (camera.fx as f32, camera.fy as f32);
@@ -150,6 +175,7 @@ impl Fusion {
                     // A ray is never shorter than its depth, so most voxels need no square root.
                     let behind = d - z;
                     if behind <= -self.truncation {
+                        voxel.hide();
                         continue;
                     }
                     let sample = if behind >= self.truncation {
@@ -158,17 +184,30 @@ impl Fusion {
                         let (ray_x, ray_y) = ((u as f32 - principal_u) * inv_fx, (v as f32 - principal_v) * inv_fy);
                         let distance = behind * (ray_x * ray_x + ray_y * ray_y + 1.0).sqrt();
                         if distance <= -self.truncation {
+                            voxel.hide();
                             continue;
                         }
                         (distance * inv_truncation).min(1.0)
                     };
-                    voxel.distance = (voxel.distance * voxel.weight + sample) / (voxel.weight + 1.0);
-                    voxel.weight += 1.0;
+                    let weight = if forgets { voxel.supported(sample) } else { voxel.weight.max(0.0) };
+                    voxel.distance = (voxel.distance * weight + sample) / (weight + 1.0);
+                    voxel.weight = weight + 1.0;
                     measured += 1;
                 }
             }
         }
         measured
+    }
+
+    /// Decreases the weights of the earlier views, if the field forgets.
+    fn fade(&mut self) {
+        let Some(decay) = self.decay else { return };
+        for voxel in self.voxels.iter_mut().filter(|voxel| voxel.weight > 0.0) {
+            voxel.weight *= decay;
+            if voxel.weight < FORGOTTEN {
+                *voxel = Voxel::default();
+            }
+        }
     }
 
     /// The reason why a view [measures](Self::integrate) no voxel.
@@ -252,7 +291,8 @@ impl Fusion {
     /// # Errors
     /// [`VolumeError::Empty`] if no surface was observed.
     pub fn volume(&self, pose: Isometry3<f64>) -> Result<Volume, VolumeError> {
-        Volume::new(self.resolution, self.voxel_size, pose, self.values())
+        let hidden = self.voxels.iter().map(|voxel| voxel.weight == HIDDEN).collect();
+        Ok(Volume::new(self.resolution, self.voxel_size, pose, self.values())?.with_hidden(hidden))
     }
 
     /// Voxels along an edge.
@@ -292,6 +332,20 @@ impl Fusion {
 }
 
 impl Voxel {
+    /// Notes that the voxel lies behind a surface.
+    fn hide(&mut self) {
+        if self.weight == 0.0 {
+            self.weight = HIDDEN;
+        }
+    }
+
+    /// The weight of the earlier views, halved if a measurement contradicts them.
+    fn supported(self, sample: f32) -> f32 {
+        let is_free = |distance: f32| distance >= NEAR_SURFACE;
+        let contradicts = is_free(sample) != is_free(self.distance) || (sample - self.distance).abs() > CONTRADICTION;
+        self.weight.max(0.0) * if contradicts { 0.5 } else { 1.0 }
+    }
+
     fn is_near_surface(self) -> bool {
         self.weight > 0.0 && self.distance < NEAR_SURFACE && self.distance >= -NEAR_SURFACE
     }
@@ -360,6 +414,61 @@ mod tests {
         assert!(surface.len() == expected.len() && surface.len() > 500, "{} points", surface.len());
         let worst = surface.iter().zip(&expected).map(|(a, b)| (a.position - b.position).norm()).fold(0.0, f64::max);
         assert!(worst < 1e-6 && surface.iter().all(|point| point.normal.z < -0.99), "{worst}");
+    }
+
+    #[test]
+    fn space_behind_a_surface_is_hidden() {
+        let camera = Intrinsics::BENCHMARK;
+        // The left half of the image shows a wall at z = 0.15, the right half has no measurement.
+        let depth: Vec<f32> = (0..camera.width * camera.height)
+            .map(|pixel| if pixel % camera.width < camera.width / 2 { 0.65 } else { 0.0 })
+            .collect();
+        let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
+        fusion.integrate(&DepthImage::new(camera, &depth).unwrap(), &facing());
+        let volume = fusion.volume(Isometry3::identity()).unwrap();
+        let hidden = |x: usize, z: usize| volume.hidden().unwrap()[(x * 40 + 20) * 40 + z];
+        assert_eq!([5, 19, 22, 25, 38].map(|z| hidden(10, z)), [false, false, false, true, true]);
+        assert!(!hidden(30, 38), "nothing is known where there is no measurement");
+    }
+
+    #[test]
+    fn a_field_that_forgets_drops_what_has_moved() {
+        let camera = Intrinsics::BENCHMARK;
+        let wall = |depth: f32| vec![depth; camera.width * camera.height];
+        let (near, far) = (wall(0.6), wall(0.7));
+        let crossing = |fusion: &Fusion| {
+            let values = fusion.values();
+            let column = &values[(20 * 40 + 20) * 40..][..40];
+            (1..40).filter(|&z| column[z - 1] >= 0.5 && column[z] > 0.0 && column[z] < 0.5).collect::<Vec<_>>()
+        };
+        let fused = |forgets: bool| {
+            let fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
+            let mut fusion = if forgets { fusion.forgetting(10.0) } else { fusion };
+            let mut add = |depth: &[f32], times: usize| {
+                let image = DepthImage::new(camera, depth).unwrap();
+                (0..times).for_each(|_| _ = fusion.integrate(&image, &facing()));
+            };
+            add(&near, 20);
+            add(&far, 6);
+            fusion
+        };
+        // The wall moved from z = 0.1 to z = 0.2, which lies between the voxels 26 and 27.
+        assert_eq!(crossing(&fused(true)), [27]);
+        assert_ne!(crossing(&fused(false)), [27]);
+    }
+
+    #[test]
+    fn a_field_that_forgets_keeps_what_stands_still() {
+        let camera = Intrinsics::BENCHMARK;
+        let depth = vec![0.65; camera.width * camera.height];
+        let image = DepthImage::new(camera, &depth).unwrap();
+        let fused = |mut fusion: Fusion| {
+            (0..10).for_each(|_| _ = fusion.integrate(&image, &facing()));
+            fusion.values()
+        };
+        let fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
+        let (kept, plain) = (fused(fusion.clone().forgetting(5.0)), fused(fusion));
+        assert!(kept.iter().zip(&plain).all(|(a, b)| (a - b).abs() < 1e-4));
     }
 
     #[test]

@@ -85,6 +85,25 @@ impl Hand {
     pub const GPD: Self =
         Self { finger_width: 0.015, outer_diameter: 0.11, depth: FINGER_DEPTH, height: 0.02, ..Self::PANDA };
 
+    /// The hand with boxes that are larger by `margin` on every side.
+    #[must_use]
+    pub fn grown(self, margin: f64) -> Self {
+        let [lower, upper] = self.palm;
+        Self {
+            finger_width: self.finger_width + 2.0 * margin,
+            outer_diameter: self.outer_diameter + 2.0 * margin,
+            depth: self.depth + margin,
+            height: self.height + 2.0 * margin,
+            palm: [lower.map(|c| c - margin), upper.map(|c| c + margin)],
+        }
+    }
+
+    /// The hand opened by less: half of the opening is `half_opening`, metres.
+    #[must_use]
+    pub fn opened_to(self, half_opening: f64) -> Self {
+        Self { outer_diameter: 2.0 * (half_opening + self.finger_width), ..self }
+    }
+
     /// Half of the opening between the fingers, metres.
     #[must_use]
     pub fn half_opening(&self) -> f64 {
@@ -105,10 +124,14 @@ impl Hand {
         let at_fingers = point.x.abs() <= self.height / 2.0
             && (self.half_opening()..=self.outer_diameter / 2.0).contains(&point.y.abs())
             && (-from..=self.depth).contains(&point.z);
+        at_fingers || self.palm_meets_on_way(point, from)
+    }
+
+    /// Whether the palm hits a point of the grasp frame on an approach from `from` metres back.
+    pub(crate) fn palm_meets_on_way(&self, point: &Point3<f64>, from: f64) -> bool {
         let [lower, upper] = self.palm;
-        at_fingers
-            || (0..2).all(|axis| (lower[axis]..=upper[axis]).contains(&point[axis]))
-                && (lower[2] - from..=upper[2]).contains(&point.z)
+        (0..2).all(|axis| (lower[axis]..=upper[axis]).contains(&point[axis]))
+            && (lower[2] - from..=upper[2]).contains(&point.z)
     }
 
     /// Whether a sphere around a point of the grasp frame may contain a point that the hand [meets](Self::meets).

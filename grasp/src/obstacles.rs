@@ -16,12 +16,16 @@ pub struct Clearance {
     pub behind: f32,
     /// Height of the table, metres above the volume's bottom; `None` without a table.
     pub table: Option<f64>,
+    /// Smallest distance between the hand and the obstacles, metres.
+    pub margin: f64,
+    /// Whether voxels that lie behind a surface in every view are obstacles, too.
+    pub hidden: bool,
 }
 
 impl Default for Clearance {
     /// The Panda hand and the pre-grasp distance of the benchmark.
     fn default() -> Self {
-        Self { hand: Hand::PANDA, from: 0.05, behind: 0.25, table: None }
+        Self { hand: Hand::PANDA, from: 0.05, behind: 0.25, table: None, margin: 0.0, hidden: false }
     }
 }
 
@@ -37,26 +41,29 @@ struct Block {
     points: Vec<Point3<f64>>,
 }
 
-/// Obstacles for the hand: voxels at or behind the observed surfaces of a volume, and the table. Unobserved space
-/// counts as free.
+/// Obstacles for the hand: voxels at or behind the observed surfaces of a volume, the table, and on request the hidden
+/// voxels. Other unobserved space counts as free.
 #[derive(Clone, Debug)]
 pub struct Obstacles {
     clearance: Clearance,
+    /// The hand, grown by the margin.
+    hand: Hand,
     blocks: Vec<Block>,
     /// Pose of the volume.
     pose: Isometry3<f64>,
 }
 
 impl Obstacles {
-    /// The obstacles in `volume`.
+    /// The obstacles in `volume`. Hidden voxels are known only in a volume that was fused from views.
     #[must_use]
     pub fn observed(volume: &Volume, clearance: Clearance) -> Self {
         let (n, size) = (volume.resolution(), volume.voxel_size());
         let behind = 0.5 - clearance.behind / 2.0;
         let place = |cell: [f64; 3]| volume.pose() * Point3::from(cell.map(|c| c * size));
         let mut blocks = BTreeMap::<[usize; 3], Vec<Point3<f64>>>::new();
+        let hidden = volume.hidden().filter(|_| clearance.hidden);
         for (index, &value) in volume.values().iter().enumerate() {
-            if value > 0.0 && value <= behind {
+            if value > 0.0 && value <= behind || hidden.is_some_and(|hidden| hidden[index]) {
                 let cell = [index / (n * n), index / n % n, index % n];
                 blocks.entry(cell.map(|c| c / BLOCK)).or_default().push(place(cell.map(|c| c as f64 + 0.5)));
             }
@@ -66,24 +73,63 @@ impl Obstacles {
             radius: 0.5 * 3.0_f64.sqrt() * BLOCK as f64 * size,
             points,
         };
-        Self { clearance, blocks: blocks.into_iter().map(block).collect(), pose: *volume.pose() }
+        let hand = clearance.hand.grown(clearance.margin);
+        Self { clearance, hand, blocks: blocks.into_iter().map(block).collect(), pose: *volume.pose() }
     }
 
     /// Whether the open hand collides on its way from the pre-grasp to `pose` (frame of the volume's pose).
     #[must_use]
     pub fn meet(&self, pose: &Isometry3<f64>) -> bool {
-        let Clearance { hand, from, table, .. } = self.clearance;
-        // The motion is straight, so the lowest point is at one of its ends.
-        let low =
-            |pose: &Isometry3<f64>| table.is_some_and(|table| hand.lowest_point(&(self.pose.inverse() * pose)) < table);
-        if low(pose) || low(&before(pose, from)) {
-            return true;
+        self.meet_table(pose, &self.hand) || self.near(pose).any(|point| self.hand.meets(&point, self.clearance.from))
+    }
+
+    /// The largest opening with which the hand is free of collisions on its way to `pose`, metres: at most that of the
+    /// hand, and more than `width`, the size of the object. `None` if there is none.
+    #[must_use]
+    pub fn opening(&self, pose: &Isometry3<f64>, width: f64) -> Option<f64> {
+        let Clearance { hand: of_request, from, margin, .. } = self.clearance;
+        let (breadth, thickness) = (self.hand.height / 2.0, self.hand.finger_width);
+        // Distances from the middle of the hand of the points that the fingers meet at some opening.
+        let mut blocking = Vec::new();
+        for point in self.near(pose) {
+            if self.hand.palm_meets_on_way(&point, from) {
+                return None;
+            }
+            if point.x.abs() <= breadth && (-from..=self.hand.depth).contains(&point.z) {
+                blocking.push(point.y.abs());
+            }
         }
+        blocking.sort_by(|a, b| b.total_cmp(a));
+        let mut inner = self.hand.half_opening();
+        for distance in blocking {
+            if distance >= inner && distance <= inner + thickness {
+                // Just free of this point.
+                inner = distance - thickness - 1e-6;
+            }
+        }
+        let half = inner + margin;
+        let is_free = 2.0 * half > width && !self.meet_table(pose, &of_request.opened_to(half).grown(margin));
+        is_free.then_some(2.0 * half)
+    }
+
+    /// Whether the hand meets the table on its way to `pose`.
+    fn meet_table(&self, pose: &Isometry3<f64>, hand: &Hand) -> bool {
+        let Clearance { from, table, .. } = self.clearance;
+        // The motion is straight, so the lowest point is at one of its ends.
+        let is_low =
+            |pose: &Isometry3<f64>| table.is_some_and(|table| hand.lowest_point(&(self.pose.inverse() * pose)) < table);
+        is_low(pose) || is_low(&before(pose, from))
+    }
+
+    /// The obstacles near the hand on its way to `pose`, in the frame of the hand.
+    fn near(&self, pose: &Isometry3<f64>) -> impl Iterator<Item = Point3<f64>> {
+        let from = self.clearance.from;
         // A matrix rotates the thousands of points faster than a quaternion.
         let turn = pose.rotation.inverse().to_rotation_matrix();
-        let in_hand = |point: &Point3<f64>| Point3::from(turn * (point.coords - pose.translation.vector));
-        let near = |block: &&Block| hand.comes_near(&in_hand(&block.centre), from, block.radius);
-        self.blocks.iter().filter(near).flat_map(|block| &block.points).any(|point| hand.meets(&in_hand(point), from))
+        let origin = pose.translation.vector;
+        let in_hand = move |point: &Point3<f64>| Point3::from(turn * (point.coords - origin));
+        let is_near = move |block: &&Block| self.hand.comes_near(&in_hand(&block.centre), from, block.radius);
+        self.blocks.iter().filter(is_near).flat_map(|block| &block.points).map(in_hand)
     }
 }
 
@@ -162,6 +208,43 @@ mod tests {
             !meet(Some(0.06), &up) && meet(Some(0.07), &up),
             "the back of the palm is 0.088 m below the base, and 0.05 m lower at the pre-grasp"
         );
+    }
+
+    #[test]
+    fn hidden_voxels_are_obstacles_on_request() {
+        // The wall is 0.03 m thick in the volume; what is behind is hidden.
+        let hidden = (0..N.pow(3)).map(|index| index / (N * N) >= 24).collect();
+        let volume = wall().with_hidden(hidden);
+        let meet =
+            |hidden, x| Obstacles::observed(&volume, Clearance { hidden, ..Clearance::default() }).meet(&down(x, 0.15));
+        assert!(!meet(false, 0.3) && meet(true, 0.3), "the palm reaches 0.1 m to each side");
+        assert!(!meet(true, 0.04));
+    }
+
+    #[test]
+    fn a_margin_keeps_the_hand_away_from_surfaces() {
+        let meet = |margin, x| {
+            let clearance = Clearance { behind: 0.0, margin, ..Clearance::default() };
+            Obstacles::observed(&wall(), clearance).meet(&down(x, 0.15))
+        };
+        // The first voxel of the wall is at 0.15375.
+        assert!(!meet(0.0, 0.05) && !meet(0.003, 0.05) && meet(0.005, 0.05));
+    }
+
+    #[test]
+    fn the_hand_is_opened_as_far_as_obstacles_permit() {
+        let hand = Hand { palm: [[-0.03, -0.03, -0.088], [0.03, 0.03, 0.004]], ..Hand::PANDA };
+        let opening = |margin, x, width| {
+            let clearance = Clearance { hand, behind: 0.0, margin, table: Some(0.05), ..Clearance::default() };
+            Obstacles::observed(&wall(), clearance).opening(&down(x, 0.15), width)
+        };
+        let is_near = |opening: Option<f64>, expected| opening.is_some_and(|o| f64::abs(o - expected) < 1e-5);
+        assert!(is_near(opening(0.0, 0.05, 0.02), 0.08), "nothing is near");
+        // The first voxel of the wall is at 0.15375, and a finger is 0.0264 thick.
+        assert!(is_near(opening(0.0, 0.1, 0.02), 2.0 * (0.05375 - 0.0264)));
+        assert!(is_near(opening(0.005, 0.1, 0.02), 2.0 * (0.05375 - 0.0264 - 0.005)));
+        assert_eq!(opening(0.0, 0.1, 0.06), None, "the object is wider");
+        assert_eq!(opening(0.0, 0.14, 0.02), None, "the palm meets the wall");
     }
 
     #[test]

@@ -2,7 +2,7 @@ use std::ops::AddAssign;
 
 use nalgebra::Isometry3;
 
-use crate::{Constraints, DecodeParams, Grasp, Hand, Obstacles, Violation, Volume};
+use crate::{Constraints, DecodeParams, Grasp, Hand, ObjectMap, Obstacles, Violation, Volume};
 
 /// Numbers of dropped voxels, each counted once, under the first reason that applied in this order.
 ///
@@ -23,6 +23,8 @@ pub struct Dropped {
     pub approach: usize,
     /// The hand is below the requested height.
     pub height: usize,
+    /// Not on an object that is wanted.
+    pub object: usize,
     /// The open hand collides with an observed surface or the table.
     pub collision: usize,
     /// Suppressed by a better grasp nearby.
@@ -38,6 +40,7 @@ impl AddAssign for Dropped {
         self.region += other.region;
         self.approach += other.approach;
         self.height += other.height;
+        self.object += other.object;
         self.collision += other.collision;
         self.suppressed += other.suppressed;
     }
@@ -62,17 +65,19 @@ impl Decoded {
 }
 
 /// Checks on grasps besides their quality.
-pub(crate) struct Selection {
+pub(crate) struct Selection<'a> {
     constraints: Constraints,
     hand: Hand,
+    objects: Option<&'a ObjectMap>,
     obstacles: Option<Obstacles>,
 }
 
-impl Selection {
-    pub fn new(volume: &Volume, params: &DecodeParams) -> Self {
+impl<'a> Selection<'a> {
+    pub fn new(volume: &'a Volume, params: &DecodeParams) -> Self {
         Self {
             constraints: params.constraints,
             hand: params.hand.unwrap_or(Hand::PANDA),
+            objects: volume.objects(),
             obstacles: params.clearance.map(|clearance| Obstacles::observed(volume, clearance)),
         }
     }
@@ -83,6 +88,7 @@ impl Selection {
             Some(Violation::Region) => &mut dropped.region,
             Some(Violation::Approach) => &mut dropped.approach,
             Some(Violation::Height) => &mut dropped.height,
+            None if self.objects.is_some_and(|objects| !objects.admits(pose, &self.hand)) => &mut dropped.object,
             None if self.obstacles.as_ref().is_some_and(|obstacles| obstacles.meet(pose)) => &mut dropped.collision,
             None => return true,
         };

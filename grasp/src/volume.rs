@@ -1,5 +1,9 @@
+use std::sync::Arc;
+
 use nalgebra::Isometry3;
 use thiserror::Error;
+
+use crate::{ObjectMap, Region};
 
 /// A validated truncated signed distance field over a cube: the input of a network.
 ///
@@ -12,6 +16,8 @@ pub struct Volume {
     voxel_size: f64,
     pose: Isometry3<f64>,
     values: Vec<f32>,
+    hidden: Option<Vec<bool>>,
+    objects: Option<Arc<ObjectMap>>,
 }
 
 /// Why an array is not a valid [`Volume`].
@@ -98,7 +104,18 @@ impl Volume {
         if values.iter().fold(true, |zero, &v| zero & (v == 0.0)) {
             return Err(VolumeError::Empty);
         }
-        Ok(Self { resolution, voxel_size, pose, values })
+        Ok(Self { resolution, voxel_size, pose, values, hidden: None, objects: None })
+    }
+
+    /// The volume with the voxels that lie behind a surface in every view.
+    pub(crate) fn with_hidden(self, hidden: Vec<bool>) -> Self {
+        Self { hidden: Some(hidden), ..self }
+    }
+
+    /// The volume with the objects in it.
+    #[must_use]
+    pub fn with_objects(self, objects: Option<Arc<ObjectMap>>) -> Self {
+        Self { objects, ..self }
     }
 
     /// Voxels along an edge.
@@ -123,6 +140,37 @@ impl Volume {
     #[must_use]
     pub fn values(&self) -> &[f32] {
         &self.values
+    }
+
+    /// For each voxel, whether it lies behind a surface in a view and was measured by none. `None` if the volume was
+    /// not fused from views.
+    #[must_use]
+    pub fn hidden(&self) -> Option<&[bool]> {
+        self.hidden.as_deref()
+    }
+
+    /// The region whose points are at least `margin` from the vertical sides, metres.
+    #[must_use]
+    pub fn within(&self, margin: f64) -> Region {
+        let size = self.resolution as f64 * self.voxel_size;
+        Region { frame: self.pose, lower: [margin, margin, 0.0], upper: [size - margin, size - margin, size] }
+    }
+
+    /// Whether surfaces were observed higher than `height`, metres above the bottom.
+    #[must_use]
+    pub fn has_surface_above(&self, height: f64) -> bool {
+        /// Fewer voxels behind a surface are noise.
+        const FEWEST: usize = 4;
+        let first = (height / self.voxel_size + 0.5).max(0.0) as usize;
+        let columns = self.values.chunks_exact(self.resolution);
+        let behind = columns.flat_map(|column| column.iter().skip(first)).filter(|value| (1e-6..0.5).contains(*value));
+        behind.take(FEWEST).count() == FEWEST
+    }
+
+    /// The objects in the volume, if they are known.
+    #[must_use]
+    pub fn objects(&self) -> Option<&ObjectMap> {
+        self.objects.as_deref()
     }
 }
 

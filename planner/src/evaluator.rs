@@ -70,8 +70,7 @@ impl Evaluator {
         let Decoded { mut grasps, mut dropped } = proposals;
         dropped.suppressed += grasps.len().saturating_sub(PROPOSALS);
         grasps.truncate(PROPOSALS);
-        // The hand of the evaluator's training has its fingertips at `FINGER_DEPTH`.
-        let depth = params.hand.map_or(FINGER_DEPTH, |hand| hand.depth);
+        let depth = depth(params);
         self.evaluate(&mut grasps, volume, depth)?;
         sort(&mut grasps);
         let mut moving: Vec<usize> = (0..REFINED.min(grasps.len())).collect();
@@ -96,17 +95,48 @@ impl Evaluator {
         Ok(decoded)
     }
 
+    /// The predicted probabilities of success of grasps at `poses`.
+    ///
+    /// # Errors
+    /// [`RuntimeError`] if the classifier fails.
+    pub fn score(
+        &mut self,
+        poses: &[Isometry3<f64>],
+        volume: &Volume,
+        params: &DecodeParams,
+    ) -> Result<Vec<f32>, RuntimeError> {
+        self.probabilities(poses.len(), |index| poses[index], volume, depth(params))
+    }
+
     /// Replaces the quality of each grasp by the predicted probability of success.
     fn evaluate(&mut self, grasps: &mut [Grasp], volume: &Volume, depth: f64) -> Result<(), RuntimeError> {
-        let of_training_hand = Translation3::new(0.0, 0.0, depth - FINGER_DEPTH);
-        let scores = self.classifier.score(grasps.len(), |index, patch| {
-            Patch::write(volume, &(grasps[index].pose * of_training_hand), patch);
-        })?;
-        for (grasp, score) in grasps.iter_mut().zip(scores) {
-            grasp.quality = 1.0 / (1.0 + (-score).exp());
+        let qualities = self.probabilities(grasps.len(), |index| grasps[index].pose, volume, depth)?;
+        for (grasp, quality) in grasps.iter_mut().zip(qualities) {
+            grasp.quality = quality;
         }
         Ok(())
     }
+
+    /// The probabilities of `count` poses, for a hand whose fingers are `depth` metres long. The evaluator was trained
+    /// with fingers of [`FINGER_DEPTH`], so it gets the pose of such a hand with its fingertips in the same place.
+    fn probabilities(
+        &mut self,
+        count: usize,
+        pose: impl Fn(usize) -> Isometry3<f64>,
+        volume: &Volume,
+        depth: f64,
+    ) -> Result<Vec<f32>, RuntimeError> {
+        let of_training_hand = Translation3::new(0.0, 0.0, depth - FINGER_DEPTH);
+        let scores = self.classifier.score(count, |index, patch| {
+            Patch::write(volume, &(pose(index) * of_training_hand), patch);
+        })?;
+        Ok(scores.into_iter().map(|score| 1.0 / (1.0 + (-score).exp())).collect())
+    }
+}
+
+/// Length of the fingers, metres.
+fn depth(params: &DecodeParams) -> f64 {
+    params.hand.map_or(FINGER_DEPTH, |hand| hand.depth)
 }
 
 /// Sorts by quality, best first.

@@ -1,7 +1,8 @@
 use std::path::Path;
 
-use grasp::{DecodeParams, Decoded, Maps, Volume, decode};
+use grasp::{DecodeParams, Decoded, Maps, Volume, decode, quality_at};
 use grasp_models::{LoadError, Network, Options, Output, RuntimeError};
+use nalgebra::Isometry3;
 
 use crate::{Evaluator, PlanError, PlanParams, Planner, Scene};
 
@@ -75,6 +76,26 @@ impl Inference<'_> {
                 evaluator.refine(proposals, volume, params, is_wanted)?
             }
         })
+    }
+}
+
+impl Inference<'_> {
+    /// The predicted quality of grasps at `poses` in `volume`, which is the one at `index` of the batch. An evaluator
+    /// predicts it for the pose; a network alone for the best rotation at the position.
+    ///
+    /// # Errors
+    /// [`PlanError`] if the maps are invalid or the evaluator fails.
+    pub fn score(
+        &mut self,
+        index: usize,
+        volume: &Volume,
+        poses: &[Isometry3<f64>],
+        params: &DecodeParams,
+    ) -> Result<Vec<f32>, PlanError> {
+        match &mut self.evaluator {
+            None => Ok(quality_at(volume, &self.output.maps(index), poses, params)?),
+            Some(evaluator) => Ok(evaluator.score(poses, volume, params)?),
+        }
     }
 }
 

@@ -1,9 +1,48 @@
-use grasp::{Dropped, Grasp};
+use grasp::{Dropped, FINGER_DEPTH, Grasp};
+use nalgebra::Isometry3;
 
 use crate::pose::{self, PoseFields};
-use crate::{FieldError, pb};
+use crate::{DetectParams, FieldError, pb};
 
 const POSE: PoseFields = PoseFields { position: "grasps.pose.position", orientation: "grasps.pose.orientation" };
+
+const CANDIDATE: PoseFields = PoseFields { position: "pose.position", orientation: "pose.orientation" };
+
+/// Most candidates in a request.
+const MAX_CANDIDATES: usize = 1024;
+
+/// A grasp that the caller proposes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Candidate {
+    /// `T_frame_grasp`, with the origin at the finger base and the fingers closing along ±y.
+    pub pose: Isometry3<f64>,
+    /// Opening between the fingers when the object is held, metres, if it is known.
+    pub width: Option<f64>,
+}
+
+/// Converts the candidates of a request from the convention of its options.
+///
+/// # Errors
+/// [`FieldError`] names the invalid field.
+pub fn candidates(candidates: &[pb::Candidate], params: &DetectParams) -> Result<Vec<Candidate>, FieldError> {
+    if !(1..=MAX_CANDIDATES).contains(&candidates.len()) {
+        let value = format_args!("a list of {}", candidates.len());
+        return Err(FieldError::new("candidates", value, format_args!("must have from 1 to {MAX_CANDIDATES}")));
+    }
+    let depth = params.hand.map_or(FINGER_DEPTH, |hand| hand.depth);
+    let candidate = |candidate: &pb::Candidate| {
+        let pose = candidate.pose.as_ref().ok_or_else(|| FieldError::new("pose", "absent", "must be given"))?;
+        let pose = params.convention.grasp(&pose::decode(pose, &CANDIDATE)?, depth);
+        match candidate.width {
+            Some(width) if !(0.0..=1.0).contains(&width) => {
+                Err(FieldError::new("width", width, "must be from 0 to 1 m"))
+            }
+            width => Ok(Candidate { pose, width }),
+        }
+    };
+    let indexed = candidates.iter().enumerate();
+    indexed.map(|(index, c)| candidate(c).map_err(|error| error.inside(format_args!("candidates[{index}]")))).collect()
+}
 
 impl From<&Grasp> for pb::Grasp {
     fn from(grasp: &Grasp) -> Self {
@@ -32,9 +71,46 @@ impl From<&Dropped> for pb::Dropped {
             region: count(dropped.region),
             approach: count(dropped.approach),
             height: count(dropped.height),
+            object: count(dropped.object),
             suppressed: count(dropped.suppressed),
             collision: count(dropped.collision),
             over_limit: 0,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+
+    #[test]
+    fn candidates_are_converted_from_the_convention_of_the_request() {
+        let convention = pb::Convention { origin: pb::convention::Origin::Tcp.into(), ..Default::default() };
+        let options = pb::Options { convention: Some(convention), ..Default::default() };
+        let params = DetectParams::try_from(&options).unwrap();
+        let grasp = Isometry3::new(Vector3::new(0.1, 0.2, 0.3), Vector3::new(3.0, 0.0, 0.0));
+        let [pose, ..] = params.poses(&grasp);
+        let candidate = pb::Candidate { pose: Some((&pose).into()), width: None };
+        let converted = candidates(&[candidate], &params).unwrap();
+        assert!((converted[0].pose.to_homogeneous() - grasp.to_homogeneous()).norm() < 1e-12);
+    }
+
+    #[test]
+    fn invalid_candidates_are_named() {
+        let params = DetectParams::try_from(&pb::Options::default()).unwrap();
+        let valid = pb::Candidate { pose: Some((&Isometry3::identity()).into()), width: Some(0.04) };
+        let refused = |list: &[pb::Candidate]| candidates(list, &params).unwrap_err().to_string();
+        assert_eq!(refused(&[]), "candidates is a list of 0, must have from 1 to 1024");
+        let absent = pb::Candidate { pose: None, ..valid };
+        assert_eq!(refused(&[valid, absent]), "candidates[1].pose is absent, must be given");
+        let wide = pb::Candidate { width: Some(40.0), ..valid };
+        assert_eq!(refused(&[wide]), "candidates[0].width is 40, must be from 0 to 1 m");
+        let mut turned = valid;
+        if let Some(orientation) = turned.pose.as_mut().and_then(|pose| pose.orientation.as_mut()) {
+            orientation.w = f64::NAN;
+        }
+        assert!(refused(&[turned]).starts_with("candidates[0].pose.orientation is"));
     }
 }

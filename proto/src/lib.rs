@@ -7,7 +7,9 @@
 
 mod error;
 mod grasps;
+mod labels;
 mod options;
+mod png;
 mod pose;
 mod views;
 mod volume;
@@ -27,6 +29,7 @@ pub mod oip {
 }
 
 pub use error::{FieldError, on_a_line};
+pub use grasps::{Candidate, candidates};
 pub use options::{Collision, DetectParams, TABLE_HEIGHT};
 pub use pose::pose;
 pub use views::{MAX_VIEWS, Points, Workspace, check_count, cloud_view, depth_view};

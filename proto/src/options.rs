@@ -1,3 +1,5 @@
+use std::collections::BTreeSet;
+
 use grasp::{
     Clearance, ClosingAxis, Cone, Constraints, Convention, DecodeParams, Hand, HandError, Origin, Region, Retreat,
     before,
@@ -22,6 +24,12 @@ pub const MAX_NAME: usize = 256;
 /// Largest pre-grasp and retreat distance, metres.
 const REACH: f64 = 10.0;
 
+/// Largest margin and clearance, metres.
+const MAX_MARGIN: f64 = 0.1;
+
+const REGION: PoseFields =
+    PoseFields { position: "options.region_pose.position", orientation: "options.region_pose.orientation" };
+
 const PARENT: PoseFields = PoseFields {
     position: "options.convention.parent_from_grasp.position",
     orientation: "options.convention.parent_from_grasp.orientation",
@@ -40,6 +48,12 @@ pub struct DetectParams {
     pub force: Option<f32>,
     /// Largest number of grasps.
     pub max_grasps: usize,
+    /// Largest number of grasps on one object.
+    pub max_grasps_per_object: usize,
+    /// Labels of the objects to grasp; empty means all surfaces.
+    pub objects: BTreeSet<u16>,
+    /// Smallest distance of the fingertips from the sides of the cube, metres.
+    pub margin: f64,
     /// Whether to report the dropped grasps.
     pub explain: bool,
     /// Region, approach and height.
@@ -50,6 +64,10 @@ pub struct DetectParams {
     pub collision: Collision,
     /// Height of the table above the volume's bottom, metres; `None` without a table.
     pub table: Option<f64>,
+    /// Smallest distance between the hand and the obstacles, metres.
+    pub clearance: f64,
+    /// Whether space behind a surface counts as an obstacle.
+    pub hidden: bool,
     /// Frame of the hand in which poses are reported.
     pub convention: Convention,
     /// Distance from the pre-grasp to the grasp, metres.
@@ -86,8 +104,44 @@ impl DetectParams {
     /// Parameters of the collision check.
     #[must_use]
     pub fn clearance(&self) -> Clearance {
-        let hand = self.hand.unwrap_or(Hand::PANDA);
-        Clearance { hand, from: self.pregrasp, table: self.table, ..Clearance::default() }
+        let Self { pregrasp: from, table, clearance: margin, hidden, .. } = *self;
+        Clearance { hand: self.hand(), from, table, margin, hidden, ..Clearance::default() }
+    }
+
+    /// The hand that executes the grasps.
+    #[must_use]
+    pub fn hand(&self) -> Hand {
+        self.hand.unwrap_or(Hand::PANDA)
+    }
+
+    /// Refuses options that need views, for a request with a volume.
+    ///
+    /// # Errors
+    /// [`FieldError`] names the option.
+    pub fn check_without_views(&self) -> Result<(), FieldError> {
+        if self.hidden {
+            let needed = "needs depth images or point clouds: a volume does not distinguish hidden from free space";
+            return Err(FieldError::new("options.collision.hidden", true, needed));
+        }
+        self.check_objects(false)
+    }
+
+    /// Refuses options about objects if no view has labels.
+    ///
+    /// # Errors
+    /// [`FieldError`] names the option.
+    pub fn check_objects(&self, is_labelled: bool) -> Result<(), FieldError> {
+        const NEEDED: &str = "needs views with labels";
+        if is_labelled {
+            return Ok(());
+        }
+        if let Some(first) = self.objects.first() {
+            return Err(FieldError::new("options.objects", format_args!("[{first}, …]"), NEEDED));
+        }
+        if self.max_grasps_per_object < usize::MAX {
+            return Err(FieldError::new("options.max_grasps_per_object", self.max_grasps_per_object, NEEDED));
+        }
+        Ok(())
     }
 
     /// The reported poses of a grasp: grasp, pre-grasp and retreat, in the requested convention.
@@ -115,17 +169,22 @@ impl TryFrom<&pb::Options> for DetectParams {
             version: options.version.clone(),
             threshold: probability("options.threshold", options.threshold)?,
             force: probability("options.force", options.force)?,
-            max_grasps: if options.max_grasps == 0 { usize::MAX } else { options.max_grasps as usize },
+            max_grasps: limit(options.max_grasps),
+            max_grasps_per_object: limit(options.max_grasps_per_object),
+            objects: objects(&options.objects)?,
+            margin: margin("options.margin", options.margin)?,
             explain: options.explain,
             constraints: Constraints {
                 workspace: None,
-                region: options.region.as_ref().map(region).transpose()?,
+                region: region(options)?,
                 approach: options.approach.as_ref().map(cone).transpose()?,
                 min_height: number("options.min_height", options.min_height)?,
             },
             hand: options.gripper.as_ref().map(hand).transpose()?,
             collision: mode(&collision)?,
             table: Some(table).filter(|height| *height >= 0.0),
+            clearance: margin("options.collision.clearance", collision.clearance)?,
+            hidden: collision.hidden,
             convention: options.convention.as_ref().map(convention).transpose()?.unwrap_or_default(),
             pregrasp: distance("options.pregrasp_distance", options.pregrasp_distance)?.unwrap_or(PREGRASP),
             retreat: options
@@ -177,8 +236,35 @@ fn corners(bounds: &pb::Box, field: &'static str) -> Result<[[f64; 3]; 2], Field
     Ok([corner(bounds.min, "min")?, corner(bounds.max, "max")?])
 }
 
-fn region(bounds: &pb::Box) -> Result<Region, FieldError> {
+/// A largest number; 0 means no limit.
+fn limit(count: u32) -> usize {
+    if count == 0 { usize::MAX } else { count as usize }
+}
+
+fn margin(field: &'static str, value: Option<f64>) -> Result<f64, FieldError> {
+    match value {
+        Some(value) if !(0.0..=MAX_MARGIN).contains(&value) => {
+            Err(FieldError::new(field, value, format_args!("must be from 0 to {MAX_MARGIN} m")))
+        }
+        value => Ok(value.unwrap_or_default()),
+    }
+}
+
+fn objects(labels: &[u32]) -> Result<BTreeSet<u16>, FieldError> {
+    let label = |(index, &label): (usize, &u32)| {
+        let valid = u16::try_from(label).ok().filter(|label| *label > 0);
+        valid.ok_or_else(|| FieldError::new(format!("options.objects[{index}]"), label, "must be from 1 to 65535"))
+    };
+    labels.iter().enumerate().map(label).collect()
+}
+
+fn region(options: &pb::Options) -> Result<Option<Region>, FieldError> {
     const FIELD: &str = "options.region";
+    let Some(bounds) = &options.region else {
+        let without = |_| FieldError::new("options.region_pose", "given", "must be absent without options.region");
+        return options.region_pose.as_ref().map_or(Ok(None), |pose| Err(without(pose)));
+    };
+    let frame = options.region_pose.as_ref().map_or(Ok(Isometry3::identity()), |pose| pose::decode(pose, &REGION))?;
     let [lower, upper] = corners(bounds, FIELD)?;
     for (axis, name) in ["x", "y", "z"].into_iter().enumerate() {
         if lower[axis] > upper[axis] {
@@ -186,7 +272,7 @@ fn region(bounds: &pb::Box) -> Result<Region, FieldError> {
             return Err(FieldError::new(format!("{FIELD}.max.{name}"), upper[axis], needed));
         }
     }
-    Ok(Region { frame: Isometry3::identity(), lower, upper })
+    Ok(Some(Region { frame, lower, upper }))
 }
 
 /// The direction of a vector of any length above 0.
@@ -312,6 +398,29 @@ mod tests {
     }
 
     #[test]
+    fn options_about_objects_need_labels() {
+        let params = |options: &pb::Options| DetectParams::try_from(options).unwrap();
+        let of_objects = params(&pb::Options { objects: vec![7, 3], ..Default::default() });
+        assert_eq!(of_objects.objects, [3, 7].into());
+        let refused = of_objects.check_objects(false).unwrap_err();
+        assert_eq!(refused.to_string(), "options.objects is [3, …], needs views with labels");
+        assert!(of_objects.check_objects(true).is_ok());
+        let limited = params(&pb::Options { max_grasps_per_object: 2, ..Default::default() });
+        assert_eq!(limited.check_objects(false).unwrap_err().field, "options.max_grasps_per_object");
+        assert!(params(&pb::Options::default()).check_without_views().is_ok());
+    }
+
+    #[test]
+    fn a_region_can_have_any_direction() {
+        let vector = |x, y, z| Some(pb::Vector3 { x, y, z });
+        let pose = Isometry3::new(Vector3::new(0.1, 0.0, 0.0), Vector3::new(0.0, 0.0, 0.5));
+        let region = Some(pb::Box { min: vector(0.0, 0.0, 0.0), max: vector(0.1, 0.1, 0.1) });
+        let options = pb::Options { region, region_pose: Some((&pose).into()), ..Default::default() };
+        let region = DetectParams::try_from(&options).unwrap().constraints.region.unwrap();
+        assert!((region.frame.to_homogeneous() - pose.to_homogeneous()).norm() < 1e-12);
+    }
+
+    #[test]
     fn each_invalid_option_is_named() {
         let vector = |x, y, z| Some(pb::Vector3 { x, y, z });
         let options = |change: fn(&mut pb::Options)| {
@@ -336,6 +445,17 @@ mod tests {
             refused(pb::Options { region, ..Default::default() }),
             "options.region.max.z is 0.1, must be at least `min.z`, 0.2"
         );
+        assert_eq!(options(|o| o.margin = Some(0.2)), "options.margin is 0.2, must be from 0 to 0.1 m");
+        assert_eq!(options(|o| o.objects = vec![3, 0]), "options.objects[1] is 0, must be from 1 to 65535");
+        let clearance = Some(pb::CollisionCheck { clearance: Some(f64::NAN), ..Default::default() });
+        assert_eq!(
+            refused(pb::Options { collision: clearance, ..Default::default() }),
+            "options.collision.clearance is NaN, must be from 0 to 0.1 m"
+        );
+        assert_eq!(
+            options(|o| o.region_pose = Some((&Isometry3::identity()).into())),
+            "options.region_pose is given, must be absent without options.region"
+        );
         let approach = Some(pb::Cone { axis: vector(0.0, 0.0, 0.0), angle: 0.5 });
         assert_eq!(
             refused(pb::Options { approach, ..Default::default() }),
@@ -351,7 +471,7 @@ mod tests {
             refused(pb::Options { convention, ..Default::default() }),
             "options.convention.parent_from_grasp is absent, must be given for ORIGIN_PARENT"
         );
-        let collision = Some(pb::CollisionCheck { mode: 7, table_height: None });
+        let collision = Some(pb::CollisionCheck { mode: 7, ..Default::default() });
         assert_eq!(
             refused(pb::Options { collision, ..Default::default() }),
             "options.collision.mode is 7, must be MODE_OFF (0), MODE_FLAG (1) or MODE_FILTER (2)"

@@ -1,13 +1,16 @@
-use grasp::{DepthImage, Intrinsics, Tabletop, Unit as DepthUnit, View};
-use nalgebra::{Isometry3, Point3, Unit, Vector3};
+use grasp::{DepthImage, Intrinsics, Tabletop, Unit as DepthUnit, View, WORKSPACE_SIZE};
+use nalgebra::{Isometry3, Point3, Translation3, Unit, Vector3};
 
 use crate::options::direction;
 use crate::pb::depth_view::Extrinsics;
 use crate::pose::{self, PoseFields};
-use crate::{FieldError, pb};
+use crate::{FieldError, labels, pb, png};
 
 /// Largest number of views in one request.
 pub const MAX_VIEWS: usize = 64;
+
+/// Largest extent of a workspace, metres.
+const MAX_EXTENT: f64 = 2.0;
 
 /// Longest edge of an image, pixels.
 const MAX_EDGE: u32 = 16_384;
@@ -40,6 +43,8 @@ pub struct Workspace {
     pub find_table: bool,
     /// Direction of gravity in the caller's frame.
     pub gravity: Option<Unit<Vector3<f64>>>,
+    /// Lengths along x and y, metres; `None` means one cube.
+    pub extent: Option<[f64; 2]>,
 }
 
 /// The points of one camera, in the task frame.
@@ -49,13 +54,15 @@ pub struct Points {
     pub points: Vec<Point3<f64>>,
     /// Position of the camera, metres.
     pub eye: Point3<f64>,
+    /// Label of the object of each point, if it is known; 0 is no object.
+    pub labels: Option<Vec<u16>>,
 }
 
 impl TryFrom<pb::Workspace> for Workspace {
     type Error = FieldError;
 
     fn try_from(workspace: pb::Workspace) -> Result<Self, FieldError> {
-        let pb::Workspace { pose, size, frame_id, stamp, find_table, gravity } = workspace;
+        let pb::Workspace { pose, size, frame_id, stamp, find_table, gravity, extent } = workspace;
         if !(0.0..=100.0).contains(&size) {
             return Err(FieldError::new(
                 "workspace.size",
@@ -69,7 +76,8 @@ impl TryFrom<pb::Workspace> for Workspace {
         let frame_from_task = pose.map_or(Ok(Isometry3::identity()), |pose| pose::decode(&pose, &WORKSPACE))?;
         let gravity = gravity.map(|gravity| direction(Some(gravity), "workspace.gravity")).transpose()?;
         let size = Some(size).filter(|size| *size > 0.0);
-        Ok(Self { frame_from_task, size, frame_id, stamp, find_table, gravity })
+        let extent = extent.map(checked_extent).transpose()?;
+        Ok(Self { frame_from_task, size, frame_id, stamp, find_table, gravity, extent })
     }
 }
 
@@ -118,10 +126,23 @@ impl Workspace {
         let image = DepthImage::new(intrinsics, &depth).map_err(|error| FieldError::refused("camera", error))?;
         let gravity = self.gravity.map(|gravity| frame_from_camera.rotation.inverse() * gravity);
         let found = Tabletop::find(&image, gravity, height).map_err(|error| FieldError::refused("data", error))?;
-        self.frame_from_task = frame_from_camera * found.camera_from_task;
+        // A larger workspace has its middle over that of the cube which was found.
+        let corner = self.extent.map_or([0.0; 2], |extent| extent.map(|length| (WORKSPACE_SIZE - length) / 2.0));
+        let in_cube = Translation3::new(corner[0], corner[1], 0.0);
+        self.frame_from_task = frame_from_camera * found.camera_from_task * in_cube;
         let Tabletop { distance, angle, share, deviation, tilt, .. } = found;
         Ok(pb::FoundTable { workspace: Some((&self.frame_from_task).into()), distance, angle, share, deviation, tilt })
     }
+}
+
+fn checked_extent(extent: pb::Extent) -> Result<[f64; 2], FieldError> {
+    for (field, length) in [("workspace.extent.x", extent.x), ("workspace.extent.y", extent.y)] {
+        // Written so that NaN fails.
+        if !(length > 0.0 && length <= MAX_EXTENT) {
+            return Err(FieldError::new(field, length, format_args!("must be above 0 and at most {MAX_EXTENT} m")));
+        }
+    }
+    Ok([extent.x, extent.y])
 }
 
 /// Checks the number of views.
@@ -145,6 +166,8 @@ pub fn depth_view(view: &pb::DepthView, index: usize, frame_from_task: &Isometry
 
 fn try_depth_view(view: &pb::DepthView, frame_from_task: &Isometry3<f64>) -> Result<View, FieldError> {
     let (intrinsics, depth) = image(view)?;
+    let of_image = |message| labels::of_image(message, intrinsics.width, intrinsics.height);
+    let labels = view.labels.as_ref().map(of_image).transpose().map_err(|error| error.inside("labels"))?;
     let camera_from_task = match &view.extrinsics {
         Some(Extrinsics::CameraFromTask(pose)) => pose::decode(pose, &CAMERA_FROM_TASK)?,
         Some(Extrinsics::FrameFromCamera(pose)) => pose::decode(pose, &FRAME_FROM_CAMERA)?.inverse() * frame_from_task,
@@ -153,7 +176,7 @@ fn try_depth_view(view: &pb::DepthView, frame_from_task: &Isometry3<f64>) -> Res
             return Err(FieldError::new("extrinsics", "absent", needed));
         }
     };
-    Ok(View { intrinsics, depth, camera_from_task })
+    Ok(View { intrinsics, depth, camera_from_task, labels })
 }
 
 /// The intrinsics and the depth, metres, row by row, of a view.
@@ -162,14 +185,18 @@ fn image(view: &pb::DepthView) -> Result<(Intrinsics, Vec<f32>), FieldError> {
     let intrinsics = intrinsics(camera)?;
     let pixels = intrinsics.width * intrinsics.height;
     let value_size = match view.unit() {
-        pb::DepthUnit::F32Metres => 4,
-        pb::DepthUnit::U16Millimetres => 2,
+        pb::DepthUnit::F32Metres => Some(4),
+        pb::DepthUnit::U16Millimetres => Some(2),
+        pb::DepthUnit::PngMillimetres => None,
         pb::DepthUnit::Unspecified => {
-            let needed = "must be DEPTH_UNIT_F32_METRES (1) or DEPTH_UNIT_U16_MILLIMETRES (2)";
+            let needed = "must be DEPTH_UNIT_F32_METRES (1), DEPTH_UNIT_U16_MILLIMETRES (2) or \
+                          DEPTH_UNIT_PNG_MILLIMETRES (3)";
             return Err(FieldError::new("unit", view.unit, needed));
         }
     };
-    if view.data.len() != pixels * value_size {
+    if let Some(value_size) = value_size
+        && view.data.len() != pixels * value_size
+    {
         let needed = format_args!(
             "{} × {} pixels need {} ({})",
             intrinsics.width,
@@ -183,6 +210,11 @@ fn image(view: &pb::DepthView) -> Result<(Intrinsics, Vec<f32>), FieldError> {
         pb::DepthUnit::U16Millimetres => {
             view.data.as_chunks().0.iter().map(|&bytes| f32::from(u16::from_le_bytes(bytes)) * 1e-3).collect()
         }
+        pb::DepthUnit::PngMillimetres => {
+            let values = png::grey(&view.data, intrinsics.width, intrinsics.height);
+            let values = values.map_err(|reason| FieldError::refused("data", reason))?;
+            values.into_iter().map(|value| f32::from(value) * 1e-3).collect()
+        }
         _ => view.data.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect(),
     };
     let image = DepthImage::new(intrinsics, &depth).map_err(|error| FieldError::refused("camera", error))?;
@@ -192,7 +224,7 @@ fn image(view: &pb::DepthView) -> Result<(Intrinsics, Vec<f32>), FieldError> {
                           by 1000";
             return Err(FieldError::new("data", "in metres, with a median above 20", needed));
         }
-        (DepthUnit::Thousandths, pb::DepthUnit::U16Millimetres) => {
+        (DepthUnit::Thousandths, pb::DepthUnit::U16Millimetres | pb::DepthUnit::PngMillimetres) => {
             let needed = "must be millimetres but looks like metres: send f32 with DEPTH_UNIT_F32_METRES";
             return Err(FieldError::new("data", "in millimetres, with a median below 20", needed));
         }
@@ -275,11 +307,18 @@ fn try_cloud_view(view: &pb::CloudView, frame_from_task: &Isometry3<f64>) -> Res
         let finite = x.is_finite() && y.is_finite() && z.is_finite();
         finite.then(|| task_from_cloud * Point3::new(x, y, z).cast::<f64>())
     };
-    let points: Vec<_> = view.points.as_chunks().0.iter().filter_map(point).collect();
+    let all = view.points.as_chunks().0;
+    let points: Vec<_> = all.iter().filter_map(point).collect();
+    let of_points = |message| labels::of_points(message, all.len());
+    let labels = view.labels.as_ref().map(of_points).transpose().map_err(|error| error.inside("labels"))?;
+    let labels = labels.map(|labels| {
+        let finite = all.iter().zip(labels).filter(|(bytes, _)| point(bytes).is_some());
+        finite.map(|(_, label)| label).collect()
+    });
     if points.is_empty() {
         return Err(FieldError::new("points", "NaN throughout", "must have at least one finite point"));
     }
-    Ok(Points { points, eye: task_from_cloud * Point3::new(x, y, z) })
+    Ok(Points { points, eye: task_from_cloud * Point3::new(x, y, z), labels })
 }
 
 #[cfg(test)]
@@ -293,6 +332,7 @@ mod tests {
             unit: pb::DepthUnit::U16Millimetres.into(),
             camera: Some(pb::Camera { width: 4, height: 3, k: vec![5.0, 0.0, 2.0, 0.0, 5.0, 1.5, 0.0, 0.0, 1.0] }),
             extrinsics: Some(Extrinsics::CameraFromTask((&Isometry3::translation(0.0, 0.0, 0.4)).into())),
+            labels: None,
         }
     }
 
@@ -302,6 +342,60 @@ mod tests {
         let error = depth_view(&view, 1, &Isometry3::identity()).unwrap_err();
         assert!(error.message.starts_with(&*error.field), "{error:?}");
         error.to_string()
+    }
+
+    #[test]
+    fn a_png_gives_the_same_view() {
+        let png = pb::DepthView {
+            data: png::encoded(&[500; 12], 4, 3).into(),
+            unit: pb::DepthUnit::PngMillimetres.into(),
+            ..view()
+        };
+        let frame = Isometry3::identity();
+        assert_eq!(depth_view(&png, 0, &frame).unwrap().depth, depth_view(&view(), 0, &frame).unwrap().depth);
+        let other = png::encoded(&[500; 12], 3, 4);
+        let unit = pb::DepthUnit::PngMillimetres.into();
+        assert_eq!(
+            refused(|view| *view = pb::DepthView { data: other.clone().into(), unit, ..view.clone() }),
+            "views[1].data: the PNG has 3 × 4 pixels, the camera has 4 × 3"
+        );
+        assert!(refused(|view| view.unit = unit).starts_with("views[1].data: not a valid PNG file"));
+    }
+
+    #[test]
+    fn labels_belong_to_pixels_and_points() {
+        let labels = |data: Vec<u8>| Some(pb::Labels { data: data.into(), r#type: pb::LabelType::U8.into() });
+        let labelled = pb::DepthView { labels: labels((0..12).collect()), ..view() };
+        let converted = depth_view(&labelled, 0, &Isometry3::identity()).unwrap();
+        assert_eq!(converted.labels, Some((0..12).collect()));
+        assert_eq!(
+            refused(|view| view.labels = labels(vec![1; 11])),
+            "views[1].labels.data is 11 bytes, one label each needs 12 (LABEL_TYPE_U8)"
+        );
+        // Points that are not finite are left out, with their labels.
+        let points = [[0.0, 0.0, 0.5], [f32::NAN, 0.0, 0.5], [0.1, 0.0, 0.5]];
+        let cloud = pb::CloudView {
+            points: points.iter().flatten().flat_map(|c| c.to_le_bytes()).collect::<Vec<u8>>().into(),
+            frame_from_cloud: None,
+            camera_position: Some(pb::Vector3::default()),
+            labels: labels(vec![4, 5, 6]),
+        };
+        let converted = cloud_view(&cloud, 0, &Isometry3::identity()).unwrap();
+        assert_eq!((converted.points.len(), converted.labels), (2, Some(vec![4, 6])));
+    }
+
+    #[test]
+    fn an_extent_is_checked() {
+        let workspace = |x, y| {
+            let extent = Some(pb::Extent { x, y });
+            Workspace::try_from(pb::Workspace { extent, ..Default::default() }).map(|workspace| workspace.extent)
+        };
+        assert_eq!(workspace(0.9, 0.6), Ok(Some([0.9, 0.6])));
+        assert_eq!(
+            workspace(0.9, 2.5).unwrap_err().to_string(),
+            "workspace.extent.y is 2.5, must be above 0 and at most 2 m"
+        );
+        assert_eq!(workspace(f64::NAN, 0.5).unwrap_err().field, "workspace.extent.x");
     }
 
     #[test]
@@ -355,7 +449,7 @@ mod tests {
         );
         assert_eq!(
             refused(|v| v.unit = 0),
-            "views[1].unit is 0, must be DEPTH_UNIT_F32_METRES (1) or DEPTH_UNIT_U16_MILLIMETRES (2)"
+            "views[1].unit is 0, must be DEPTH_UNIT_F32_METRES (1), DEPTH_UNIT_U16_MILLIMETRES (2) or DEPTH_UNIT_PNG_MILLIMETRES (3)"
         );
         assert!(refused(|v| v.extrinsics = None).starts_with("views[1].extrinsics is absent, camera_from_task"));
         let nowhere = pb::Pose { position: None, orientation: None };
@@ -390,6 +484,7 @@ mod tests {
             points: points.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>().into(),
             frame_from_cloud: Some((&Isometry3::translation(1.0, 0.0, 0.0)).into()),
             camera_position: Some(pb::Vector3::default()),
+            labels: None,
         };
         let points = cloud_view(&view, 0, &Isometry3::translation(0.5, 0.0, 0.0)).unwrap();
         let [point] = points.points[..] else { panic!("the NaN point is ignored") };

@@ -17,10 +17,15 @@ pub const BLOCK: [[f64; 3]; 2] = [[0.13, 0.11, TABLE], [0.17, 0.19, 0.15]];
 /// vertical, `azimuth` that about it, degrees.
 #[must_use]
 pub fn camera(polar: f64, azimuth: f64) -> Isometry3<f64> {
-    let middle = Point3::new(0.15, 0.15, 0.08);
+    camera_at(Point3::new(0.15, 0.15, 0.08), 0.6, polar, azimuth)
+}
+
+/// `T_camera_task` of a camera that looks at `middle` from `distance` metres.
+#[must_use]
+pub fn camera_at(middle: Point3<f64>, distance: f64, polar: f64, azimuth: f64) -> Isometry3<f64> {
     let (polar, azimuth) = (polar.to_radians(), azimuth.to_radians());
     let direction = Vector3::new(polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos());
-    let eye = middle + direction * 0.6;
+    let eye = middle + direction * distance;
     let up = Vector3::new(-polar.cos() * azimuth.cos(), -polar.cos() * azimuth.sin(), polar.sin());
     let axes = nalgebra::Matrix3::from_columns(&[up.cross(&direction), -up, -direction]);
     let rotation = UnitQuaternion::from_matrix(&axes);
@@ -30,23 +35,39 @@ pub fn camera(polar: f64, azimuth: f64) -> Isometry3<f64> {
 /// The depth image of the camera: metres along its optical axis, 0 without a reading.
 #[must_use]
 pub fn depth(camera_from_task: &Isometry3<f64>) -> Vec<f32> {
+    seen(&[BLOCK], camera_from_task).into_iter().map(|(depth, _)| depth).collect()
+}
+
+/// What each pixel of the camera shows of a table with boxes: the depth in metres, 0 without a reading, and the number of
+/// the box, counted from 1; 0 for the table.
+#[must_use]
+pub fn seen(boxes: &[[[f64; 3]; 2]], camera_from_task: &Isometry3<f64>) -> Vec<(f32, u16)> {
     let task_from_camera = camera_from_task.inverse();
     let eye = task_from_camera * Point3::origin();
     let pixel = |index: usize| {
         let (u, v) = ((index % CAMERA.width) as f64, (index / CAMERA.width) as f64);
         let ray = task_from_camera * Vector3::new((u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, 1.0);
-        let table = (TABLE - eye.z) / ray.z;
-        let mut span = (0.0_f64, f64::INFINITY);
-        for axis in 0..3 {
-            let [a, b] = [0, 1].map(|side| (BLOCK[side][axis] - eye[axis]) / ray[axis]);
-            span = (span.0.max(a.min(b)), span.1.min(a.max(b)));
-        }
-        let block = if span.0 <= span.1 { span.0 } else { f64::INFINITY };
-        let table = if table > 0.0 { table } else { f64::INFINITY };
-        let nearest = block.min(table);
-        if nearest.is_finite() { nearest as f32 } else { 0.0 }
+        let distance = |corners: &[[f64; 3]; 2]| {
+            let mut span = (0.0_f64, f64::INFINITY);
+            for axis in 0..3 {
+                let [a, b] = [0, 1].map(|side| (corners[side][axis] - eye[axis]) / ray[axis]);
+                span = (span.0.max(a.min(b)), span.1.min(a.max(b)));
+            }
+            (span.0 <= span.1).then_some(span.0)
+        };
+        let table = Some((TABLE - eye.z) / ray.z).filter(|table| *table > 0.0).map(|table| (table, 0));
+        let boxes = boxes.iter().zip(1..).filter_map(|(corners, number)| Some((distance(corners)?, number)));
+        let nearest = boxes.chain(table).min_by(|(a, _), (b, _)| a.total_cmp(b));
+        nearest.map_or((0.0, 0), |(distance, number)| (distance as f32, number))
     };
     (0..CAMERA.width * CAMERA.height).map(pixel).collect()
+}
+
+/// The view of a table with boxes as a client sends it, with the numbers of the boxes as labels.
+#[must_use]
+pub fn labelled(boxes: &[[[f64; 3]; 2]], camera_from_task: &Isometry3<f64>) -> DepthView {
+    let (depth, labels) = seen(boxes, camera_from_task).into_iter().unzip();
+    DepthView { depth: Depth::Metres(depth), labels: Some(labels), ..view(camera_from_task) }
 }
 
 /// The depth image as a client sends it.
@@ -59,5 +80,6 @@ pub fn view(camera_from_task: &Isometry3<f64>) -> DepthView {
         height: height as u32,
         k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
         extrinsics: Extrinsics::CameraFromTask(*camera_from_task),
+        labels: None,
     }
 }

@@ -140,6 +140,7 @@ async fn point_clouds_give_grasps_in_the_workspace() {
         points: pixels.chain([[f32::NAN; 3]]).collect(),
         frame_from_cloud: pose.inverse(),
         camera_position: [0.0; 3],
+        labels: None,
     };
     let network = client.detect_from_cloud(std::slice::from_ref(&cloud), &Workspace::default(), low()).await.unwrap();
     assert!(!network.grasps.is_empty() && network.latency.fusion > 0.0);
@@ -257,7 +258,7 @@ async fn planners_without_a_network_are_selected_by_name() {
     };
     assert_eq!((has_low_quality(0.5).await, has_low_quality(0.001).await), (false, true));
     // A table height above the block leaves no points to grasp.
-    let table = Some(pb::CollisionCheck { mode: 0, table_height: Some(0.2) });
+    let table = Some(pb::CollisionCheck { mode: 0, table_height: Some(0.2), ..Default::default() });
     let detect = DetectOptions { model: "shaf".to_owned(), collision: table, ..DetectOptions::default() };
     let none = client.detect_from_depth(&views, &Workspace::default(), with_options(detect)).await.unwrap();
     assert!(none.grasps.is_empty() && none.dropped.as_ref().unwrap().mask > 1000, "{:?}", none.dropped);
@@ -397,7 +398,7 @@ async fn colliding_grasps_are_flagged_or_dropped() {
     let gripper = Some(pb::Gripper { max_opening, finger_depth, finger_width, finger_breadth, palm: None });
     let detect_with = async |client: &Client, detect| detect_with(client, DetectOptions { gripper, ..detect }).await;
     let all = detect_with(&client, DetectOptions::default()).await.grasps;
-    let collision = |mode: i32| Some(pb::CollisionCheck { mode, table_height: None });
+    let collision = |mode: i32| Some(pb::CollisionCheck { mode, ..Default::default() });
     let flagged =
         detect_with(&client, DetectOptions { collision: collision(1), ..DetectOptions::default() }).await.grasps;
     let filtered =
@@ -414,7 +415,7 @@ async fn colliding_grasps_are_flagged_or_dropped() {
         filtered.grasps.iter().all(|grasp| grasp.pose.translation.z >= TABLE + 0.01),
         "no grasp is below the table"
     );
-    let buried = Some(pb::CollisionCheck { mode: 1, table_height: Some(0.3) });
+    let buried = Some(pb::CollisionCheck { mode: 1, table_height: Some(0.3), ..Default::default() });
     let buried = detect_with(&client, DetectOptions { collision: buried, ..DetectOptions::default() }).await.grasps;
     assert!(buried.iter().all(|grasp| grasp.collides == Some(true)), "the table is above all grasps");
 }
@@ -484,14 +485,18 @@ async fn wrong_geometry_is_reported_as_a_warning_and_counted() {
 
     // As DetectGrasps, and in a stream whose second view contradicts the first.
     let volume = fused(&[camera], RESOLUTION, Isometry3::identity());
-    let lower =
-        DetectOptions { collision: Some(pb::CollisionCheck { mode: 0, table_height: Some(0.02) }), ..low().detect };
+    let lower = DetectOptions {
+        collision: Some(pb::CollisionCheck { mode: 0, table_height: Some(0.02), ..Default::default() }),
+        ..low().detect
+    };
     let detection = client.detect(&volume, with_options(lower)).await.unwrap();
     let [warning] = &detection.warnings[..] else { panic!("{:?}", detection.warnings) };
     assert_eq!(warning.code(), pb::geometry_warning::Code::TableHeight);
     assert!((warning.figures["height_m"] - TABLE).abs() < 0.005 && warning.figures["expected_height_m"] == 0.02);
-    let none =
-        DetectOptions { collision: Some(pb::CollisionCheck { mode: 0, table_height: Some(-1.0) }), ..low().detect };
+    let none = DetectOptions {
+        collision: Some(pb::CollisionCheck { mode: 0, table_height: Some(-1.0), ..Default::default() }),
+        ..low().detect
+    };
     assert_eq!(client.detect(&volume, with_options(none)).await.unwrap().warnings, []);
 
     let mut track = client.track(workspace).await.unwrap();
@@ -557,8 +562,12 @@ async fn the_table_is_found_in_the_first_view() {
     refused(&views[..1], nowhere, "workspace.gravity is (0, 0, 0), must be finite and of a length above 0").await;
     let nothing = DepthView { depth: Depth::Metres(vec![0.0; 160 * 120]), ..views[0].clone() };
     refused(&[nothing], any, "views[0].data: only 0 % of the image has a depth").await;
-    let cloud =
-        CloudView { points: vec![[0.1, 0.1, 0.1]], frame_from_cloud: Isometry3::identity(), camera_position: [0.0; 3] };
+    let cloud = CloudView {
+        points: vec![[0.1, 0.1, 0.1]],
+        frame_from_cloud: Isometry3::identity(),
+        camera_position: [0.0; 3],
+        labels: None,
+    };
     let (_, message) = refusal(client.detect_from_cloud(&[cloud], &auto, low()).await);
     assert!(message.starts_with("workspace.find_table is true, needs depth images"), "{message}");
 }

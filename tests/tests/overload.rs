@@ -82,7 +82,7 @@ async fn the_retry_delay_includes_postprocessing() {
     // Decoding takes far longer than the network.
     let centres: Vec<[usize; 3]> = (0..343).map(|i| [i / 49, i / 7 % 7, i % 7].map(|c| 12 + 12 * c)).collect();
     let volume = blobs(96, Isometry3::identity(), &centres);
-    let flag = CollisionCheck { mode: collision_check::Mode::Flag.into(), table_height: None };
+    let flag = CollisionCheck { mode: collision_check::Mode::Flag.into(), ..Default::default() };
     let detect = DetectOptions { collision: Some(flag), max_grasps: 1000, ..DetectOptions::default() };
     let options = || Options { detect: detect.clone(), ..Options::default() };
     let first = client.detect(&volume, options()).await.unwrap();

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use grasp::Warning;
-use grasp_proto::{DetectParams, FieldError, pb};
+use grasp_proto::{Candidate, DetectParams, FieldError, pb};
 use opentelemetry::Context;
 use tokio::sync::watch;
 use tonic::{Code, Request, Status};
@@ -14,15 +14,16 @@ use tracing::{Span, debug, info, info_span};
 
 use crate::readiness::State;
 use crate::rpc::refusal::Refusal;
+use crate::serving::cubes::CubeScene;
+use crate::serving::detection::{Detection, Score};
 use crate::serving::engine::Engine;
-use crate::serving::job::{Detection, Reply, SessionOutput, Tensors};
+use crate::serving::job::{EngineError, Reply, SessionOutput, Tensors};
 use crate::telemetry::metrics::Metrics;
-use crate::telemetry::recent::{Detected, Outcome, RecentRequests};
+use crate::telemetry::recent::{Outcome, RecentRequests, Shown};
 use crate::telemetry::subscriber::{self, REQUEST};
 use crate::telemetry::timings::StageTimings;
 use crate::transport::deadline::{self, Deadline};
 use crate::transport::request_body::unreadable_message;
-use grasp_planner::Scene;
 
 /// Maximum length of a request id and a frame id, bytes. Both are echoed; the request id is also logged.
 const MAX_ID: usize = 256;
@@ -68,11 +69,13 @@ impl CallContext {
     }
 }
 
-/// A queued request: the pending result of the session, and what the response needs besides it.
-pub(crate) struct PendingReply {
-    reply: Reply<Detection>,
+/// A queued request: the pending results of its cubes, and what the response needs besides them.
+pub(crate) struct PendingReply<T = Detection> {
+    replies: Vec<Reply<T>>,
     params: DetectParams,
-    /// Time until the scene was queued, without the fusion.
+    /// The smallest quality of a grasp.
+    threshold: f32,
+    /// Time until the scenes were queued, without the fusion.
     preprocessing: Duration,
     observed: Observed,
     origin: FrameStamp,
@@ -179,19 +182,51 @@ impl Call {
         self.span.record("model", &engine.label);
     }
 
-    /// Queues a scene.
+    /// Queues the scenes of a request for grasp detection.
     pub fn submit(
         &self,
         engine: &Engine,
-        scene: Scene,
+        scenes: Vec<CubeScene>,
+        params: DetectParams,
+        origin: FrameStamp,
+        observed: Observed,
+    ) -> Result<PendingReply, Refusal> {
+        engine.check_cubes(scenes.len())?;
+        self.queue(engine, scenes, params, origin, observed, |scene| {
+            engine.detect(scene, self.deadline, self.span.clone()).map_err(Refusal::from)
+        })
+    }
+
+    /// Queues a scene whose candidates are to be scored.
+    pub fn submit_candidates(
+        &self,
+        engine: &Engine,
+        scene: CubeScene,
+        candidates: &[Candidate],
+        origin: FrameStamp,
+        observed: Observed,
+    ) -> Result<PendingReply<Vec<Score>>, Refusal> {
+        let params = scene.params.clone();
+        self.queue(engine, vec![scene], params, origin, observed, |scene| {
+            engine.score(scene, candidates.to_vec(), self.deadline, self.span.clone()).map_err(Refusal::from)
+        })
+    }
+
+    /// Checks the table in the scenes and queues them with `push`.
+    fn queue<T>(
+        &self,
+        engine: &Engine,
+        scenes: Vec<CubeScene>,
         params: DetectParams,
         origin: FrameStamp,
         mut observed: Observed,
-    ) -> Result<PendingReply, Refusal> {
-        observed.warnings.extend(params.table.and_then(|expected| Warning::of_table(&scene.volume, expected)));
+        push: impl Fn(CubeScene) -> Result<Reply<T>, Refusal>,
+    ) -> Result<PendingReply<T>, Refusal> {
+        observed.warnings.extend(params.table.and_then(|expected| table_warning(&scenes, expected)));
         let preprocessing = self.started.elapsed().saturating_sub(observed.fusion.unwrap_or_default());
-        let reply = engine.detect(scene, params.clone(), self.deadline, self.span.clone())?;
-        Ok(PendingReply { reply, params, preprocessing, observed, origin })
+        let threshold = params.decode_params(engine.source.decode_params()).threshold;
+        let replies = scenes.into_iter().map(push).collect::<Result<_, _>>()?;
+        Ok(PendingReply { replies, params, threshold, preprocessing, observed, origin })
     }
 
     /// Waits for the session's result, and records the outcome in the log and the metrics.
@@ -254,19 +289,66 @@ impl Call {
         self.span.clone()
     }
 
-    async fn reply(&mut self, pending: PendingReply) -> Result<pb::DetectGraspsResponse, Refusal> {
-        let PendingReply { reply, params, preprocessing, observed, origin } = pending;
+    /// Waits for the session's scores, and records the outcome in the log and the metrics.
+    pub async fn finish_scores(
+        mut self,
+        pending: Result<PendingReply<Vec<Score>>, Refusal>,
+    ) -> Result<pb::ScoreGraspsResponse, Refusal> {
+        let outcome = match pending {
+            Ok(pending) => self.scores(pending).await,
+            Err(refusal) => Err(refusal),
+        };
+        match outcome {
+            Ok(response) => {
+                self.ended = true;
+                Ok(response)
+            }
+            Err(refusal) => Err(self.end(refusal)),
+        }
+    }
+
+    async fn scores(&mut self, pending: PendingReply<Vec<Score>>) -> Result<pb::ScoreGraspsResponse, Refusal> {
+        let PendingReply { replies, preprocessing, observed, origin, .. } = pending;
         let Observed { fusion, warnings, table } = observed;
-        let SessionOutput { value, queue, inference, postprocessing } = reply.wait(self.deadline).await?;
-        let Detection { grasps: found, collides, dropped, over_limit, volume } = value;
+        let (values, stages) = all(replies, self.deadline).await?;
+        let total = self.started.elapsed();
+        let timings = StageTimings { preprocessing, fusion, total, ..stages };
+        self.succeeded(&timings, 0);
+        let warnings = self.warned(&warnings);
+        self.recent.add(self.id.clone(), self.label.clone(), Outcome::Scored(timings));
+        Ok(pb::ScoreGraspsResponse {
+            request_id: self.id.clone(),
+            frame_id: origin.frame_id,
+            stamp: origin.stamp,
+            scores: values.iter().flatten().map(Into::into).collect(),
+            model: std::mem::take(&mut self.name),
+            version: std::mem::take(&mut self.version),
+            latency: Some((&timings).into()),
+            warnings,
+            table,
+        })
+    }
+
+    async fn reply(&mut self, pending: PendingReply) -> Result<pb::DetectGraspsResponse, Refusal> {
+        let PendingReply { replies, params, threshold, preprocessing, observed, origin } = pending;
+        let Observed { fusion, warnings, table } = observed;
+        let (cubes, stages) = all(replies, self.deadline).await?;
+        let Detection { grasps: found, dropped, over_limit, volumes } = Detection::merged(cubes, &params, threshold);
 
         let grasps: Vec<_> = found
             .iter()
-            .enumerate()
-            .map(|(index, grasp)| {
-                let [pose, pregrasp, retreat] = params.poses(&grasp.pose).map(|pose| Some((&pose).into()));
-                let collides = collides.as_ref().map(|collides| collides[index]);
-                pb::Grasp { pose, width: grasp.width, quality: grasp.quality, pregrasp, retreat, collides }
+            .map(|detected| {
+                let [pose, pregrasp, retreat] = params.poses(&detected.grasp.pose).map(|pose| Some((&pose).into()));
+                pb::Grasp {
+                    pose,
+                    width: detected.grasp.width,
+                    quality: detected.grasp.quality,
+                    pregrasp,
+                    retreat,
+                    collides: detected.collides,
+                    object: detected.object.map(u32::from),
+                    open_width: detected.open_width,
+                }
             })
             .collect();
         // Fits: there is at most one grasp per voxel.
@@ -275,20 +357,12 @@ impl Call {
 
         let finger_depth = params.hand.map_or(grasp::FINGER_DEPTH, |hand| hand.depth);
         let total = self.started.elapsed();
-        let timings = StageTimings { queue, preprocessing, fusion, inference, postprocessing, total };
+        let timings = StageTimings { preprocessing, fusion, total, ..stages };
         self.succeeded(&timings, grasps.len());
-        let warnings: Vec<pb::GeometryWarning> = warnings.iter().map(Into::into).collect();
-        for warning in &warnings {
-            self.metrics.warned(&self.label, warning.code());
-            self.span.in_scope(|| debug!(code = warning.code().as_str_name(), "{}", warning.message));
-        }
-        let (pose, size) = (*volume.pose(), volume.voxel_size() * volume.resolution() as f64);
-        let volume = Some(volume).filter(|volume| volume.resolution() <= Detected::MAX_RESOLUTION);
+        let warnings = self.warned(&warnings);
         let messages = warnings.iter().map(|warning| warning.message.clone()).collect();
-        let detected =
-            Detected { timings, pose, size, volume, grasps: found, collides, finger_depth, warnings: messages };
-        let outcome = Outcome::Detected(Box::new(detected));
-        self.recent.add(self.id.clone(), self.label.clone(), outcome);
+        let shown = Shown::new(timings, volumes, found, finger_depth, messages);
+        self.recent.add(self.id.clone(), self.label.clone(), Outcome::Detected(Box::new(shown)));
         Ok(pb::DetectGraspsResponse {
             request_id: self.id.clone(),
             frame_id: origin.frame_id,
@@ -301,6 +375,16 @@ impl Call {
             warnings,
             table,
         })
+    }
+
+    /// The warnings of the reply, which are logged and counted.
+    fn warned(&self, warnings: &[Warning]) -> Vec<pb::GeometryWarning> {
+        let warnings: Vec<pb::GeometryWarning> = warnings.iter().map(Into::into).collect();
+        for warning in &warnings {
+            self.metrics.warned(&self.label, warning.code());
+            self.span.in_scope(|| debug!(code = warning.code().as_str_name(), "{}", warning.message));
+        }
+        warnings
     }
 
     fn succeeded(&self, timings: &StageTimings, grasps: usize) {
@@ -334,6 +418,29 @@ impl Drop for Call {
             self.span.in_scope(|| info!(?code, "{reason}"));
         }
     }
+}
+
+/// Waits for the results of all cubes. The timings of the sessions are those from the first cube to the last: the cubes
+/// are inferred in parallel, and one after another.
+async fn all<T>(replies: Vec<Reply<T>>, deadline: Option<Deadline>) -> Result<(Vec<T>, StageTimings), EngineError> {
+    let mut values = Vec::with_capacity(replies.len());
+    let (mut queue, mut inferred, mut decoded) = (Duration::MAX, Duration::ZERO, Duration::ZERO);
+    for reply in replies {
+        let output = reply.wait(deadline).await?;
+        values.push(output.value);
+        queue = queue.min(output.queue);
+        inferred = inferred.max(output.queue + output.inference);
+        decoded = decoded.max(output.queue + output.inference + output.postprocessing);
+    }
+    let (inference, postprocessing) = (inferred.saturating_sub(queue), decoded.saturating_sub(inferred));
+    Ok((values, StageTimings { queue, inference, postprocessing, ..StageTimings::default() }))
+}
+
+/// The warning about the table, unless it is as expected in one of the cubes.
+fn table_warning(scenes: &[CubeScene], expected: f64) -> Option<Warning> {
+    let mut warnings = scenes.iter().map(|scene| Warning::of_table(&scene.scene.volume, expected));
+    let first = warnings.next()??;
+    warnings.all(|warning| warning.is_some()).then_some(first)
 }
 
 /// Ids for requests without one: a random number of the process, then a counter.

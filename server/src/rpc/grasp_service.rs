@@ -3,11 +3,12 @@ use std::sync::Arc;
 use std::thread;
 use std::time::Instant;
 
-use grasp::{View, Volume, WORKSPACE_SIZE};
+use grasp::{Volume, WORKSPACE_SIZE};
 use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::grasp_service_server::GraspService;
 use grasp_proto::{
-    DetectParams, FieldError, TABLE_HEIGHT, Workspace, check_count, cloud_view, depth_view, pb, resolution,
+    Candidate, DetectParams, FieldError, TABLE_HEIGHT, Workspace, candidates, check_count, cloud_view, depth_view, pb,
+    resolution,
 };
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::time::timeout_at;
@@ -19,11 +20,13 @@ use tonic::{Request, Response, Status, Streaming};
 use crate::readiness::draining;
 use crate::rpc::call::{Call, CallContext, Calls, FrameStamp, Observed, PendingReply};
 use crate::rpc::refusal::Refusal;
+use crate::serving::cubes::{CubeScene, Cubes};
+use crate::serving::detection::Score;
 use crate::serving::engine::Engine;
 use crate::serving::job::EngineError;
+use crate::serving::observation::Observation;
 use crate::serving::registry::{ModelRegistry, check_voxel_size};
-use crate::serving::scene::{FusionGrid, Integrated, camera_positions, rendered, size};
-use crate::serving::tracking::{Track, TrackedVolumes};
+use crate::serving::tracking::{Start, Track, TrackedVolumes};
 use crate::transport::deadline::Deadline;
 use grasp_planner::Scene;
 
@@ -48,8 +51,11 @@ pub(crate) struct GraspRpc {
     conversion_permits: Arc<Semaphore>,
 }
 
-/// Views, and the table that determined their workspace.
-type PlacedViews = (Vec<View>, Option<pb::FoundTable>);
+/// What the cameras saw, and the table that determined the workspace.
+type Placed = (Observation, Option<pb::FoundTable>);
+
+/// The scenes of a request with views, and what their fusion showed.
+type Fused = (Vec<CubeScene>, Observed);
 
 /// A call that is queued, or refused with its refusal not yet sent.
 struct PendingCall {
@@ -94,9 +100,21 @@ impl GraspRpc {
 
     async fn submit(&self, request: pb::DetectGraspsRequest, call: &mut Call) -> Result<PendingReply, Refusal> {
         let pb::DetectGraspsRequest { volume, options, .. } = request;
-        let mut volume = volume.ok_or_else(|| FieldError::new("volume", "absent", "must be given"))?;
-        let origin = FrameStamp::checked("volume.frame_id", std::mem::take(&mut volume.frame_id), volume.stamp)?;
+        let volume = volume.ok_or_else(|| FieldError::new("volume", "absent", "must be given"))?;
         let params = DetectParams::try_from(&options.unwrap_or_default())?;
+        let (engine, scene, origin) = self.of_volume(volume, &params, call).await?;
+        call.submit(&engine, vec![scene], params, origin, Observed::default())
+    }
+
+    /// Selects the model for a volume and converts the volume.
+    async fn of_volume(
+        &self,
+        mut volume: pb::Volume,
+        params: &DetectParams,
+        call: &mut Call,
+    ) -> Result<(Arc<Engine>, CubeScene, FrameStamp), Refusal> {
+        let origin = FrameStamp::checked("volume.frame_id", std::mem::take(&mut volume.frame_id), volume.stamp)?;
+        params.check_without_views()?;
         // Selects the model first, so that no volume is converted that no model accepts.
         let engine = self.models.select(&params.model, &params.version, Some(resolution(&volume)?))?;
         call.set_model(&engine);
@@ -108,8 +126,11 @@ impl GraspRpc {
             blocking(permits, move || Ok(Volume::try_from(&volume)?)).await?
         };
         check_voxel_size(&checked, &engine)?;
-        let scene = Scene { volume: checked, points: None };
-        call.submit(&engine, scene, params, origin, Observed::default())
+        let mut params = params.clone();
+        if params.margin > 0.0 {
+            params.constraints.workspace = Some(checked.within(params.margin));
+        }
+        Ok((engine, CubeScene { scene: Scene { volume: checked, points: None }, params }, origin))
     }
 
     async fn submit_depth(
@@ -117,15 +138,8 @@ impl GraspRpc {
         request: pb::DetectGraspsFromDepthRequest,
         call: &mut Call,
     ) -> Result<PendingReply, Refusal> {
-        let pb::DetectGraspsFromDepthRequest { mut views, workspace, options, .. } = request;
-        let count = views.len();
-        let make_views = move |workspace: &mut Workspace, table: f64, _: f64| -> Result<PlacedViews, FieldError> {
-            let table = workspace.find_table(&mut views, table)?;
-            let views = views.iter().enumerate();
-            let views = views.map(|(index, view)| depth_view(view, index, &workspace.frame_from_task));
-            Ok((views.collect::<Result<_, _>>()?, table))
-        };
-        self.submit_views(count, workspace, options, call, make_views).await
+        let pb::DetectGraspsFromDepthRequest { views, workspace, options, .. } = request;
+        self.submit_views(views.len(), workspace, options, call, depth(views)).await
     }
 
     async fn submit_cloud(
@@ -134,30 +148,34 @@ impl GraspRpc {
         call: &mut Call,
     ) -> Result<PendingReply, Refusal> {
         let pb::DetectGraspsFromCloudRequest { views, workspace, options, .. } = request;
-        let count = views.len();
-        let make_views = move |workspace: &mut Workspace, _: f64, size: f64| -> Result<PlacedViews, FieldError> {
-            if workspace.find_table {
-                return Err(FieldError::new("workspace.find_table", true, "needs depth images; send those instead"));
-            }
-            let views = views.iter().enumerate();
-            let clouds = views.map(|(index, view)| cloud_view(view, index, &workspace.frame_from_task));
-            Ok((rendered(&clouds.collect::<Result<Vec<_>, _>>()?, size)?, None))
-        };
-        self.submit_views(count, workspace, options, call, make_views).await
+        self.submit_views(views.len(), workspace, options, call, clouds(views)).await
     }
 
-    /// Fuses `count` views and queues the scene. `make_views` returns the views in a workspace with the table at a
-    /// height, in a cube of a size, metres.
+    /// Fuses `count` views and queues the scenes. `place` converts the views and sets the pose of the workspace.
     async fn submit_views(
         &self,
         count: usize,
         workspace: Option<pb::Workspace>,
         options: Option<pb::Options>,
         call: &mut Call,
-        make_views: impl FnOnce(&mut Workspace, f64, f64) -> Result<PlacedViews, FieldError> + Send + 'static,
+        place: impl FnOnce(&mut Workspace, f64) -> Result<Placed, FieldError> + Send + 'static,
     ) -> Result<PendingReply, Refusal> {
-        check_count(count)?;
         let params = DetectParams::try_from(&options.unwrap_or_default())?;
+        let (engine, (scenes, observed), origin) = self.of_views(count, workspace, &params, call, place).await?;
+        call.submit(&engine, scenes, params, origin, observed)
+    }
+
+    /// Selects the model for `count` views and fuses them. `place` converts the views and sets the pose of the
+    /// workspace, in which the table is at the given height, metres.
+    async fn of_views(
+        &self,
+        count: usize,
+        workspace: Option<pb::Workspace>,
+        params: &DetectParams,
+        call: &mut Call,
+        place: impl FnOnce(&mut Workspace, f64) -> Result<Placed, FieldError> + Send + 'static,
+    ) -> Result<(Arc<Engine>, Fused, FrameStamp), Refusal> {
+        check_count(count)?;
         let mut workspace = Workspace::try_from(workspace.unwrap_or_default())?;
         let origin =
             FrameStamp::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
@@ -165,14 +183,55 @@ impl GraspRpc {
         call.set_model(&engine);
         let permits = (self.conversion_permit(&engine)?, self.fusion_permit(call).await?);
         engine.check_capacity()?;
-        let selected = Arc::clone(&engine);
+        let (selected, params) = (Arc::clone(&engine), params.clone());
         let fused = blocking(permits, move || {
-            let size = size(&selected.source, &workspace);
-            let (views, table) = make_views(&mut workspace, params.table.unwrap_or(TABLE_HEIGHT), size)?;
-            fuse(&selected, params, &workspace, &views, table)
+            let (observation, table) = place(&mut workspace, params.table.unwrap_or(TABLE_HEIGHT))?;
+            fuse(&selected, &params, &workspace, &observation, table)
         });
-        let (scene, params, observed) = fused.await?;
-        call.submit(&engine, scene, params, origin, observed)
+        Ok((engine, fused.await?, origin))
+    }
+
+    /// Queues the scene of a request with candidates.
+    async fn submit_candidates(
+        &self,
+        request: pb::ScoreGraspsRequest,
+        call: &mut Call,
+    ) -> Result<PendingReply<Vec<Score>>, Refusal> {
+        use pb::score_grasps_request::Scene as Message;
+        let pb::ScoreGraspsRequest { candidates: messages, scene, options, .. } = request;
+        let params = DetectParams::try_from(&options.unwrap_or_default())?;
+        let candidates: Vec<Candidate> = candidates(&messages, &params)?;
+        let one_cube = |workspace: &Option<pb::Workspace>, field: &'static str| match workspace {
+            Some(pb::Workspace { extent: Some(_), .. }) => Err(FieldError::new(field, "given", "must be absent")),
+            _ => Ok(()),
+        };
+        let (engine, (scenes, observed), origin) = match scene {
+            None => {
+                let needed = "volume, depth or clouds must be given";
+                return Err(FieldError::new("scene", "absent", needed).into());
+            }
+            Some(Message::Volume(volume)) => {
+                let (engine, scene, origin) = self.of_volume(volume, &params, call).await?;
+                (engine, (vec![scene], Observed::default()), origin)
+            }
+            Some(Message::Depth(pb::DepthViews { views, workspace })) => {
+                one_cube(&workspace, "depth.workspace.extent")?;
+                self.of_views(views.len(), workspace, &params, call, depth(views)).await?
+            }
+            Some(Message::Clouds(pb::CloudViews { views, workspace })) => {
+                one_cube(&workspace, "clouds.workspace.extent")?;
+                self.of_views(views.len(), workspace, &params, call, clouds(views)).await?
+            }
+        };
+        if engine.source.network().is_none() {
+            let value = format_args!("`{}`", engine.source.name());
+            return Err(FieldError::new("options.model", value, "which has no network and cannot score").into());
+        }
+        match scenes.into_iter().next() {
+            Some(scene) => call.submit_candidates(&engine, scene, &candidates, origin, observed),
+            // Cannot happen: views without a surface are refused.
+            None => Err(EngineError::SessionEnded.into()),
+        }
     }
 
     /// Finds the table in a view.
@@ -232,7 +291,7 @@ impl GraspRpc {
         track: &mut Option<Track>,
         call: &mut Call,
     ) -> Result<PendingReply, Refusal> {
-        let pb::TrackGraspsRequest { mut views, workspace, options, .. } = request;
+        let pb::TrackGraspsRequest { mut views, workspace, options, half_life, .. } = request;
         let before = track.as_ref().map(|track| track.params.clone());
         let params = match (options, before) {
             (None, Some(before)) => before,
@@ -242,31 +301,55 @@ impl GraspRpc {
         call.set_model(&engine);
         // No conversion permit is needed: --max-tracked already limits the streams.
         let permit = self.fusion_permit(call).await?;
-        let (selected, old) = (Arc::clone(&engine), track.take());
+        let (selected, old, of_request) = (Arc::clone(&engine), track.take(), params.clone());
+        let start = workspace.map(|workspace| Start { workspace, half_life });
         // The volume is returned in any case, so an invalid view does not lose it.
         let (new, fused) =
-            blocking(permit, move || Ok(Track::integrate(old, &selected, params, workspace, &mut views))).await?;
+            blocking(permit, move || Ok(Track::integrate(old, &selected, of_request, start, &mut views))).await?;
         *track = new;
-        let (scene, params, origin, observed) = fused?;
-        call.submit(&engine, scene, params, origin, observed)
+        let (scenes, origin, observed) = fused?;
+        call.submit(&engine, scenes, params, origin, observed)
     }
 }
 
-/// Fuses views into a scene. Returns it with the updated parameters.
+/// Converts depth images, and finds the table if the workspace asks for it.
+fn depth(mut views: Vec<pb::DepthView>) -> impl FnOnce(&mut Workspace, f64) -> Result<Placed, FieldError> {
+    move |workspace, table| {
+        let table = workspace.find_table(&mut views, table)?;
+        let views = views.iter().enumerate();
+        let views = views.map(|(index, view)| depth_view(view, index, &workspace.frame_from_task));
+        Ok((Observation::Depth(views.collect::<Result<_, _>>()?), table))
+    }
+}
+
+/// Converts point clouds.
+fn clouds(views: Vec<pb::CloudView>) -> impl FnOnce(&mut Workspace, f64) -> Result<Placed, FieldError> {
+    move |workspace, _| {
+        if workspace.find_table {
+            return Err(FieldError::new("workspace.find_table", true, "needs depth images; send those instead"));
+        }
+        let views = views.iter().enumerate();
+        let views = views.map(|(index, view)| cloud_view(view, index, &workspace.frame_from_task));
+        Ok((Observation::Clouds(views.collect::<Result<_, _>>()?), None))
+    }
+}
+
+/// Fuses views into the scenes of a workspace.
 fn fuse(
     engine: &Engine,
-    mut params: DetectParams,
+    params: &DetectParams,
     workspace: &Workspace,
-    views: &[View],
+    observation: &Observation,
     table: Option<pb::FoundTable>,
-) -> Result<(Scene, DetectParams, Observed), Refusal> {
+) -> Result<Fused, Refusal> {
     let started = Instant::now();
-    let grid = FusionGrid::of(&engine.source, workspace, &camera_positions(views))?;
-    let mut fusion = grid.fusion();
-    let Integrated { points, warnings } = grid.integrate(&mut fusion, views)?;
-    params.constraints = grid.within(params.constraints);
-    let observed = Observed { fusion: Some(started.elapsed()), warnings, table };
-    Ok((grid.scene(&fusion, points)?, params, observed))
+    params.check_objects(observation.is_labelled())?;
+    let mut cubes = Cubes::of(&engine.source, workspace, &observation.cameras(), params.margin)?;
+    let integrated = cubes.integrate(observation)?;
+    let warnings = integrated.warnings.clone();
+    let objects = observation.objects(cubes.frame_from_task(), &params.objects);
+    let scenes = cubes.scenes(integrated, objects.as_ref(), params)?;
+    Ok((scenes, Observed { fusion: Some(started.elapsed()), warnings, table }))
 }
 
 /// Runs `work` on a thread for blocking tasks, to keep the async runtime's threads free.
@@ -313,6 +396,21 @@ impl GraspService for GraspRpc {
         let mut request = request.into_inner();
         let id = std::mem::take(&mut request.request_id);
         self.begin(id, context, async |call| self.submit_cloud(request, call).await).await.respond().await
+    }
+
+    async fn score_grasps(
+        &self,
+        request: Request<pb::ScoreGraspsRequest>,
+    ) -> Result<Response<pb::ScoreGraspsResponse>, Status> {
+        let context = CallContext::of(&request);
+        let mut request = request.into_inner();
+        let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), context);
+        let pending = match checked {
+            Ok(()) => self.submit_candidates(request, &mut call).await,
+            Err(refusal) => Err(refusal),
+        };
+        let id = call.id.clone();
+        call.finish_scores(pending).await.map(Response::new).map_err(|refusal| refusal.status(&id))
     }
 
     async fn find_table(

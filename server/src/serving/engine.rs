@@ -7,12 +7,14 @@ use anyhow::Context;
 use grasp::Volume;
 use grasp_models::{Backend, Options};
 use grasp_planner::{Loaded, Scene, Source};
-use grasp_proto::DetectParams;
+use grasp_proto::{Candidate, FieldError};
 use thiserror::Error;
 use tokio::sync::oneshot;
 use tracing::{Span, info, warn};
 
-use super::job::{Detection, Job, Reply, Task, Tensors};
+use super::cubes::CubeScene;
+use super::detection::{Detection, Score};
+use super::job::{Job, Reply, Task, Tensors};
 use super::queue::{Batching, Full, Queue, QueueSlot};
 use super::session::{ServiceTime, Session, warm_up};
 use crate::telemetry::metrics::{Metrics, ModelLabels, QueueMetrics};
@@ -24,6 +26,7 @@ pub(crate) struct Engine {
     /// `name version`, used in the log and the metrics.
     pub label: String,
     pub backend: Backend,
+    workers: usize,
     queue: Arc<Queue<Job>>,
     service_time: Arc<ServiceTime>,
 }
@@ -75,7 +78,8 @@ impl Engine {
         let queue = Arc::new(Queue::new(workers, capacity, waiting));
         // Created before the threads, so that an early return drops it, which closes the queue and ends started
         // threads.
-        let engine = Self { source, label, backend, queue, service_time: Arc::new(ServiceTime::new(service_time)) };
+        let service_time = Arc::new(ServiceTime::new(service_time));
+        let engine = Self { source, label, backend, workers, queue, service_time };
         for (worker, planner) in planners.into_iter().enumerate() {
             let (queue, service_time) = (Arc::clone(&engine.queue), Arc::clone(&engine.service_time));
             let defaults = engine.source.decode_params();
@@ -101,13 +105,25 @@ impl Engine {
     /// Queues a scene for grasp detection. Refuses immediately if the queue is full.
     pub fn detect(
         &self,
-        scene: Scene,
-        params: DetectParams,
+        CubeScene { scene, params }: CubeScene,
         deadline: Option<Deadline>,
         span: Span,
     ) -> Result<Reply<Detection>, Overloaded> {
         let (sender, receiver) = oneshot::channel();
         let slot = self.push(scene, Task::Grasps(Box::new(params), sender), deadline, span)?;
+        Ok(Reply::new(receiver, slot))
+    }
+
+    /// Queues a scene whose candidates are to be scored. Refuses immediately if the queue is full.
+    pub fn score(
+        &self,
+        CubeScene { scene, params }: CubeScene,
+        candidates: Vec<Candidate>,
+        deadline: Option<Deadline>,
+        span: Span,
+    ) -> Result<Reply<Vec<Score>>, Overloaded> {
+        let (sender, receiver) = oneshot::channel();
+        let slot = self.push(scene, Task::Scores(Box::new(params), candidates, sender), deadline, span)?;
         Ok(Reply::new(receiver, slot))
     }
 
@@ -127,6 +143,17 @@ impl Engine {
     /// Queue length, requests.
     pub fn capacity(&self) -> usize {
         self.queue.capacity()
+    }
+
+    /// Checks that the cubes of one workspace fit into an empty queue.
+    pub fn check_cubes(&self, cubes: usize) -> Result<(), FieldError> {
+        let places = self.capacity() + self.workers;
+        if cubes <= places {
+            return Ok(());
+        }
+        let value = format_args!("a workspace of {cubes} cubes with objects");
+        let needed = format_args!("must have at most {places}, the places of the model's queue (--queue)");
+        Err(FieldError::new("workspace.extent", value, needed))
     }
 
     /// Refuses if the queue is full now, before the caller converts and fuses data.

@@ -2,14 +2,15 @@
 
 use std::time::{Duration, Instant};
 
-use grasp::{DecodeError, Dropped, Grasp, Volume};
+use grasp::DecodeError;
 use grasp_models::RuntimeError;
 use grasp_planner::{PlanError, Scene};
-use grasp_proto::DetectParams;
+use grasp_proto::{Candidate, DetectParams};
 use thiserror::Error;
 use tokio::sync::oneshot;
 use tracing::Span;
 
+use super::detection::{Detection, Score};
 use super::queue::QueueSlot;
 use crate::transport::deadline::Deadline;
 
@@ -19,19 +20,6 @@ pub(crate) struct SessionOutput<T> {
     pub queue: Duration,
     pub inference: Duration,
     pub postprocessing: Duration,
-}
-
-/// The grasps in a scene.
-pub(crate) struct Detection {
-    /// Best first, at most as many as requested.
-    pub grasps: Vec<Grasp>,
-    /// For each grasp, whether the hand collides; None if not requested.
-    pub collides: Option<Vec<bool>>,
-    /// Counts of dropped candidates by reason.
-    pub dropped: Dropped,
-    /// Grasps beyond the requested number.
-    pub over_limit: usize,
-    pub volume: Volume,
 }
 
 /// A network's [`OUTPUTS`](grasp_models::OUTPUTS), as bytes: f32, little-endian.
@@ -46,7 +34,7 @@ pub(crate) enum EngineError {
     Decode(#[from] DecodeError),
     #[error("the session panicked: {0}")]
     Panic(String),
-    #[error("the planner has no network, which ModelInfer requires")]
+    #[error("the planner has no network, which ModelInfer and ScoreGrasps require")]
     NoNetwork,
     #[error("the session thread has ended")]
     SessionEnded,
@@ -105,6 +93,7 @@ pub(super) struct Job {
 /// What a session computes from a scene.
 pub(super) enum Task {
     Grasps(Box<DetectParams>, Sender<Detection>),
+    Scores(Box<DetectParams>, Vec<Candidate>, Sender<Vec<Score>>),
     /// The network's raw output.
     Maps(Sender<Tensors>),
 }
@@ -113,6 +102,7 @@ impl Task {
     pub fn is_closed(&self) -> bool {
         match self {
             Self::Grasps(_, reply) => reply.is_closed(),
+            Self::Scores(_, _, reply) => reply.is_closed(),
             Self::Maps(reply) => reply.is_closed(),
         }
     }
@@ -121,6 +111,7 @@ impl Task {
     pub fn fail(self, error: EngineError) {
         match self {
             Self::Grasps(_, reply) => drop(reply.send(Err(error))),
+            Self::Scores(_, _, reply) => drop(reply.send(Err(error))),
             Self::Maps(reply) => drop(reply.send(Err(error))),
         }
     }

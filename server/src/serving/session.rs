@@ -5,15 +5,15 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use grasp::{DecodeParams, Decoded, Obstacles, Volume};
+use grasp::{DecodeParams, Volume};
 use grasp_models::batch_sizes;
 use grasp_planner::{Inference, Loaded, NetworkPlanner, PlanParams, Planner};
-use grasp_proto::{Collision, DetectParams};
 use nalgebra::Isometry3;
 use prometheus::Histogram;
 use tracing::error;
 
-use super::job::{Detection, EngineError, Job, Sender, SessionOutput, Task, Tensors};
+use super::detection::{Detection, Score};
+use super::job::{EngineError, Job, Sender, SessionOutput, Task, Tensors};
 use super::queue::{Batching, Queue};
 use crate::transport::deadline::Deadline;
 
@@ -128,7 +128,15 @@ fn infer<'a>(
                     let is_wanted = || !reply.is_closed() && !deadline.is_some_and(Deadline::has_passed);
                     Ok(output.decode(index, &scene.volume, &params.decode_params(defaults), &is_wanted)?)
                 });
-                send_result(reply, submitted, times, started, || Ok(detection(decoded?, scene.volume, &params)));
+                let detection = || Ok(Detection::of(decoded?, scene.volume, &params));
+                send_result(reply, submitted, times, started, detection);
+            }
+            Task::Scores(params, candidates, reply) => {
+                let decode = params.decode_params(defaults);
+                let poses: Vec<_> = candidates.iter().map(|candidate| candidate.pose).collect();
+                let qualities = caught(|| Ok(output.score(index, &scene.volume, &poses, &decode)?));
+                let scores = || Ok(Score::of(&candidates, qualities?, &scene.volume, &params, decode.threshold));
+                send_result(reply, submitted, times, started, scores);
             }
             Task::Maps(reply) => send_result(reply, submitted, times, started, || Ok(tensors(output, index))),
         }
@@ -153,9 +161,10 @@ fn plan<'a>(
                 Ok(planner.plan(&scene, &params, &keep_going)?)
             });
             let times = done(started.elapsed());
-            send_result(reply, submitted, times, Instant::now(), || Ok(detection(decoded?, scene.volume, &params)));
+            let detection = || Ok(Detection::of(decoded?, scene.volume, &params));
+            send_result(reply, submitted, times, Instant::now(), detection);
         }
-        Task::Maps(_) => {
+        Task::Maps(_) | Task::Scores(..) => {
             done(Duration::ZERO);
             task.fail(EngineError::NoNetwork);
         }
@@ -183,18 +192,6 @@ fn send_result<T>(
     let (queue, postprocessing) = (taken.duration_since(submitted), started.elapsed());
     // Fails if the client has cancelled, which the call counts.
     let _ = reply.send(result.map(|value| SessionOutput { value, queue, inference, postprocessing }));
-}
-
-/// The requested number of grasps, with collision flags if requested.
-fn detection(decoded: Decoded, volume: Volume, params: &DetectParams) -> Detection {
-    let Decoded { mut grasps, dropped } = decoded;
-    let over_limit = grasps.len().saturating_sub(params.max_grasps);
-    grasps.truncate(params.max_grasps);
-    let collides = (params.collision == Collision::Flag).then(|| {
-        let obstacles = Obstacles::observed(&volume, params.clearance());
-        grasps.iter().map(|grasp| obstacles.meet(&grasp.pose)).collect()
-    });
-    Detection { grasps, collides, dropped, over_limit, volume }
 }
 
 fn tensors(output: &Inference, index: usize) -> Tensors {

@@ -1,7 +1,7 @@
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use grasp::{Fusion, View};
 use grasp_proto::{DetectParams, FieldError, MAX_VIEWS, TABLE_HEIGHT, Workspace, check_count, depth_view, pb};
 use nalgebra::Isometry3;
 use prometheus::IntGauge;
@@ -9,9 +9,9 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use crate::rpc::call::{FrameStamp, Observed};
 use crate::rpc::refusal::Refusal;
+use crate::serving::cubes::{CubeScene, Cubes};
 use crate::serving::engine::Engine;
-use crate::serving::scene::{FusionGrid, Integrated, camera_positions};
-use grasp_planner::Scene;
+use crate::serving::observation::Observation;
 
 /// Limits on TrackGrasps streams: their number, and the time without a request.
 pub(crate) struct TrackedVolumes {
@@ -54,40 +54,48 @@ impl Drop for TrackPermit {
     }
 }
 
-/// The volume of a TrackGrasps stream, to which each request adds views.
+/// The field of a TrackGrasps stream, to which each request adds views.
 pub(crate) struct Track {
-    grid: FusionGrid,
-    fusion: Fusion,
-    frame_from_task: Isometry3<f64>,
+    cubes: Cubes,
     origin: FrameStamp,
     /// The parameters of the latest request with options.
     pub params: DetectParams,
 }
 
-/// The scene, its parameters, frame and stamp, and what the fusion showed.
-type Fused = (Scene, DetectParams, FrameStamp, Observed);
+/// The start of a new field.
+pub(crate) struct Start {
+    pub workspace: pb::Workspace,
+    /// Half-life of the measurements, views.
+    pub half_life: Option<f64>,
+}
+
+/// The scenes, frame and stamp, and what the fusion showed.
+type Fused = (Vec<CubeScene>, FrameStamp, Observed);
+
+/// Shortest and longest half-life, views.
+const HALF_LIFE: RangeInclusive<f64> = 0.5..=10_000.0;
 
 impl Track {
-    /// Adds views to the volume, or to a new one if a workspace is given. An invalid view is an error; views before it
+    /// Adds views to the field, or to a new one if a workspace is given. An invalid view is an error; views before it
     /// in the request may already be integrated.
     pub fn integrate(
         track: Option<Self>,
         engine: &Engine,
         params: DetectParams,
-        workspace: Option<pb::Workspace>,
+        start: Option<Start>,
         views: &mut [pb::DepthView],
     ) -> (Option<Self>, Result<Fused, Refusal>) {
-        match (track, workspace) {
+        match (track, start) {
             (None, None) => {
                 let missing = FieldError::new("workspace", "absent", "must be given in the first request of a stream");
                 (None, Err(missing.into()))
             }
             (Some(mut track), None) => {
-                let views = converted(views, &track.frame_from_task);
+                let views = converted(views, track.cubes.frame_from_task());
                 let fused = views.map_err(Refusal::from).and_then(|views| track.add(engine, params, &views, None));
                 (Some(track), fused)
             }
-            (track, Some(workspace)) => match Self::start(engine, &params, workspace, views) {
+            (track, Some(start)) => match Self::start(engine, &params, start, views) {
                 Ok((mut track, views, table)) => {
                     let fused = track.add(engine, params, &views, table);
                     (Some(track), fused)
@@ -97,47 +105,60 @@ impl Track {
         }
     }
 
-    /// An empty volume, its first views, and the table that determined its pose.
+    /// An empty field, its first views, and the table that determined its pose.
     fn start(
         engine: &Engine,
         params: &DetectParams,
-        workspace: pb::Workspace,
+        Start { workspace, half_life }: Start,
         views: &mut [pb::DepthView],
-    ) -> Result<(Self, Vec<View>, Option<pb::FoundTable>), Refusal> {
+    ) -> Result<(Self, Observation, Option<pb::FoundTable>), Refusal> {
+        if let Some(half_life) = half_life
+            && !HALF_LIFE.contains(&half_life)
+        {
+            let needed = format_args!("must be from {} to {} views", HALF_LIFE.start(), HALF_LIFE.end());
+            return Err(FieldError::new("half_life", half_life, needed).into());
+        }
         let mut workspace = Workspace::try_from(workspace)?;
         let origin =
             FrameStamp::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
         // The rotation of the grid may depend on the camera positions.
         check_count(views.len())?;
         let table = workspace.find_table(views, params.table.unwrap_or(TABLE_HEIGHT))?;
-        let frame_from_task = workspace.frame_from_task;
-        let views = converted(views, &frame_from_task)?;
-        let grid = FusionGrid::of(&engine.source, &workspace, &camera_positions(&views))?;
-        Ok((Self { fusion: grid.fusion(), grid, frame_from_task, origin, params: params.clone() }, views, table))
+        let views = converted(views, &workspace.frame_from_task)?;
+        let cubes = Cubes::of(&engine.source, &workspace, &views.cameras(), params.margin)?;
+        let cubes = match half_life {
+            Some(half_life) => cubes.forgetting(half_life),
+            None => cubes,
+        };
+        Ok((Self { cubes, origin, params: params.clone() }, views, table))
     }
 
     fn add(
         &mut self,
         engine: &Engine,
         params: DetectParams,
-        views: &[View],
+        views: &Observation,
         table: Option<pb::FoundTable>,
     ) -> Result<Fused, Refusal> {
         let started = Instant::now();
-        self.grid.check(&engine.source)?;
-        let Integrated { warnings, .. } = self.grid.integrate(&mut self.fusion, views)?;
+        self.cubes.check(&engine.source)?;
+        params.check_objects(views.is_labelled())?;
+        let integrated = self.cubes.integrate(views)?;
+        let warnings = integrated.warnings.clone();
+        let objects = views.objects(self.cubes.frame_from_task(), &params.objects);
         // Without points: those of earlier views are not stored.
-        let scene = self.grid.scene(&self.fusion, None)?;
-        self.params = DetectParams { constraints: self.grid.within(params.constraints), ..params };
+        let scenes = self.cubes.scenes(integrated.without_points(), objects.as_ref(), &params)?;
+        self.params = params;
         let observed = Observed { fusion: Some(started.elapsed()), warnings, table };
-        Ok((scene, self.params.clone(), self.origin.clone(), observed))
+        Ok((scenes, self.origin.clone(), observed))
     }
 }
 
-fn converted(views: &[pb::DepthView], frame_from_task: &Isometry3<f64>) -> Result<Vec<View>, FieldError> {
+fn converted(views: &[pb::DepthView], frame_from_task: &Isometry3<f64>) -> Result<Observation, FieldError> {
     if views.len() > MAX_VIEWS {
         let needed = format_args!("must have at most {MAX_VIEWS}");
         return Err(FieldError::new("views", format_args!("a list of {}", views.len()), needed));
     }
-    views.iter().enumerate().map(|(index, view)| depth_view(view, index, frame_from_task)).collect()
+    let views = views.iter().enumerate().map(|(index, view)| depth_view(view, index, frame_from_task));
+    Ok(Observation::Depth(views.collect::<Result<_, _>>()?))
 }

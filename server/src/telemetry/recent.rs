@@ -2,12 +2,13 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use grasp::{Fusion, Grasp, SurfaceMesh, Volume};
-use nalgebra::Isometry3;
+use grasp::{Fusion, Volume};
+use nalgebra::{Isometry3, Translation3, Vector3};
 use serde_json::{Value, json};
 use tokio::sync::watch;
 use tonic::Code;
 
+use crate::serving::detection::Detected;
 use crate::telemetry::metrics::code_name;
 use crate::telemetry::timings::StageTimings;
 
@@ -31,7 +32,9 @@ pub(crate) struct RecentRequest {
 
 /// How a request ended.
 pub(crate) enum Outcome {
-    Detected(Box<Detected>),
+    Detected(Box<Shown>),
+    /// A `ScoreGrasps` call.
+    Scored(StageTimings),
     /// A `ModelInfer` call, which returns the network's output without decoding it.
     Inferred(StageTimings),
     Refused {
@@ -41,26 +44,53 @@ pub(crate) enum Outcome {
 }
 
 /// The scene and the grasps of a successful request.
-pub(crate) struct Detected {
-    pub timings: StageTimings,
-    /// `T_frame_volume`.
-    pub pose: Isometry3<f64>,
-    /// Edge length of the volume, metres.
-    pub size: f64,
-    /// None above [`MAX_RESOLUTION`](Self::MAX_RESOLUTION).
-    pub volume: Option<Volume>,
-    /// In the parent frame of `pose`.
-    pub grasps: Vec<Grasp>,
-    pub collides: Option<Vec<bool>>,
+pub(crate) struct Shown {
+    timings: StageTimings,
+    /// Pose of the square that contains the cubes, at its corner.
+    pose: Isometry3<f64>,
+    /// Edge of this square, metres.
+    size: f64,
+    /// The cubes.
+    volumes: Vec<Volume>,
+    /// In the frame of the volumes' poses.
+    grasps: Vec<Detected>,
     /// Length of the fingers, metres.
-    pub finger_depth: f64,
+    finger_depth: f64,
     /// Signs that the geometry of the request is wrong.
-    pub warnings: Vec<String>,
+    warnings: Vec<String>,
 }
 
-impl Detected {
-    /// Maximum resolution of a stored volume, voxels along an edge: 1 MB per request.
-    pub const MAX_RESOLUTION: usize = 64;
+impl Shown {
+    /// Most voxels of the stored volumes: 1 MB per request. Further cubes have no surface on the page.
+    const MAX_VOXELS: usize = 1 << 18;
+
+    pub fn new(
+        timings: StageTimings,
+        mut volumes: Vec<Volume>,
+        grasps: Vec<Detected>,
+        finger_depth: f64,
+        warnings: Vec<String>,
+    ) -> Self {
+        let (pose, size) = square(&volumes);
+        let mut voxels = 0;
+        volumes.retain(|volume| {
+            voxels += volume.values().len();
+            voxels <= Self::MAX_VOXELS
+        });
+        Self { timings, pose, size, volumes, grasps, finger_depth, warnings }
+    }
+}
+
+/// Pose and edge of the square that contains cubes.
+fn square(volumes: &[Volume]) -> (Isometry3<f64>, f64) {
+    let Some(first) = volumes.first() else { return (Isometry3::identity(), 0.0) };
+    let corners = volumes.iter().map(|volume| (first.pose().inverse() * volume.pose()).translation.vector);
+    let (low, high) = corners
+        .fold((Vector3::zeros(), Vector3::zeros()), |(low, high): (Vector3<f64>, Vector3<f64>), corner| {
+            (low.inf(&corner), high.sup(&corner))
+        });
+    let edge = first.voxel_size() * first.resolution() as f64;
+    (first.pose() * Translation3::from(low), (high - low).max() + edge)
 }
 
 impl RecentRequests {
@@ -119,9 +149,14 @@ impl RecentRequest {
             Outcome::Detected(detected) => json!({
                 "code": "OK",
                 "grasps": detected.grasps.len(),
-                "best": detected.grasps.first().map(|grasp| grasp.quality),
+                "best": detected.grasps.first().map(|detected| detected.grasp.quality),
                 "warnings": detected.warnings,
                 "latency": detected.timings.stages().collect::<BTreeMap<_, _>>(),
+            }),
+            Outcome::Scored(timings) => json!({
+                "code": "OK",
+                "message": "ScoreGrasps returns the scores of the caller's grasps; none were detected.",
+                "latency": timings.stages().collect::<BTreeMap<_, _>>(),
             }),
             Outcome::Inferred(timings) => json!({
                 "code": "OK",
@@ -140,21 +175,25 @@ impl RecentRequest {
     /// vertex, `triangles` three vertex indices per triangle. A pose is x, y, z and the quaternion x, y, z, w.
     fn details(&self) -> Value {
         let mut value = self.summary();
-        if let (Some(object), Outcome::Detected(detected)) = (value.as_object_mut(), &self.outcome) {
-            let Detected { pose, size, volume, grasps, collides, finger_depth, .. } = &**detected;
-            let mesh = volume.as_ref().map(|volume| Fusion::of(volume).mesh());
-            let SurfaceMesh { vertices, triangles } = mesh.unwrap_or_default();
+        if let (Some(object), Outcome::Detected(shown)) = (value.as_object_mut(), &self.outcome) {
+            let Shown { pose, size, volumes, grasps, finger_depth, .. } = &**shown;
+            let (mut vertices, mut triangles) = (Vec::new(), Vec::new());
+            for volume in volumes {
+                let mesh = Fusion::of(volume).mesh();
+                let shown_from_volume = pose.inverse() * volume.pose();
+                let first = vertices.len() as u32;
+                vertices.extend(mesh.vertices.iter().map(|vertex| shown_from_volume * vertex));
+                triangles.extend(mesh.triangles.into_iter().flatten().map(|index| first + index));
+            }
             let vertices = vertices.iter().flat_map(|v| [v.x, v.y, v.z].map(|number| (number * 1e4).round() / 1e4));
-            let to_volume = pose.inverse();
-            let grasp = |(index, grasp): (usize, &Grasp)| {
-                let collides = collides.as_ref().and_then(|collides| collides.get(index));
-                let pose = parts(&(to_volume * grasp.pose));
+            let grasp = |Detected { grasp, collides, .. }: &Detected| {
+                let pose = parts(&(pose.inverse() * grasp.pose));
                 json!({ "pose": pose, "width": grasp.width, "depth": finger_depth, "quality": grasp.quality, "collides": collides })
             };
             object.insert("size".to_owned(), json!(size));
             object.insert("vertices".to_owned(), vertices.collect());
-            object.insert("triangles".to_owned(), triangles.into_iter().flatten().collect());
-            object.insert("grasps".to_owned(), grasps.iter().enumerate().map(grasp).collect());
+            object.insert("triangles".to_owned(), triangles.into());
+            object.insert("grasps".to_owned(), grasps.iter().map(grasp).collect());
         }
         value
     }

@@ -46,5 +46,6 @@ pub fn depth_view(view: &View) -> DepthView {
         height: height as u32,
         k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
         extrinsics: Extrinsics::CameraFromTask(view.camera_from_task),
+        labels: None,
     }
 }

@@ -28,6 +28,19 @@ pub(crate) struct DetectArgs {
     #[arg(long, default_value_t = 0)]
     max_grasps: u32,
 
+    /// Return only grasps on the objects with these labels (see --labels); the others remain obstacles.
+    #[arg(long, value_name = "LABEL,…", value_delimiter = ',')]
+    objects: Vec<u32>,
+
+    /// Return at most this many grasps on one object, with --labels. 0: no limit.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    max_grasps_per_object: u32,
+
+    /// Smallest distance of the fingertips from the sides of the workspace's cube, metres: an object that a side cuts
+    /// looks like a thinner one. Default: 0.
+    #[arg(long, value_name = "METRES")]
+    margin: Option<f64>,
+
     /// Also report how many voxels were dropped, by reason.
     #[arg(long)]
     explain: bool,
@@ -36,6 +49,10 @@ pub(crate) struct DetectArgs {
     /// the grasps, metres.
     #[arg(long, value_name = "X,Y,Z,X,Y,Z", allow_hyphen_values = true)]
     region: Option<Numbers<6>>,
+
+    /// Pose of the frame of --region in the frame of the grasps, for a box of any direction. Formats as for --workspace.
+    #[arg(long, value_name = "FILE|NUMBERS", requires = "region", allow_hyphen_values = true)]
+    region_pose: Option<Poses>,
 
     /// Only grasps whose approach direction is within this angle of a direction in the frame of the grasps.
     #[arg(long, value_name = "X,Y,Z,DEGREES", allow_hyphen_values = true)]
@@ -56,6 +73,14 @@ pub(crate) struct DetectArgs {
     /// Check of the open hand for collisions with the observed surface and the table.
     #[arg(long, value_enum, default_value_t = Collision::Off)]
     collision: Collision,
+
+    /// Smallest distance between the hand and the obstacles in the collision check, metres. Default: 0.
+    #[arg(long, value_name = "METRES")]
+    clearance: Option<f64>,
+
+    /// In the collision check, also treat as an obstacle what lies behind a surface in every view.
+    #[arg(long)]
+    hidden: bool,
 
     /// Height of the table above the bottom of the workspace, metres.
     #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
@@ -122,7 +147,9 @@ impl DetectArgs {
         let parent_from_grasp = self.parent_from_grasp.as_ref().map(Poses::one).transpose()?;
         let vector = |[x, y, z]: [f64; 3]| Some(pb::Vector3 { x, y, z });
         let corners = |Numbers([a, b, c, x, y, z])| pb::Box { min: vector([a, b, c]), max: vector([x, y, z]) };
-        let Self { model, version, threshold, force, max_grasps, explain, min_height, table_height, .. } = self.clone();
+        let region_pose = self.region_pose.as_ref().map(Poses::one).transpose()?;
+        let Self { model, version, threshold, force, max_grasps, explain, min_height, .. } = self.clone();
+        let Self { objects, max_grasps_per_object, margin, table_height, clearance, hidden, .. } = self.clone();
         Ok(DetectOptions {
             model,
             version,
@@ -131,14 +158,18 @@ impl DetectArgs {
             max_grasps,
             explain,
             min_height,
+            objects,
+            max_grasps_per_object,
+            margin,
             region: self.region.map(corners),
+            region_pose: region_pose.as_ref().map(Into::into),
             approach: self
                 .approach
                 .map(|Numbers([x, y, z, degrees])| pb::Cone { axis: vector([x, y, z]), angle: degrees.to_radians() }),
             gripper: self.gripper.map(|Numbers([max_opening, finger_depth, finger_width, finger_breadth])| {
                 pb::Gripper { max_opening, finger_depth, finger_width, finger_breadth, palm: self.palm.map(corners) }
             }),
-            collision: Some(pb::CollisionCheck { mode: self.collision as i32, table_height }),
+            collision: Some(pb::CollisionCheck { mode: self.collision as i32, table_height, clearance, hidden }),
             convention: Some(pb::Convention {
                 origin: self.origin as i32,
                 closing_axis: self.closing as i32,

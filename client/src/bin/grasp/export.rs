@@ -9,17 +9,21 @@ use serde_json::json;
 /// One row per grasp; metres, quaternions x y z w.
 pub(crate) fn csv(detection: &Detection) -> String {
     let mut text =
-        "quality,width,x,y,z,qx,qy,qz,qw,pregrasp_x,pregrasp_y,pregrasp_z,collides,retreat_x,retreat_y,retreat_z\n"
+        "quality,width,x,y,z,qx,qy,qz,qw,pregrasp_x,pregrasp_y,pregrasp_z,collides,retreat_x,retreat_y,retreat_z,object,\
+         open_width\n"
             .to_owned();
-    for Proposal { pose, width, quality, pregrasp, retreat, collides } in &detection.grasps {
+    for Proposal { pose, width, quality, pregrasp, retreat, collides, object, open_width } in &detection.grasps {
         let ([x, y, z], [qx, qy, qz, qw]) = parts(pose);
         let ([px, py, pz], _) = parts(pregrasp);
         let ([rx, ry, rz], _) = parts(retreat);
         let collides = collides.map(|collides| collides.to_string()).unwrap_or_default();
+        let object = object.map(|object| object.to_string()).unwrap_or_default();
+        let open_width = open_width.map(|width| width.to_string()).unwrap_or_default();
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
-            "{quality},{width},{x},{y},{z},{qx},{qy},{qz},{qw},{px},{py},{pz},{collides},{rx},{ry},{rz}"
+            "{quality},{width},{x},{y},{z},{qx},{qy},{qz},{qw},{px},{py},{pz},{collides},{rx},{ry},{rz},{object},\
+             {open_width}"
         );
     }
     text

@@ -5,6 +5,7 @@ mod detect_args;
 mod export;
 mod files;
 mod image;
+mod labels;
 mod numbers;
 mod overlay;
 mod pose;
@@ -33,6 +34,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use tonic::Code;
 
 use crate::detect_args::DetectArgs;
+use crate::pose::Poses;
 use crate::scene::SceneArgs;
 use crate::table::Table;
 use crate::view::ViewArgs;
@@ -83,6 +85,8 @@ enum Command {
     Watch(Watch),
     /// Find the table in a depth image, and the workspace over what stands on it. Needs no server.
     Table(Table),
+    /// Score your own grasps: the predicted quality of each, and which of the options it violates.
+    Score(Score),
     /// Draw the grasps, or record them for Foxglove and Rerun.
     View(View),
     /// Measure latency and throughput of the server with repeated requests.
@@ -129,6 +133,19 @@ struct Watch {
     /// Exit after this many detections. Default: no limit.
     #[arg(long, value_name = "N")]
     count: Option<u64>,
+}
+
+#[derive(Args)]
+struct Score {
+    #[command(flatten)]
+    scene: SceneArgs,
+
+    #[command(flatten)]
+    detect: DetectArgs,
+
+    /// T_frame_grasp of each grasp, in the convention of --origin and --closing. Formats as for --camera-from-task.
+    #[arg(long, value_name = "FILE|NUMBERS", allow_hyphen_values = true)]
+    grasps: Poses,
 }
 
 #[derive(Args)]
@@ -251,6 +268,11 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
                 }
                 tokio::time::sleep(Duration::from_secs_f64(every)).await;
             }
+        }
+        Command::Score(Score { scene: args, detect, grasps }) => {
+            let (scene, detect, grasps) = (args.read()?, detect.read()?, grasps.all()?);
+            let scores = scene.score(&connect().await?, &grasps, options(&args, detect)).await?;
+            show::print(&if json { show::scores_json(&scores) } else { show::scores(&scores) })?;
         }
         Command::View(View { scene: args, detect, view }) => {
             // The drawing needs the finger base frame, so that --origin and --closing do not apply.

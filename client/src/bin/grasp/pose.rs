@@ -56,6 +56,14 @@ impl Poses {
         }
     }
 
+    /// All poses.
+    pub fn all(&self) -> anyhow::Result<Vec<Isometry3<f64>>> {
+        match self {
+            Self::Numbers(pose) => Ok(vec![*pose]),
+            Self::File(path) => in_file(path, poses),
+        }
+    }
+
     /// One pose for each of `count` inputs; `inputs` names them in the error.
     pub fn each(&self, count: usize, inputs: &str) -> anyhow::Result<Vec<Isometry3<f64>>> {
         match self {

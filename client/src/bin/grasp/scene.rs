@@ -1,14 +1,17 @@
 use std::path::PathBuf;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use clap::Args;
 use grasp::{DepthImage, Fusion, Intrinsics, RESOLUTION, View, Volume, WORKSPACE_SIZE, seen_from};
-use grasp_client::{Client, CloudView, Depth, DepthView, Detection, Error, Extrinsics, FindTable, Options, Workspace};
+use grasp_client::{
+    Client, CloudView, Depth, DepthView, Detection, Error, Extrinsics, FindTable, Observation, Options, Scores,
+    Workspace,
+};
 use nalgebra::{Isometry3, Point3};
 
 use crate::numbers::Numbers;
 use crate::pose::Poses;
-use crate::{cloud, image, pose, volume};
+use crate::{cloud, image, labels, pose, volume};
 
 /// The observation: a volume, depth images with camera poses, or point clouds with camera positions.
 #[derive(Args, Clone)]
@@ -68,6 +71,15 @@ pub(crate) struct SceneArgs {
     #[arg(long, value_name = "FILE|NUMBERS", requires = "camera_position", allow_hyphen_values = true)]
     frame_from_cloud: Option<Poses>,
 
+    /// Labels of the objects in each depth image or point cloud, in the order of these files: 8- or 16-bit grey PNG, or
+    /// .npy with integers; 0 is no object. Give it once for each.
+    #[arg(long, value_name = "FILE")]
+    labels: Vec<PathBuf>,
+
+    /// Lengths of the workspace along x and y, metres, at most 2: larger than one cube. Default: one cube.
+    #[arg(long, value_name = "X,Y")]
+    size: Option<Numbers<2>>,
+
     /// T_frame_task: pose of the workspace's corner, formats as for --camera-from-task. Default: identity.
     #[arg(long, value_name = "FILE|NUMBERS", allow_hyphen_values = true)]
     workspace: Option<Poses>,
@@ -91,7 +103,8 @@ impl SceneArgs {
         let Self { files, intrinsics, camera_from_task, frame_from_camera, frame_from_cloud, workspace, .. } = self;
         let poses = [camera_from_task, frame_from_camera, frame_from_cloud, workspace].into_iter().flatten();
         let intrinsics = intrinsics.as_deref().and_then(pose::intrinsics_file);
-        files.iter().cloned().chain(intrinsics).chain(poses.filter_map(Poses::file).cloned())
+        let labels = self.labels.iter().cloned();
+        files.iter().cloned().chain(labels).chain(intrinsics).chain(poses.filter_map(Poses::file).cloned())
     }
 
     pub fn frame_id(&self) -> String {
@@ -101,7 +114,8 @@ impl SceneArgs {
     pub fn read(&self) -> anyhow::Result<Scene> {
         let pose = self.workspace.as_ref().map(Poses::one).transpose()?.unwrap_or_default();
         let find_table = self.find_table.then(|| FindTable { gravity: self.gravity.map(|Numbers(gravity)| gravity) });
-        let workspace = Workspace { pose, size: None, find_table };
+        let extent = self.size.map(|Numbers(extent)| extent);
+        let workspace = Workspace { pose, size: None, find_table, extent };
         if let Some(intrinsics) = &self.intrinsics {
             return Ok(Scene::Depth(self.images(intrinsics)?, workspace));
         }
@@ -115,7 +129,22 @@ impl SceneArgs {
                 self.files.len()
             )
         };
+        ensure!(extent.is_none() && self.labels.is_empty(), "--size and --labels need depth images or point clouds");
         Ok(Scene::Volume(Box::new(volume::read(file, self.voxel_size, pose)?)))
+    }
+
+    /// The labels of each file, if given.
+    fn labels(&self) -> anyhow::Result<Vec<Option<Vec<u16>>>> {
+        if self.labels.is_empty() {
+            return Ok(vec![None; self.files.len()]);
+        }
+        ensure!(
+            self.labels.len() == self.files.len(),
+            "--labels is given {} times for {} files; give it once for each",
+            self.labels.len(),
+            self.files.len()
+        );
+        self.labels.iter().map(|path| labels::read(path).map(Some)).collect()
     }
 
     fn images(&self, intrinsics: &str) -> anyhow::Result<Vec<DepthView>> {
@@ -134,11 +163,11 @@ impl SceneArgs {
                 ),
             };
         let poses = poses.each(self.files.len(), "images")?;
-        let view = |(file, pose): (&PathBuf, Isometry3<f64>)| {
+        let view = |((file, pose), labels): ((&PathBuf, Isometry3<f64>), _)| {
             let (depth, width, height) = image::read(file, self.depth_scale)?;
-            Ok(DepthView { depth, width, height, k, extrinsics: direction(pose) })
+            Ok(DepthView { depth, width, height, k, extrinsics: direction(pose), labels })
         };
-        self.files.iter().zip(poses).map(view).collect()
+        self.files.iter().zip(poses).zip(self.labels()?).map(view).collect()
     }
 
     fn clouds(&self) -> anyhow::Result<Vec<CloudView>> {
@@ -155,10 +184,10 @@ impl SceneArgs {
             Some(poses) => poses.each(count, "point clouds")?,
             None => vec![Isometry3::identity(); count],
         };
-        let view = |((file, Numbers(camera_position)), frame_from_cloud): ((&PathBuf, _), _)| {
-            Ok(CloudView { points: cloud::read(file)?, frame_from_cloud, camera_position })
+        let view = |(((file, Numbers(camera_position)), frame_from_cloud), labels): (((&PathBuf, _), _), _)| {
+            Ok(CloudView { points: cloud::read(file)?, frame_from_cloud, camera_position, labels })
         };
-        self.files.iter().zip(positions).zip(poses).map(view).collect()
+        self.files.iter().zip(positions).zip(poses).zip(self.labels()?).map(view).collect()
     }
 }
 
@@ -180,6 +209,21 @@ impl Scene {
         }
     }
 
+    /// Scores grasps in the observation.
+    pub async fn score(
+        &self,
+        client: &Client,
+        candidates: &[Isometry3<f64>],
+        options: Options,
+    ) -> Result<Scores, Error> {
+        let observation = match self {
+            Self::Volume(volume) => Observation::Volume(volume),
+            Self::Depth(views, workspace) => Observation::Depth(views, workspace),
+            Self::Clouds(views, workspace) => Observation::Clouds(views, workspace),
+        };
+        client.score(observation, candidates, options).await
+    }
+
     /// The volume to draw: the given one, or the fused images or points.
     pub fn volume(&self, detection: &Detection) -> anyhow::Result<Volume> {
         let (views, workspace) = match self {
@@ -193,7 +237,10 @@ impl Scene {
                 (views.collect::<anyhow::Result<Vec<_>>>()?, *workspace)
             }
         };
-        let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
+        let [x, y] = workspace.extent.unwrap_or_default();
+        let size = x.max(y).max(WORKSPACE_SIZE);
+        let resolution = (size / WORKSPACE_SIZE * RESOLUTION as f64).ceil() as usize;
+        let mut fusion = Fusion::new(resolution.min(Volume::MAX_RESOLUTION), size);
         for view in views {
             fusion.integrate(&DepthImage::new(view.intrinsics, &view.depth)?, &view.camera_from_task);
         }
@@ -224,7 +271,7 @@ pub(crate) fn depth_view(view: &DepthView, workspace: &Workspace) -> View {
         Extrinsics::CameraFromTask(pose) => pose,
         Extrinsics::FrameFromCamera(pose) => pose.inverse() * workspace.pose,
     };
-    View { intrinsics: Intrinsics { width, height, fx, fy, cx, cy }, depth, camera_from_task }
+    View { intrinsics: Intrinsics { width, height, fx, fy, cx, cy }, depth, camera_from_task, labels: None }
 }
 
 /// Renders a cloud to a depth image, as the server does.
@@ -232,6 +279,7 @@ fn rendered_view(view: &CloudView, workspace: &Workspace) -> anyhow::Result<View
     let task_from_cloud = workspace.pose.inverse() * view.frame_from_cloud;
     let points: Vec<_> = view.points.iter().map(|&point| task_from_cloud * Point3::from(point).cast::<f64>()).collect();
     let eye = task_from_cloud * Point3::from(view.camera_position);
-    seen_from(&points, &eye, WORKSPACE_SIZE)
+    let [x, y] = workspace.extent.unwrap_or_default();
+    seen_from(&points, &eye, x.max(y).max(WORKSPACE_SIZE))
         .context("a camera sees no point of its cloud; check --camera-position and the poses")
 }

@@ -3,7 +3,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use comfy_table::{Cell, CellAlignment, Table, presets};
-use grasp_client::{Detection, Dropped, FoundTable, GeometryWarning, Latency, Model, Report};
+use grasp_client::{Detection, Dropped, FoundTable, GeometryWarning, Latency, Model, Report, Score, Scores};
 use nalgebra::Isometry3;
 use serde_json::{Value, json};
 use tonic::Code;
@@ -22,12 +22,16 @@ pub(crate) fn detection(detection: &Detection) -> String {
     if detection.grasps.is_empty() {
         text += "No grasps.\n";
     } else {
-        let mut table = numbers(&["", "quality", "x m", "y m", "z m", "qx", "qy", "qz", "qw", "width m"]);
+        let has_objects = detection.grasps.iter().any(|grasp| grasp.object.is_some());
+        let columns = ["", "quality", "x m", "y m", "z m", "qx", "qy", "qz", "qw", "width m"];
+        let columns = columns.into_iter().chain(has_objects.then_some("object"));
+        let mut table = numbers(&columns.collect::<Vec<_>>());
         for (rank, grasp) in detection.grasps.iter().enumerate() {
             let (position, rotation) = (grasp.pose.translation.vector, grasp.pose.rotation.coords);
             let pose = position.iter().chain(&rotation).map(|c| format!("{c:.4}"));
             let row = [(rank + 1).to_string(), format!("{:.3}", grasp.quality)].into_iter().chain(pose);
-            table.add_row(right(row.chain([format!("{:.4}", grasp.width)])));
+            let object = has_objects.then(|| grasp.object.map(|object| object.to_string()).unwrap_or_default());
+            table.add_row(right(row.chain([format!("{:.4}", grasp.width)]).chain(object)));
         }
         text += &format!("{table}\n");
     }
@@ -62,6 +66,8 @@ pub(crate) fn detection_json(detection: &Detection) -> String {
             "pregrasp": pose(&grasp.pregrasp),
             "retreat": pose(&grasp.retreat),
             "collides": grasp.collides,
+            "object": grasp.object,
+            "open_width": grasp.open_width,
         })
     });
     let object =
@@ -78,6 +84,49 @@ pub(crate) fn detection_json(detection: &Detection) -> String {
         "dropped": detection.dropped.as_ref().map(|d| object(&reasons(d).map(|(reason, n)| (reason, json!(n))))),
     });
     format!("{value:#}")
+}
+
+pub(crate) fn scores(scores: &Scores) -> String {
+    let mut table = numbers(&["", "quality", "open width m", "object", "violations"]);
+    for (index, score) in scores.scores.iter().enumerate() {
+        let open_width = score.open_width.map(|width| format!("{width:.4}")).unwrap_or_default();
+        let object = score.object.map(|object| object.to_string()).unwrap_or_default();
+        let quality = format!("{:.3}", score.quality);
+        table.add_row(right([(index + 1).to_string(), quality, open_width, object, violations(score).join(", ")]));
+    }
+    let mut text = format!("{table}\n");
+    for warning in &scores.warnings {
+        text += &format!("warning: {}\n", warning.message);
+    }
+    text + &format!("{} {}; {:.2} ms", scores.model, scores.version, scores.latency.total * 1e3)
+}
+
+pub(crate) fn scores_json(scores: &Scores) -> String {
+    let score = |score: &Score| {
+        json!({
+            "quality": score.quality,
+            "violations": violations(score),
+            "object": score.object,
+            "open_width": score.open_width,
+        })
+    };
+    let value = json!({
+        "request_id": scores.request_id,
+        "model": scores.model,
+        "version": scores.version,
+        "scores": scores.scores.iter().map(score).collect::<Vec<_>>(),
+        "table": scores.table.as_ref().map(table_json),
+        "warnings": scores.warnings.iter().map(warning_json).collect::<Vec<_>>(),
+    });
+    format!("{value:#}")
+}
+
+/// The names of the violations of a score.
+fn violations(score: &Score) -> Vec<String> {
+    let name = |violation: grasp_client::pb::score::Violation| {
+        violation.as_str_name().trim_start_matches("VIOLATION_").to_lowercase()
+    };
+    score.violations().map(name).collect()
 }
 
 fn table_json(table: &FoundTable) -> Value {
@@ -215,7 +264,7 @@ fn stages(latency: &Latency) -> [(&'static str, f64); 6] {
     ]
 }
 
-fn reasons(dropped: &Dropped) -> [(&'static str, u32); 9] {
+fn reasons(dropped: &Dropped) -> [(&'static str, u32); 10] {
     [
         ("below_threshold", dropped.below_threshold),
         ("mask", dropped.mask),
@@ -223,6 +272,7 @@ fn reasons(dropped: &Dropped) -> [(&'static str, u32); 9] {
         ("region", dropped.region),
         ("approach", dropped.approach),
         ("height", dropped.height),
+        ("object", dropped.object),
         ("collision", dropped.collision),
         ("suppressed", dropped.suppressed),
         ("over_limit", dropped.over_limit),

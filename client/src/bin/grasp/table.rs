@@ -59,6 +59,7 @@ impl Table {
             height,
             k,
             extrinsics: Extrinsics::FrameFromCamera(Isometry3::identity()),
+            labels: None,
         };
         let gravity = self.gravity.map(|Numbers(gravity)| {
             Unit::try_new(Vector3::from(gravity), 1e-9).context("--gravity is 0,0,0; it must be a direction")

@@ -1,0 +1,140 @@
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+use nalgebra::{Isometry3, Point3};
+
+use crate::{Grasp, Hand};
+
+/// Which object the observed surfaces belong to, as a segmentation of the images says. Label 0 is no object.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ObjectMap {
+    /// `T_map_frame`: maps points of the frame of the grasps into that of the cells.
+    map_from_frame: Isometry3<f64>,
+    /// Label of the cells with observed points of an object.
+    cells: HashMap<[i32; 3], u16>,
+    /// The objects to grasp; `None` means all surfaces, also those of no object.
+    wanted: Option<BTreeSet<u16>>,
+}
+
+/// Edge of a cell, metres: that of a voxel of VGN's volumes.
+const CELL: f64 = 0.0075;
+
+impl ObjectMap {
+    /// A map from labelled points of the task frame. `frame_from_task` is its pose in the frame of the grasps. Empty
+    /// `wanted` means all surfaces.
+    #[must_use]
+    pub fn new(
+        points: impl Iterator<Item = (Point3<f64>, u16)>,
+        frame_from_task: &Isometry3<f64>,
+        wanted: BTreeSet<u16>,
+    ) -> Self {
+        let mut votes = HashMap::<[i32; 3], BTreeMap<u16, u32>>::new();
+        for (point, label) in points {
+            *votes.entry(cell(&point)).or_default().entry(label).or_default() += 1;
+        }
+        let label = |votes: BTreeMap<u16, u32>| most(votes).filter(|label| *label > 0);
+        let cells = votes.into_iter().filter_map(|(cell, votes)| Some((cell, label(votes)?))).collect();
+        Self { map_from_frame: frame_from_task.inverse(), cells, wanted: Some(wanted).filter(|set| !set.is_empty()) }
+    }
+
+    /// The object between the open fingers of a hand at `pose`: the one with the most cells; `None` if there is none.
+    #[must_use]
+    pub fn object(&self, pose: &Isometry3<f64>, hand: &Hand) -> Option<u16> {
+        let map_from_hand = self.map_from_frame * pose;
+        let range = |from: f64, to: f64| {
+            let steps = ((to - from) / CELL).ceil();
+            (0..=steps as u32).map(move |step| from + (to - from) * f64::from(step) / steps)
+        };
+        let mut cells = BTreeSet::new();
+        for x in range(-hand.height / 2.0, hand.height / 2.0) {
+            for y in range(-hand.half_opening(), hand.half_opening()) {
+                cells.extend(range(0.0, hand.depth).map(|z| cell(&(map_from_hand * Point3::new(x, y, z)))));
+            }
+        }
+        let mut votes = BTreeMap::new();
+        for label in cells.iter().filter_map(|cell| self.cells.get(cell)) {
+            *votes.entry(*label).or_default() += 1;
+        }
+        most(votes)
+    }
+
+    /// Whether a grasp holds an object that is wanted.
+    #[must_use]
+    pub fn admits(&self, pose: &Isometry3<f64>, hand: &Hand) -> bool {
+        let Some(wanted) = &self.wanted else { return true };
+        self.object(pose, hand).is_some_and(|object| wanted.contains(&object))
+    }
+
+    /// The grasps, best first, without those beyond the best `limit` of their object.
+    #[must_use]
+    pub fn limited(&self, grasps: Vec<Grasp>, hand: &Hand, limit: usize) -> Vec<Grasp> {
+        let mut counts = BTreeMap::<Option<u16>, usize>::new();
+        let mut is_within = |grasp: &Grasp| {
+            let count = counts.entry(self.object(&grasp.pose, hand)).or_default();
+            *count += 1;
+            *count <= limit
+        };
+        grasps.into_iter().filter(|grasp| is_within(grasp)).collect()
+    }
+}
+
+fn cell(point: &Point3<f64>) -> [i32; 3] {
+    // Saturates far outside of every workspace.
+    point.coords.map(|c| (c / CELL).floor() as i32).into()
+}
+
+/// The label with the most votes, of several the largest.
+fn most(votes: BTreeMap<u16, u32>) -> Option<u16> {
+    votes.into_iter().max_by_key(|&(_, count)| count).map(|(label, _)| label)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::PI;
+
+    use nalgebra::Vector3;
+
+    use super::*;
+
+    /// Two boxes of 4 cm on a table at z = 0.05, at x = 0.1 (label 3) and x = 0.2 (label 7), seen from above.
+    fn points() -> impl Iterator<Item = (Point3<f64>, u16)> {
+        let step = |c: usize| (c as f64 + 0.5) * 0.003;
+        (0..100).flat_map(move |x| (0..100).map(move |y| (step(x), step(y)))).map(|(x, y)| {
+            let on = |centre: f64| (x - centre).abs() < 0.02 && (y - 0.15).abs() < 0.02;
+            let (z, label) = if on(0.1) {
+                (0.09, 3)
+            } else if on(0.2) {
+                (0.09, 7)
+            } else {
+                (0.05, 0)
+            };
+            (Point3::new(x, y, z), label)
+        })
+    }
+
+    fn over(x: f64, frame_from_task: &Isometry3<f64>) -> Isometry3<f64> {
+        frame_from_task * Isometry3::new(Vector3::new(x, 0.15, 0.12), Vector3::x() * PI)
+    }
+
+    #[test]
+    fn a_grasp_is_on_the_object_between_its_fingers() {
+        let frame_from_task = Isometry3::new(Vector3::new(1.0, -2.0, 0.5), Vector3::new(0.0, 0.0, 0.7));
+        let map = ObjectMap::new(points(), &frame_from_task, BTreeSet::new());
+        let object = |x| map.object(&over(x, &frame_from_task), &Hand::PANDA);
+        assert_eq!([0.1, 0.2, 0.15].map(object), [Some(3), Some(7), None]);
+        assert!(map.admits(&over(0.15, &frame_from_task), &Hand::PANDA), "all grasps are wanted");
+
+        let map = ObjectMap::new(points(), &frame_from_task, [7].into());
+        let admits = |x| map.admits(&over(x, &frame_from_task), &Hand::PANDA);
+        assert_eq!([0.1, 0.2, 0.15].map(admits), [false, true, false]);
+    }
+
+    #[test]
+    fn each_object_keeps_its_best_grasps() {
+        let frame = Isometry3::identity();
+        let map = ObjectMap::new(points(), &frame, BTreeSet::new());
+        let grasp = |x, quality| Grasp { pose: over(x, &frame), width: 0.04, quality };
+        let grasps = vec![grasp(0.1, 0.9), grasp(0.1, 0.8), grasp(0.2, 0.7), grasp(0.1, 0.6), grasp(0.2, 0.5)];
+        let qualities: Vec<f32> = map.limited(grasps, &Hand::PANDA, 1).iter().map(|grasp| grasp.quality).collect();
+        assert_eq!(qualities, [0.9, 0.7]);
+    }
+}

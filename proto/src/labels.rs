@@ -1,0 +1,68 @@
+use crate::png;
+use crate::{FieldError, pb};
+
+/// The labels of the pixels of an image of `width` × `height`, row by row. Errors name the field in the message.
+pub(crate) fn of_image(labels: &pb::Labels, width: usize, height: usize) -> Result<Vec<u16>, FieldError> {
+    match labels.r#type() {
+        pb::LabelType::Png => {
+            png::grey(&labels.data, width, height).map_err(|reason| FieldError::refused("data", reason))
+        }
+        _ => of_points(labels, width * height),
+    }
+}
+
+/// The labels of `count` points or pixels. Errors name the field in the message.
+pub(crate) fn of_points(labels: &pb::Labels, count: usize) -> Result<Vec<u16>, FieldError> {
+    let size = match labels.r#type() {
+        pb::LabelType::U8 => 1,
+        pb::LabelType::U16 => 2,
+        pb::LabelType::Png => return Err(FieldError::new("type", "LABEL_TYPE_PNG", "which is only for images")),
+        pb::LabelType::Unspecified => {
+            let needed = "must be LABEL_TYPE_U8 (1), LABEL_TYPE_U16 (2) or LABEL_TYPE_PNG (3)";
+            return Err(FieldError::new("type", labels.r#type, needed));
+        }
+    };
+    if labels.data.len() != count * size {
+        let needed = format_args!("one label each needs {} ({})", count * size, labels.r#type().as_str_name());
+        return Err(FieldError::new("data", format_args!("{} bytes", labels.data.len()), needed));
+    }
+    Ok(match size {
+        1 => labels.data.iter().map(|&label| u16::from(label)).collect(),
+        _ => labels.data.as_chunks().0.iter().map(|&bytes| u16::from_le_bytes(bytes)).collect(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn labels(data: &[u8], r#type: pb::LabelType) -> pb::Labels {
+        pb::Labels { data: data.to_vec().into(), r#type: r#type.into() }
+    }
+
+    #[test]
+    fn every_type_gives_the_same_labels() {
+        let expected = [0, 3, 7, 255, 1, 0];
+        assert_eq!(of_image(&labels(&[0, 3, 7, 255, 1, 0], pb::LabelType::U8), 3, 2).unwrap(), expected);
+        let wide: Vec<u8> = expected.iter().flat_map(|label: &u16| label.to_le_bytes()).collect();
+        assert_eq!(of_points(&labels(&wide, pb::LabelType::U16), 6).unwrap(), expected);
+        assert_eq!(of_image(&labels(&png::encoded(&expected, 3, 2), pb::LabelType::Png), 3, 2).unwrap(), expected);
+    }
+
+    #[test]
+    fn invalid_labels_are_named() {
+        let refused = |labels: &pb::Labels| of_image(labels, 3, 2).unwrap_err().to_string();
+        assert_eq!(
+            refused(&labels(&[0; 5], pb::LabelType::U8)),
+            "data is 5 bytes, one label each needs 6 (LABEL_TYPE_U8)"
+        );
+        assert_eq!(
+            refused(&labels(&[0; 6], pb::LabelType::Unspecified)),
+            "type is 0, must be LABEL_TYPE_U8 (1), LABEL_TYPE_U16 (2) or LABEL_TYPE_PNG (3)"
+        );
+        let of_points = of_points(&labels(&[0; 6], pb::LabelType::Png), 6).unwrap_err();
+        assert_eq!(of_points.to_string(), "type is LABEL_TYPE_PNG, which is only for images");
+        let other_size = labels(&png::encoded(&[0; 6], 2, 3), pb::LabelType::Png);
+        assert_eq!(refused(&other_size), "data: the PNG has 2 × 3 pixels, the camera has 3 × 2");
+    }
+}

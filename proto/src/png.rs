@@ -1,0 +1,48 @@
+use std::io::Cursor;
+
+use png::{BitDepth, ColorType, Decoder, Limits, Transformations};
+
+/// Most pixels of an image that is sent as PNG. A small file can contain a large image.
+const MAX_PIXELS: usize = 1 << 24;
+
+/// The grey values of a PNG file of `width` × `height` pixels, row by row; the error says what is wrong.
+pub(crate) fn grey(file: &[u8], width: usize, height: usize) -> Result<Vec<u16>, String> {
+    let pixels = width * height;
+    if pixels > MAX_PIXELS {
+        return Err(format!("an image of {width} × {height} pixels is too large for PNG, at most {MAX_PIXELS} in all"));
+    }
+    let mut decoder = Decoder::new_with_limits(Cursor::new(file), Limits { bytes: 4 * MAX_PIXELS });
+    decoder.set_transformations(Transformations::EXPAND);
+    let not_png = |error: png::DecodingError| format!("not a valid PNG file: {error}");
+    let mut reader = decoder.read_info().map_err(not_png)?;
+    let info = reader.info();
+    if (info.width as usize, info.height as usize) != (width, height) {
+        let (w, h) = (info.width, info.height);
+        return Err(format!("the PNG has {w} × {h} pixels, the camera has {width} × {height}"));
+    }
+    let (color, depth) = reader.output_color_type();
+    let size = match (color, depth) {
+        (ColorType::Grayscale, BitDepth::Eight) => 1,
+        (ColorType::Grayscale, BitDepth::Sixteen) => 2,
+        _ => return Err(format!("the PNG has the type {color:?} of {depth:?} bits, must be grey of 8 or 16 bits")),
+    };
+    let mut data = vec![0; pixels * size];
+    reader.next_frame(&mut data).map_err(not_png)?;
+    Ok(match size {
+        1 => data.into_iter().map(u16::from).collect(),
+        // PNG is big-endian.
+        _ => data.as_chunks().0.iter().map(|&bytes| u16::from_be_bytes(bytes)).collect(),
+    })
+}
+
+/// A PNG file of 16-bit grey values.
+#[cfg(test)]
+pub(crate) fn encoded(values: &[u16], width: u32, height: u32) -> Vec<u8> {
+    let mut file = Vec::new();
+    let mut encoder = png::Encoder::new(&mut file, width, height);
+    encoder.set_color(ColorType::Grayscale);
+    encoder.set_depth(BitDepth::Sixteen);
+    let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_be_bytes()).collect();
+    encoder.write_header().unwrap().write_image_data(&bytes).unwrap();
+    file
+}

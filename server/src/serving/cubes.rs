@@ -1,0 +1,206 @@
+use std::sync::Arc;
+
+use grasp::{Fusion, ObjectMap, Region, SurfacePoint, Tile, WORKSPACE_SIZE, Warning};
+use grasp_planner::{Scene, Source};
+use grasp_proto::{DetectParams, FieldError, Workspace};
+use nalgebra::{Isometry3, Point3};
+
+use super::observation::{Observation, at};
+use super::scene::{FusionGrid, PointSampler, empty, sees_nothing};
+
+/// The cubes that cover a workspace: one, or several overlapping ones for a workspace with an extent.
+pub(crate) struct Cubes {
+    cubes: Vec<Cube>,
+    /// `T_frame_task`.
+    frame_from_task: Isometry3<f64>,
+    /// `T_task_middle`: the cube in the middle of the workspace.
+    task_from_middle: Isometry3<f64>,
+}
+
+/// A cube and the field that its views are fused into.
+struct Cube {
+    grid: FusionGrid,
+    fusion: Fusion,
+    /// `T_task_cube`.
+    task_from_cube: Isometry3<f64>,
+    /// The part of the workspace whose grasps come from this cube: smallest and largest x and y in the task frame.
+    /// `None` if it is the only cube.
+    inner: Option<[[f64; 2]; 2]>,
+}
+
+/// The scene in one cube, with the parameters for it.
+pub(crate) struct CubeScene {
+    pub scene: Scene,
+    pub params: DetectParams,
+}
+
+/// What the views of a request show besides the fused fields.
+pub(crate) struct Integrated {
+    /// For each cube the observed points, if the planner needs them.
+    points: Vec<Option<Vec<SurfacePoint>>>,
+    /// Signs that the geometry is wrong.
+    pub warnings: Vec<Warning>,
+}
+
+impl Integrated {
+    /// The same without observed points.
+    pub fn without_points(mut self) -> Self {
+        self.points.iter_mut().for_each(|points| *points = None);
+        self
+    }
+}
+
+impl Cubes {
+    /// The cubes that a planner requires for a workspace. `cameras` are in the task frame, metres.
+    pub fn of(
+        source: &Source,
+        workspace: &Workspace,
+        cameras: &[Point3<f64>],
+        margin: f64,
+    ) -> Result<Self, FieldError> {
+        let Workspace { frame_from_task, size, extent, .. } = *workspace;
+        let edge = edge(source, size);
+        let cube = |[x, y]: [f64; 2], inner| {
+            let task_from_cube = Isometry3::translation(x, y, 0.0);
+            let cameras: Vec<_> = cameras.iter().map(|camera| task_from_cube.inverse() * camera).collect();
+            let grid = FusionGrid::of(source, &(frame_from_task * task_from_cube), size, &cameras)?;
+            Ok::<_, FieldError>(Cube { fusion: grid.fusion(), grid, task_from_cube, inner })
+        };
+        let cubes = match extent {
+            None => vec![cube([0.0; 2], None)?],
+            Some(extent) => {
+                let tiles = Tile::cover(extent, edge, margin.max(Tile::MARGIN));
+                tiles.iter().map(|tile| cube(tile.corner, Some(tile.inner))).collect::<Result<_, _>>()?
+            }
+        };
+        let [x, y] = extent.map_or([0.0; 2], |extent| extent.map(|length| (length - edge) / 2.0));
+        Ok(Self { cubes, frame_from_task, task_from_middle: Isometry3::translation(x, y, 0.0) })
+    }
+
+    /// The cubes, whose fields forget with this half-life, views.
+    pub fn forgetting(mut self, half_life: f64) -> Self {
+        for cube in &mut self.cubes {
+            cube.fusion = cube.fusion.clone().forgetting(half_life);
+        }
+        self
+    }
+
+    /// `T_frame_task`.
+    pub fn frame_from_task(&self) -> &Isometry3<f64> {
+        &self.frame_from_task
+    }
+
+    /// Checks that a planner can use these cubes.
+    pub fn check(&self, source: &Source) -> Result<(), FieldError> {
+        self.cubes.iter().try_for_each(|cube| cube.grid.check(source))
+    }
+
+    /// Integrates views, each of which must see a part of the workspace.
+    pub fn integrate(&mut self, observation: &Observation) -> Result<Integrated, FieldError> {
+        let mut samplers: Vec<_> =
+            self.cubes.iter().map(|cube| cube.grid.needs_points().then(PointSampler::default)).collect();
+        let mut warnings = Vec::new();
+        for (index, camera) in observation.cameras().iter().enumerate() {
+            if let Some(grid) = self.cubes.first().map(|cube| &cube.grid).filter(|grid| !grid.needs_points()) {
+                warnings.extend(Warning::of_camera(index, &(at(camera) * self.task_from_middle), grid.size()));
+            }
+            let (mut is_seen, mut refusal, mut disagreement) = (false, None, None);
+            for (cube, sampler) in self.cubes.iter_mut().zip(&mut samplers) {
+                match cube.integrate(observation, index, sampler.as_mut(), &mut disagreement) {
+                    Ok(()) => is_seen = true,
+                    Err(error) => refusal = refusal.or(Some(error)),
+                }
+            }
+            if let Some(refusal) = refusal.filter(|_| !is_seen) {
+                return Err(refusal);
+            }
+            warnings.extend(disagreement);
+        }
+        let unseen: Vec<_> = self.cubes.iter().filter_map(|cube| Warning::of_coverage(&cube.fusion)).collect();
+        if unseen.len() == self.cubes.len() {
+            warnings.extend(unseen.first());
+        }
+        let points = samplers.into_iter().map(|sampler| sampler.map(PointSampler::into_points)).collect();
+        Ok(Integrated { points, warnings })
+    }
+
+    /// The scenes for the planner: those of the cubes in which something stands on the table, and at least one.
+    pub fn scenes(
+        &self,
+        integrated: Integrated,
+        objects: Option<&Arc<ObjectMap>>,
+        params: &DetectParams,
+    ) -> Result<Vec<CubeScene>, FieldError> {
+        let scene = |(cube, points): (&Cube, Option<Vec<SurfacePoint>>)| {
+            let volume = cube.grid.volume(&cube.fusion)?.with_objects(objects.cloned());
+            let mut params = params.clone();
+            params.constraints.workspace = cube.region(&self.frame_from_task, params.margin);
+            Some(CubeScene { scene: Scene { volume, points }, params })
+        };
+        let mut scenes: Vec<_> = self.cubes.iter().zip(integrated.points).filter_map(scene).collect();
+        if scenes.len() > 1 {
+            let is_used = |scene: &CubeScene| {
+                params.table.is_none_or(|table| scene.scene.volume.has_surface_above(table + OBJECT_HEIGHT))
+            };
+            let first_used = scenes.iter().position(is_used).unwrap_or_default();
+            let mut index = 0;
+            scenes.retain(|scene| {
+                index += 1;
+                index - 1 == first_used || is_used(scene)
+            });
+        }
+        if scenes.is_empty() { Err(empty()) } else { Ok(scenes) }
+    }
+}
+
+/// Smallest height of an object above the table, metres. Lower surfaces are noise, or too low for a hand.
+const OBJECT_HEIGHT: f64 = 0.01;
+
+impl Cube {
+    /// Integrates view `index`. `disagreement` becomes the warning if it contradicts the views before it.
+    fn integrate(
+        &mut self,
+        observation: &Observation,
+        index: usize,
+        sampler: Option<&mut PointSampler>,
+        disagreement: &mut Option<Warning>,
+    ) -> Result<(), FieldError> {
+        let (view, camera_from_cube) = observation.image(index, &self.task_from_cube, self.grid.size())?;
+        let image = grasp::DepthImage::new(view.intrinsics, &view.depth);
+        let image = image.map_err(|error| FieldError::refused(format!("views[{index}]"), error))?;
+        let camera_from_grid = self.grid.camera_from_grid(&camera_from_cube);
+        if disagreement.is_none() {
+            *disagreement = Warning::of_view(index, &self.fusion, &image, &camera_from_grid);
+        }
+        if self.fusion.integrate(&image, &camera_from_grid) == 0 {
+            let reason = self.fusion.blind(&image, &camera_from_grid);
+            let camera = (self.task_from_cube * camera_from_cube.inverse()).translation;
+            return Err(sees_nothing(index, &camera.vector.into(), reason));
+        }
+        if let Some(sampler) = sampler {
+            let inside = |point: &SurfacePoint| point.position.iter().all(|c| (0.0..=self.grid.size()).contains(c));
+            image.points(&camera_from_cube).filter(inside).for_each(|point| sampler.add(point));
+        }
+        Ok(())
+    }
+
+    /// The region of the cube's grasps, if it is not the whole field. The fingertips keep `margin` from the sides.
+    fn region(&self, frame_from_task: &Isometry3<f64>, margin: f64) -> Option<Region> {
+        let size = self.grid.size();
+        let [lower, upper] = match self.inner {
+            Some(inner) => inner,
+            // A grid that is rotated in its cube extends beyond it.
+            None if margin > 0.0 || self.grid.is_rotated() => [[margin; 2], [size - margin; 2]],
+            None => return None,
+        };
+        let frame = *frame_from_task;
+        Some(Region { frame, lower: [lower[0], lower[1], 0.0], upper: [upper[0], upper[1], size] })
+    }
+}
+
+/// Edge of a cube, metres: that of the request, or the planner's.
+pub(crate) fn edge(source: &Source, size: Option<f64>) -> f64 {
+    let trained = |network: &grasp_models::Metadata| network.resolution as f64 * network.voxel_size;
+    let own = source.network().map_or(WORKSPACE_SIZE, |network| trained(&network.metadata));
+    size.unwrap_or(own)
+}
