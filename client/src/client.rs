@@ -187,8 +187,8 @@ impl Client {
         Ok(Tracking { requests, replies, workspace: Some(workspace), half_life: None })
     }
 
-    /// Opens a tracked volume for a scene that moves: the weight of a measurement halves with every `half_life` further
-    /// views, and with every view that contradicts it.
+    /// Opens a tracked volume for a scene that moves: in each voxel the weight of a measurement halves with every
+    /// `half_life` further ones, and with every one that contradicts it. 10 suits most scenes.
     ///
     /// # Errors
     /// [`Error::Refused`] when the server's limit of tracked volumes is reached.

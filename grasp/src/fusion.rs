@@ -26,7 +26,7 @@ pub struct Fusion {
     voxel_size: f64,
     truncation: f32,
     voxels: Vec<Voxel>,
-    /// By this factor the weights of earlier views decrease with each view, if the field forgets.
+    /// By this factor the weight of the earlier views decreases with each measurement, if the field forgets.
     decay: Option<f32>,
 }
 
@@ -40,9 +40,6 @@ struct Voxel {
 
 /// Weight of a voxel that no view has measured, and that lies behind a surface in at least one.
 const HIDDEN: f32 = -1.0;
-
-/// Weight below which a field that forgets drops a measurement.
-const FORGOTTEN: f32 = 0.1;
 
 /// Difference between a measurement and the field, as a fraction of the truncation distance, from which they contradict
 /// each other: beyond the noise of depth cameras.
@@ -104,8 +101,9 @@ impl Fusion {
         }
     }
 
-    /// The field, which now forgets: the weight of a measurement halves with every `half_life` further views, and with
-    /// every view that contradicts it. So objects that have moved disappear from the field.
+    /// The field, which now forgets: the weight of a voxel's measurement halves with every `half_life` further
+    /// measurements of this voxel, and with every one that contradicts it. So objects that have moved disappear from the
+    /// field, and what is out of view remains.
     #[must_use]
     pub fn forgetting(self, half_life: f64) -> Self {
         Self { decay: Some(0.5_f64.powf(1.0 / half_life) as f32), ..self }
@@ -130,8 +128,7 @@ impl Fusion {
     ///
     /// Returns the number of measured voxels. If it is 0, [`blind`](Self::blind) gives the reason.
     pub fn integrate(&mut self, image: &DepthImage, camera_from_task: &Isometry3<f64>) -> usize {
-        self.fade();
-        let forgets = self.decay.is_some();
+        let decay = self.decay;
         let mut measured = 0;
         let camera = image.intrinsics();
         let (fx, fy) = (camera.fx as f32, camera.fy as f32);
@@ -189,7 +186,8 @@ impl Fusion {
                         }
                         (distance * inv_truncation).min(1.0)
                     };
-                    let weight = if forgets { voxel.supported(sample) } else { voxel.weight.max(0.0) };
+                    let weight = voxel.weight.max(0.0);
+                    let weight = decay.map_or(weight, |decay| decay * weight * voxel.support(sample));
                     voxel.distance = (voxel.distance * weight + sample) / (weight + 1.0);
                     voxel.weight = weight + 1.0;
                     measured += 1;
@@ -197,17 +195,6 @@ impl Fusion {
             }
         }
         measured
-    }
-
-    /// Decreases the weights of the earlier views, if the field forgets.
-    fn fade(&mut self) {
-        let Some(decay) = self.decay else { return };
-        for voxel in self.voxels.iter_mut().filter(|voxel| voxel.weight > 0.0) {
-            voxel.weight *= decay;
-            if voxel.weight < FORGOTTEN {
-                *voxel = Voxel::default();
-            }
-        }
     }
 
     /// The reason why a view [measures](Self::integrate) no voxel.
@@ -339,11 +326,11 @@ impl Voxel {
         }
     }
 
-    /// The weight of the earlier views, halved if a measurement contradicts them.
-    fn supported(self, sample: f32) -> f32 {
+    /// The factor by which a measurement changes the weight of those before it: a half if it contradicts them.
+    fn support(self, sample: f32) -> f32 {
         let is_free = |distance: f32| distance >= NEAR_SURFACE;
         let contradicts = is_free(sample) != is_free(self.distance) || (sample - self.distance).abs() > CONTRADICTION;
-        self.weight.max(0.0) * if contradicts { 0.5 } else { 1.0 }
+        if contradicts { 0.5 } else { 1.0 }
     }
 
     fn is_near_surface(self) -> bool {

@@ -3,12 +3,12 @@
 use grasp::{DepthImage, Intrinsics, NoTabletop, Tabletop, WORKSPACE_SIZE};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
-use grasp_sim::camera::{View, Views, look};
+use grasp_sim::camera::{View, Views, add_stereo_noise, look};
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::physics::World;
 use grasp_sim::scene::SceneKind;
 use nalgebra::{Isometry3, Point3, Unit, Vector3};
-use rand::{Rng, RngExt, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 /// Scenes, each with a view from a random camera.
@@ -25,26 +25,6 @@ fn scenes(views: &Views) -> Vec<(World, View, ChaCha8Rng)> {
         })
     };
     kinds.into_iter().flat_map(of_kind).collect()
-}
-
-/// The noise of a stereo camera: errors that grow with the square of the depth, in steps, holes at the edges of objects,
-/// and flying pixels between them and what is behind.
-fn add_stereo_noise(view: &mut View, rng: &mut impl Rng) {
-    let width = Intrinsics::BENCHMARK.width;
-    let clean = view.depth.clone();
-    for (index, depth) in view.depth.iter_mut().enumerate() {
-        let behind = clean.get(index + 2).filter(|_| index % width + 2 < width).copied().unwrap_or(*depth);
-        let edge = (behind - *depth).abs() > 0.02;
-        *depth = if rng.random_bool(if edge { 0.5 } else { 0.02 }) {
-            0.0
-        } else if edge {
-            rng.random_range(depth.min(behind)..=depth.max(behind))
-        } else {
-            // A disparity of a fifth of a pixel, at a baseline of 50 mm and a focal length of 540 pixels.
-            let step = *depth * *depth / (540.0 * 0.05) * 0.2;
-            ((*depth + step * rng.random_range(-1.0..1.0)) / step).round() * step
-        };
-    }
 }
 
 fn found(view: &View, gravity: Option<Unit<Vector3<f64>>>) -> Result<Tabletop, NoTabletop> {

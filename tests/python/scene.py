@@ -29,7 +29,7 @@ def rays():
     return np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(K).T
 
 
-def depth(camera_from_task):
+def depth(camera_from_task, with_block=True):
     """The depth image of a camera, [row][column], along its optical axis; 0 without a reading."""
     task_from_camera = np.linalg.inv(camera_from_task)
     eye, directions = task_from_camera[:3, 3], rays() @ task_from_camera[:3, :3].T
@@ -37,7 +37,7 @@ def depth(camera_from_task):
         table = (TABLE - eye[2]) / directions[..., 2]
         sides = (BLOCK[:, None, None] - eye) / directions
     enter, leave = sides.min(axis=0).max(axis=-1), sides.max(axis=0).min(axis=-1)
-    block = np.where(enter <= leave, enter, np.inf)
+    block = np.where(enter <= leave, enter, np.inf) if with_block else np.inf
     nearest = np.minimum(block, np.where(table > 0, table, np.inf))
     return np.where(np.isfinite(nearest), nearest, 0).astype(np.float32)
 

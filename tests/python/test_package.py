@@ -151,6 +151,76 @@ class DetectTest(ServerTest):
         with self.assertRaisesRegex(graspd.InvalidArgument, "table_height is -1, must be from 0 to 0.3 m"):
             self.client.find_table(view, table_height=-1)
 
+    def test_a_png_gives_the_same_grasps(self):
+        millimetres = [np.rint(scene.depth(camera) * 1e3).astype(np.uint16) for camera in CAMERAS]
+        detections = [
+            self.client.detect_from_depth(
+                [
+                    graspd.DepthView(depth, scene.K, camera_from_task=camera, png=png)
+                    for depth, camera in zip(millimetres, CAMERAS, strict=True)
+                ],
+                options=LOW,
+            )
+            for png in (False, True)
+        ]
+        self.assertTrue(detections[0].grasps)
+        self.assertEqual(detections[0].grasps, detections[1].grasps)
+        with self.assertRaisesRegex(ValueError, "png needs integer depths"):
+            self.client.detect_from_depth(replace(views()[0], png=True))
+
+    def test_labels_tell_the_object_of_a_grasp(self):
+        def labelled(label):
+            # The block is higher than 1 cm above the table in both views.
+            for camera, view in zip(CAMERAS, views(), strict=True):
+                rows, columns = np.indices(view.depth.shape)
+                rays = np.linalg.inv(scene.K) @ np.stack([columns, rows, np.ones_like(rows)]).reshape(3, -1)
+                points = np.linalg.inv(camera) @ np.vstack([rays * view.depth.reshape(-1), np.ones(rows.size)])
+                height = points[2].reshape(rows.shape)
+                yield replace(view, labels=np.where((view.depth > 0) & (height > 0.06), label, 0))
+
+        for label in (7, 700):
+            found = self.client.detect_from_depth(labelled(label), options=replace(LOW, objects=[label]))
+            self.assertTrue(found.grasps)
+            self.assertEqual({grasp.object for grasp in found.grasps}, {label})
+            other = self.client.detect_from_depth(labelled(label), options=replace(LOW, objects=[label + 1]))
+            self.assertEqual((other.grasps, other.dropped.object > 0), ((), True))
+            one = self.client.detect_from_depth(labelled(label), options=replace(LOW, max_grasps_per_object=1))
+            self.assertEqual(one.grasps, found.grasps[:1])
+        with self.assertRaisesRegex(graspd.InvalidArgument, "options.objects is .7, …., needs views with labels"):
+            self.client.detect_from_depth(views(), options=replace(LOW, objects=[7]))
+        with self.assertRaisesRegex(ValueError, "labels must have the shape of depth"):
+            replace(views()[0], labels=np.zeros(5, int))
+        with self.assertRaisesRegex(ValueError, "labels must be from 0 to 65535, got -1 to -1"):
+            self.client.detect_from_depth(replace(views()[0], labels=np.full(scene.depth(CAMERAS[0]).shape, -1)))
+
+    def test_a_large_workspace_contains_the_grasps_of_the_block(self):
+        workspace = graspd.Workspace(graspd.Pose((-0.2, -0.1, 0.0)), extent=(0.7, 0.5))
+        frame_from_camera = [np.linalg.inv(camera) for camera in CAMERAS]
+        given = [
+            graspd.DepthView(scene.depth(camera), scene.K, frame_from_camera=pose)
+            for camera, pose in zip(CAMERAS, frame_from_camera, strict=True)
+        ]
+        found = self.client.detect_from_depth(given, workspace, LOW)
+        self.assertTrue(found.grasps and all(map(scene.is_at_the_block, found.grasps)), found)
+        with self.assertRaisesRegex(graspd.InvalidArgument, "workspace.extent.x is 2.5, must be above 0"):
+            self.client.detect_from_depth(given, replace(workspace, extent=(2.5, 0.5)), LOW)
+
+    def test_own_grasps_are_scored(self):
+        found = self.client.detect_from_depth(views(), options=LOW)
+        poses = [graspd.Pose((3.0, 0.0, 0.0)), *(grasp.pose for grasp in found.grasps)]
+        check = replace(LOW, collision=graspd.CollisionCheck("flag", clearance=0.001))
+        scores = self.client.score(views(), poses, options=check, request_id="mine")
+        self.assertEqual((scores.request_id, scores.model, len(scores.scores)), ("mine", found.model, len(poses)))
+        self.assertEqual((scores.scores[0].quality, scores.scores[0].violations), (0.0, ("QUALITY", "REGION", "COLLISION")))
+        for score, grasp in zip(scores.scores[1:], found.grasps, strict=True):
+            self.assertAlmostEqual(score.quality, grasp.quality, places=3)
+            self.assertTrue(set(score.violations) <= {"COLLISION"}, score)
+        of_volume = self.client.score(scene.volume(*CAMERAS), poses, options=LOW)
+        self.assertAlmostEqual(of_volume.scores[1].quality, scores.scores[1].quality, places=3)
+        self.assertIsNone(of_volume.scores[1].open_width)
+        with self.assertRaisesRegex(graspd.InvalidArgument, "candidates is a list of 0"):
+            self.client.score(views(), [])
+
     def test_wrong_geometry_is_reported_and_logged_once(self):
         wire.logged.clear()
         view, height = views()[:1], graspd.Options(collision=graspd.CollisionCheck("off", table_height=0.02))
@@ -207,7 +277,7 @@ class OptionsTest(ServerTest):
         )
         free = [grasp for grasp in flagged.grasps if not grasp.collides]
         self.assertTrue(0 < len(free) < len(flagged.grasps))
-        self.assertEqual([replace(grasp, collides=None) for grasp in flagged.grasps], list(off.grasps))
+        self.assertEqual([replace(grasp, collides=None, open_width=None) for grasp in flagged.grasps], list(off.grasps))
         left = {grasp.pose.position for grasp in filtered.grasps}
         self.assertLessEqual({grasp.pose.position for grasp in free}, left, "neighbours of dropped grasps may be added")
         self.assertGreaterEqual(filtered.dropped.collision, len(flagged.grasps) - len(free))
@@ -365,6 +435,20 @@ class TrackTest(ServerTest):
                 np.testing.assert_allclose(positions(kept), positions(expected), atol=1e-9)
                 self.assertEqual((kept.frame_id, self.server.metric(TRACKED)), ("base", 1))
             self.assertEqual(tracking.add(options=replace(LOW, max_grasps=1)).grasps, kept.grasps[:1])
+        self.wait_until_none_is_tracked()
+
+    def test_a_volume_with_a_half_life_forgets(self):
+        nothing = graspd.DepthView(scene.depth(CAMERAS[0], with_block=False), scene.K, camera_from_task=CAMERAS[0])
+        for half_life, remains in [(None, True), (4.0, False)]:
+            with self.client.track(half_life=half_life) as tracking:
+                self.assertTrue(tracking.add(views()[:1] * 6, LOW).grasps)
+                self.assertEqual(bool(tracking.add([nothing] * 12, LOW).grasps), remains, half_life)
+            self.wait_until_none_is_tracked()
+        with (
+            self.client.track(half_life=0) as tracking,
+            self.assertRaisesRegex(graspd.InvalidArgument, "half_life is 0, must be from 0.5 to 10000 views"),
+        ):
+            tracking.add(views(), LOW)
         self.wait_until_none_is_tracked()
 
     def test_an_invalid_view_ends_neither_the_stream_nor_the_volume(self):
@@ -613,6 +697,8 @@ class PackageTest(ServerTest):
             (graspd.Model, grasp_pb2.Model),
             (graspd.GeometryWarning, grasp_pb2.GeometryWarning),
             (graspd.FoundTable, grasp_pb2.FoundTable),
+            (graspd.Score, grasp_pb2.Score),
+            (graspd.Scores, grasp_pb2.ScoreGraspsResponse),
             (graspd.Workspace, grasp_pb2.Workspace),
         ]:
             with self.subTest(ours.__name__):

@@ -6,7 +6,7 @@ frame b into frame a. Arrays of voxels are indexed ``[x][y][z]``.
 """
 
 from graspd.client import Client, Tracking
-from graspd.detection import Detection, Dropped, FoundTable, GeometryWarning, Grasp, Latency, Model
+from graspd.detection import Detection, Dropped, FoundTable, GeometryWarning, Grasp, Latency, Model, Score, Scores
 from graspd.errors import (
     Aborted,
     DeadlineExceeded,
@@ -50,6 +50,8 @@ __all__ = [
     "ResourceExhausted",
     "Retreat",
     "Retry",
+    "Score",
+    "Scores",
     "Tracking",
     "Unauthenticated",
     "Unavailable",

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from graspd import grasp_pb2 as pb
 from graspd import methods, wire
 from graspd.connection import OPTIONS, Connection
-from graspd.detection import Detection, FoundTable, Model
+from graspd.detection import Detection, FoundTable, Model, Scores
 from graspd.errors import Error, from_status
+from graspd.geometry import PoseLike
 from graspd.methods import Answer, Method, Request, Response
 from graspd.options import Options
 from graspd.seen import CloudView, DepthView, Volume, Workspace
@@ -93,9 +94,26 @@ class Client(Connection[grpc.Channel]):
             replies.cancel()
         detecting.end()
 
-    def track(self, workspace: Workspace = Workspace()) -> Tracking:
-        """Opens a tracked volume for a moving camera."""
-        return Tracking(lambda requests: self._stream(methods.TRACK, requests), workspace)
+    def track(self, workspace: Workspace = Workspace(), *, half_life: float | None = None) -> Tracking:
+        """Opens a tracked volume for a moving camera. For a scene that moves: with `half_life` the weight of a measurement
+        halves with every so many further ones, and with every one that contradicts it; 10 suits most scenes. None: all
+        views have the same weight."""
+        return Tracking(lambda requests: self._stream(methods.TRACK, requests), workspace, half_life)
+
+    def score(
+        self,
+        observation: wire.Observation,
+        grasps: Iterable[PoseLike],
+        workspace: Workspace = Workspace(),
+        options: Options | None = None,
+        *,
+        request_id: str = "",
+    ) -> Scores:
+        """Scores the caller's grasps in a volume, depth images or point clouds. `grasps` are ``T_frame_grasp``, in the
+        convention of the options, 1 to 1024. `workspace` is that of the images or points."""
+        return self._call(
+            methods.SCORE, wire.score_request(observation, grasps, workspace, options, request_id)
+        )
 
     def find_table(
         self,
@@ -148,8 +166,9 @@ class Tracking:
         self,
         stream: Callable[[Iterator[pb.TrackGraspsRequest]], Replies[pb.DetectGraspsStreamResponse]],
         workspace: Workspace,
+        half_life: float | None,
     ) -> None:
-        self._adding = Adding(workspace)
+        self._adding = Adding(workspace, half_life)
         self._requests: SimpleQueue[pb.TrackGraspsRequest | None] = SimpleQueue()
         self._replies = stream(iter(self._requests.get, None))
 

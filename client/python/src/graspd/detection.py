@@ -28,6 +28,26 @@ class Grasp:
     """Pose to which the hand moves after it has closed."""
     collides: bool | None
     """Whether the open hand would collide; None without ``CollisionCheck("flag")``."""
+    object: int | None = None
+    """Label of the object between the fingers, for views with `labels`; None: no object."""
+    open_width: float | None = None
+    """Largest opening with which the hand is free of collisions on its way to the grasp, metres: open it this far. None
+    without a collision check, or if there is none."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """The score of a grasp of the caller."""
+
+    quality: float
+    """Predicted probability of success, in [0, 1]; 0 outside the volume. A model with an evaluator predicts it for the
+    pose, a network alone for the best rotation at the position."""
+    violations: tuple[str, ...]
+    """Why it would not be among the detected grasps: QUALITY, WIDTH, REGION, APPROACH, HEIGHT, OBJECT, COLLISION."""
+    object: int | None
+    """Label of the object between the fingers, for views with `labels`; None: no object."""
+    open_width: float | None
+    """As `Grasp.open_width`."""
 
 
 @dataclass(frozen=True)
@@ -65,12 +85,14 @@ class Dropped:
     """Approach direction outside the cone."""
     height: int
     """A corner of the open hand below `min_height`."""
+    object: int
+    """Not on one of `Options.objects`."""
     collision: int
     """The open hand would collide; counted with ``CollisionCheck("filter")``."""
     suppressed: int
     """A neighbouring grasp has a higher quality."""
     over_limit: int
-    """A grasp beyond `max_grasps`."""
+    """A grasp beyond `max_grasps` or `max_grasps_per_object`."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +151,29 @@ class Detection:
     warnings: tuple[GeometryWarning, ...] = ()
     """Signs that the geometry of the request is wrong, or that the network was not trained for it."""
     table: FoundTable | None = None
+    """The table that was found, if the workspace has `find_table`."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """The scores of the caller's grasps."""
+
+    scores: tuple[Score, ...]
+    """One for each grasp, in their order."""
+    frame_id: str
+    """Name of the frame of the grasps: that of the volume or workspace."""
+    stamp: int | None
+    """Time stamp of the volume or workspace, nanoseconds since 1970."""
+    model: str
+    """Name of the model that scored them."""
+    version: str
+    """Version of the model."""
+    latency: Latency
+    request_id: str
+    """The request id of the caller, or the one that the server generated."""
+    warnings: tuple[GeometryWarning, ...]
+    """Signs that the geometry of the request is wrong."""
+    table: FoundTable | None
     """The table that was found, if the workspace has `find_table`."""
 
 

@@ -44,6 +44,7 @@ DETECT_STREAM = Method(
     GRASPS + "DetectGraspsStream", pb.DetectGraspsRequest, pb.DetectGraspsStreamResponse, wire.outcome
 )
 TRACK = Method(GRASPS + "TrackGrasps", pb.TrackGraspsRequest, pb.DetectGraspsStreamResponse, wire.outcome)
+SCORE = Method(GRASPS + "ScoreGrasps", pb.ScoreGraspsRequest, pb.ScoreGraspsResponse, wire.scores)
 FIND_TABLE = Method(GRASPS + "FindTable", pb.FindTableRequest, pb.FindTableResponse, wire.found_table)
 LIST_MODELS = Method(GRASPS + "ListModels", pb.ListModelsRequest, pb.ListModelsResponse, wire.models)
 CHECK = Method("/grpc.health.v1.Health/Check", HealthCheckRequest, HealthCheckResponse, wire.is_serving)

@@ -3,6 +3,7 @@ attribute. The server validates the values."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -48,12 +49,17 @@ class Gripper:
 @dataclass(frozen=True)
 class CollisionCheck:
     """Checks whether the open hand would collide with the observed surface or the table, at the grasp or between
-    pre-grasp and grasp. Unobserved space counts as free."""
+    pre-grasp and grasp."""
 
     mode: Literal["off", "flag", "filter"]
     """``off``: no check; ``flag``: set `Grasp.collides`; ``filter``: drop grasps that collide."""
     table_height: float | None = None
     """Height of the table above the bottom of the volume, metres; None: 0.05; negative: no table."""
+    clearance: float | None = None
+    """Smallest distance between the hand and the obstacles, metres; None: 0."""
+    hidden: bool = False
+    """Also treat as an obstacle what lies behind a surface in every view. Other unobserved space counts as free. Needs
+    depth images or point clouds."""
 
 
 @dataclass(frozen=True)
@@ -111,3 +117,12 @@ class Options:
     """Distance of the pre-grasp from the grasp, back along the approach, metres; None: 0.05."""
     retreat: Retreat | None = None
     """Motion of the hand after it has closed; None: 0.1 m back along the approach."""
+    region_pose: PoseLike | None = None
+    """Pose of the frame of `region` in the frame of the grasps, for a box of any direction; None: identity."""
+    objects: Sequence[int] = ()
+    """Only grasps on objects with these labels, for views with `labels`; the other objects remain obstacles. Empty:
+    grasps on all surfaces."""
+    max_grasps_per_object: int = 0
+    """Return at most this many grasps on one object, for views with `labels`. 0: no limit."""
+    margin: float | None = None
+    """Smallest distance of the point between the fingertips from the sides of the cube, metres; None: 0."""

@@ -53,8 +53,15 @@ class DepthView:
     """``T_camera_task``: maps points of the task frame into the camera frame (z forward, x right, y down)."""
     frame_from_camera: PoseLike | None = None
     """``T_frame_camera``: the camera's pose in the workspace's `frame_id`, as hand-eye calibration returns it."""
+    labels: Any = None
+    """``[row][column]``: label of the object that each pixel shows, integers from 0 to 65535; 0 is no object. None:
+    unknown."""
+    png: bool = False
+    """Send integer depths as PNG: fewer bytes on a slow network, for a few milliseconds of computation."""
 
     def __post_init__(self) -> None:
+        if self.labels is not None and np.shape(self.labels) != np.shape(self.depth):
+            raise ValueError(f"labels must have the shape of depth, got {np.shape(self.labels)}")
         if np.ndim(self.depth) != 2:
             raise ValueError(f"a depth image must be an array [row][column], got shape {np.shape(self.depth)}")
         if self.camera_from_task is not None and self.frame_from_camera is not None:
@@ -71,8 +78,12 @@ class CloudView:
     """Position of the camera in the frame of the points, metres: (0, 0, 0) for points in the camera frame."""
     frame_from_cloud: PoseLike | None = None
     """``T_frame_cloud``: maps the points into the workspace's `frame_id`; None: identity."""
+    labels: NDArray[np.integer[Any]] | None = None
+    """``[…]``: label of the object of each point, integers from 0 to 65535; 0 is no object. None: unknown."""
 
     def __post_init__(self) -> None:
+        if self.labels is not None and np.shape(self.labels) != np.shape(self.points)[:-1]:
+            raise ValueError(f"labels must be one for each point, got shape {np.shape(self.labels)}")
         if np.shape(self.points)[-1:] != (3,):
             raise ValueError(f"a point cloud must be an array […][3] of x, y, z, got shape {np.shape(self.points)}")
 
@@ -96,3 +107,6 @@ class Workspace:
     gravity: Vector | None = None
     """For `find_table`: direction of gravity in `frame_id`, of any length above 0. An accelerometer at rest measures the
     opposite. None: unknown; a wall that fills the image is then taken for a table."""
+    extent: tuple[float, float] | None = None
+    """Lengths along x and y of a larger workspace, metres, at most 2. The server covers it with overlapping cubes. None:
+    one cube."""

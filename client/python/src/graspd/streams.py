@@ -61,12 +61,14 @@ WAS_ADDED = (StatusCode.RESOURCE_EXHAUSTED, StatusCode.INTERNAL)
 class Adding:
     """The state of a tracked volume."""
 
-    def __init__(self, workspace: Workspace) -> None:
+    def __init__(self, workspace: Workspace, half_life: float | None) -> None:
+        self._half_life = half_life
         # None once the server has accepted it.
         self._workspace: Workspace | None = workspace
 
     def request(self, views: DepthView | Iterable[DepthView], options: Options | None, request_id: str) -> pb.TrackGraspsRequest:
-        return wire.track_request(views, self._workspace, options, request_id)
+        half_life = None if self._workspace is None else self._half_life
+        return wire.track_request(views, self._workspace, half_life, options, request_id)
 
     def answer(self, reply: pb.DetectGraspsStreamResponse | None) -> Detection:
         if reply is None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import struct
+import zlib
 from collections.abc import Callable, Iterable
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from google.protobuf.timestamp_pb2 import Timestamp
@@ -13,10 +15,13 @@ from numpy.typing import DTypeLike, NDArray
 
 from graspd import errors
 from graspd import grasp_pb2 as pb
-from graspd.detection import Detection, Dropped, FoundTable, GeometryWarning, Grasp, Latency, Model
+from graspd.detection import Detection, Dropped, FoundTable, GeometryWarning, Grasp, Latency, Model, Score, Scores
 from graspd.geometry import Pose, PoseLike, Vector
 from graspd.options import Box, CollisionCheck, Cone, Convention, Gripper, Options, Retreat
 from graspd.seen import CloudView, DepthView, Volume, Workspace
+
+Observation: TypeAlias = Volume | NDArray[Any] | DepthView | CloudView | Iterable[DepthView | CloudView]
+"""A volume, depth images or point clouds."""
 
 Value = TypeVar("Value")
 Message = TypeVar("Message")
@@ -71,10 +76,44 @@ def cloud_request(
     )
 
 
+def score_request(
+    observation: Observation,
+    grasps: Iterable[PoseLike],
+    workspace: Workspace,
+    options: Options | None,
+    request_id: str,
+) -> pb.ScoreGraspsRequest:
+    request = pb.ScoreGraspsRequest(
+        request_id=request_id,
+        candidates=[pb.Candidate(pose=pose_message(grasp)) for grasp in grasps],
+        options=given(options_message, options),
+    )
+    if isinstance(observation, (Volume, np.ndarray)):
+        request.volume.CopyFrom(volume_message(observation))
+        return request
+    views = [observation] if isinstance(observation, (DepthView, CloudView)) else list(observation)
+    clouds = [view for view in views if isinstance(view, CloudView)]
+    images = [view for view in views if isinstance(view, DepthView)]
+    if clouds and images:
+        raise ValueError("an observation is either depth images or point clouds, got both")
+    if clouds:
+        of_clouds = pb.CloudViews(views=map(cloud_message, clouds), workspace=workspace_message(workspace))
+        request.clouds.CopyFrom(of_clouds)
+    else:
+        of_images = pb.DepthViews(views=map(depth_message, images), workspace=workspace_message(workspace))
+        request.depth.CopyFrom(of_images)
+    return request
+
+
 def track_request(
-    views: DepthView | Iterable[DepthView], workspace: Workspace | None, options: Options | None, request_id: str
+    views: DepthView | Iterable[DepthView],
+    workspace: Workspace | None,
+    half_life: float | None,
+    options: Options | None,
+    request_id: str,
 ) -> pb.TrackGraspsRequest:
     return pb.TrackGraspsRequest(
+        half_life=half_life,
         request_id=request_id,
         views=map(depth_message, [views] if isinstance(views, DepthView) else views),
         workspace=given(workspace_message, workspace),
@@ -145,17 +184,48 @@ def depth_message(view: DepthView) -> pb.DepthView:
         unit, depth = pb.DEPTH_UNIT_F32_METRES, image.astype("<f4", copy=False)
     else:
         raise ValueError(f"a depth image must be floats (metres) or integers (millimetres), got {image.dtype}")
+    data = depth.tobytes()
+    if view.png:
+        if unit != pb.DEPTH_UNIT_U16_MILLIMETRES:
+            raise ValueError(f"DepthView.png needs integer depths (millimetres), got {image.dtype}")
+        unit, data = pb.DEPTH_UNIT_PNG_MILLIMETRES, png_file(depth)
     return pb.DepthView(
-        data=depth.tobytes(),
+        data=data,
         unit=unit,
+        labels=None if view.labels is None else labels_message(np.asarray(view.labels)),
         camera=pb.Camera(width=width, height=height, k=np.ravel(view.k).tolist()),
         camera_from_task=pose_message(view.camera_from_task),
         frame_from_camera=pose_message(view.frame_from_camera),
     )
 
 
+def png_file(depth: NDArray[Any]) -> bytes:
+    """A PNG file of 16-bit grey values."""
+    height, width = depth.shape
+    rows = depth.astype(">u2").view(np.uint8).reshape(height, -1)
+    # Filter 2: differences to the row above.
+    filtered = np.insert(np.diff(rows, axis=0, prepend=np.uint8(0)), 0, 2, axis=1)
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(filtered.tobytes(), 1)) + chunk(b"IEND", b"")
+
+
+def labels_message(labels: NDArray[Any]) -> pb.Labels:
+    if not np.issubdtype(labels.dtype, np.integer):
+        raise ValueError(f"labels must be integers, got {labels.dtype}")
+    if labels.size and not (0 <= labels.min() and labels.max() <= 65535):
+        raise ValueError(f"labels must be from 0 to 65535, got {labels.min()} to {labels.max()}")
+    if labels.size and labels.max() > 255:
+        return pb.Labels(data=labels.astype("<u2").tobytes(), type=pb.LABEL_TYPE_U16)
+    return pb.Labels(data=labels.astype("u1").tobytes(), type=pb.LABEL_TYPE_U8)
+
+
 def cloud_message(view: CloudView) -> pb.CloudView:
     return pb.CloudView(
+        labels=given(labels_message, view.labels),
         points=np.asarray(view.points, "<f4").tobytes(),
         camera_position=vector_message(view.camera_position),
         frame_from_cloud=pose_message(view.frame_from_cloud),
@@ -170,7 +240,13 @@ def workspace_message(workspace: Workspace) -> pb.Workspace:
         stamp=given(stamp_message, workspace.stamp),
         find_table=workspace.find_table,
         gravity=None if workspace.gravity is None else vector_message(workspace.gravity),
+        extent=given(extent_message, workspace.extent),
     )
+
+
+def extent_message(extent: tuple[float, float]) -> pb.Extent:
+    x, y = extent
+    return pb.Extent(x=x, y=y)
 
 
 def options_message(options: Options) -> pb.Options:
@@ -189,6 +265,10 @@ def options_message(options: Options) -> pb.Options:
         convention=given(convention_message, options.convention),
         pregrasp_distance=options.pregrasp_distance,
         retreat=given(retreat_message, options.retreat),
+        region_pose=pose_message(options.region_pose),
+        objects=options.objects,
+        max_grasps_per_object=options.max_grasps_per_object,
+        margin=options.margin,
     )
 
 
@@ -211,7 +291,12 @@ def gripper_message(gripper: Gripper) -> pb.Gripper:
 
 
 def collision_message(check: CollisionCheck) -> pb.CollisionCheck:
-    return pb.CollisionCheck(mode=f"MODE_{check.mode.upper()}", table_height=check.table_height)
+    return pb.CollisionCheck(
+        mode=f"MODE_{check.mode.upper()}",
+        table_height=check.table_height,
+        clearance=check.clearance,
+        hidden=check.hidden,
+    )
 
 
 def convention_message(convention: Convention) -> pb.Convention:
@@ -266,6 +351,30 @@ def detection(message: pb.DetectGraspsResponse) -> Detection:
     )
 
 
+def scores(message: pb.ScoreGraspsResponse) -> Scores:
+    return Scores(
+        scores=tuple(map(score, message.scores)),
+        frame_id=message.frame_id,
+        stamp=message.stamp.ToNanoseconds() if message.HasField("stamp") else None,
+        model=message.model,
+        version=message.version,
+        latency=latency(message.latency),
+        request_id=message.request_id,
+        warnings=tuple(map(warning, message.warnings)),
+        table=table(message.table) if message.HasField("table") else None,
+    )
+
+
+def score(message: pb.Score) -> Score:
+    names = map(pb.Score.Violation.Name, message.violations)
+    return Score(
+        quality=message.quality,
+        violations=tuple(name.removeprefix("VIOLATION_") for name in names),
+        object=message.object if message.HasField("object") else None,
+        open_width=message.open_width if message.HasField("open_width") else None,
+    )
+
+
 def found_table(message: pb.FindTableResponse) -> FoundTable:
     return table(message.table)
 
@@ -302,6 +411,8 @@ def grasp(message: pb.Grasp) -> Grasp:
         pregrasp=pose(message.pregrasp),
         retreat=pose(message.retreat),
         collides=message.collides if message.HasField("collides") else None,
+        object=message.object if message.HasField("object") else None,
+        open_width=message.open_width if message.HasField("open_width") else None,
     )
 
 
@@ -329,6 +440,7 @@ def dropped(message: pb.Dropped) -> Dropped:
         region=message.region,
         approach=message.approach,
         height=message.height,
+        object=message.object,
         suppressed=message.suppressed,
         collision=message.collision,
         over_limit=message.over_limit,
