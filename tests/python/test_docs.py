@@ -151,12 +151,19 @@ class DocsTest(unittest.TestCase):
         return page
 
     def test_api(self):
+        def call(option):
+            """The call that accepts an option: some need views with labels, or belong to another option."""
+            if "object" in option:
+                labelled = "graspd.DepthView(depth, k, camera_from_task=poses[0], labels=(depth > 0).astype(int))"
+                return f"client.detect_from_depth({labelled}, workspace"
+            return "client.detect(volume"
+
         page = self.page("api.md")
         options = re.findall(r"^\| `(\w+=.*?)` \|", page.text, re.MULTILINE)
-        self.assertEqual(len(options), 14)
+        self.assertEqual(len(options), 18)
         for option in options:
             with self.subTest(option):
-                page.run("python", f"client.detect(volume, graspd.Options({option}))", 1)
+                page.run("python", f"{call(option)}, graspd.Options({option}))", 1)
 
     def test_operations(self):
         page = self.page("operations.md", shortened)

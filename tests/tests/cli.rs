@@ -9,7 +9,7 @@ use foxglove::Decode;
 use foxglove::messages::{PointCloud, SceneUpdate};
 use grasp::Volume;
 use grasp_client::{Client, DetectOptions, Error, Options};
-use grasp_tests::scene::{CAMERA, camera, depth};
+use grasp_tests::scene::{CAMERA, TABLE, camera, camera_at, depth, seen};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs, grasp};
 use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use npyz::WriterBuilder;
@@ -595,6 +595,55 @@ async fn one_depth_image_and_its_intrinsics_suffice() {
 
     let without = with("detect", &[]);
     assert!(String::from_utf8_lossy(&without.stderr).contains("`grasp table` finds"), "{without:?}");
+}
+
+#[tokio::test]
+async fn objects_are_chosen_by_their_labels_and_own_grasps_are_scored() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let boxes = [0.15, 0.45].map(|x| [[x - 0.02, 0.11, TABLE], [x + 0.02, 0.19, 0.15]]);
+    let pixels = seen(&boxes, &camera_at(Point3::new(0.3, 0.15, 0.08), 0.7, 35.0, -90.0));
+    let write = |name: &str, bits: png::BitDepth, bytes: Vec<u8>| {
+        let file = File::create(path(name)).unwrap();
+        let encoder = png::Encoder::new(file, CAMERA.width as u32, CAMERA.height as u32);
+        png_header(encoder, png::ColorType::Grayscale, bits).write_image_data(&bytes).unwrap();
+    };
+    let millimetres = pixels.iter().flat_map(|(depth, _)| ((depth * 1e3).round() as u16).to_be_bytes());
+    write("depth.png", png::BitDepth::Sixteen, millimetres.collect());
+    write("mask.png", png::BitDepth::Eight, pixels.iter().map(|&(_, label)| label as u8).collect());
+    let k = format!("{},{},{},{}", CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy);
+    let given =
+        [&*path("depth.png"), "--intrinsics", &k, "--find-table", "--labels", &path("mask.png")].map(str::to_owned);
+    let with = |command: &str, rest: &[&str]| {
+        let args = [command].into_iter().chain(given.iter().map(String::as_str)).chain(rest.iter().copied());
+        let output = run(&server, &args.collect::<Vec<_>>());
+        assert!(output.status.success(), "{output:?}");
+        serde_json::from_slice::<Value>(&output.stdout).unwrap()
+    };
+    let large = ["--size", "0.7,0.4", "--model", "shaf", "--json"];
+    let all = with("detect", &large);
+    let objects = |found: &Value| -> Vec<u64> {
+        found["grasps"].as_array().unwrap().iter().filter_map(|grasp| grasp["object"].as_u64()).collect()
+    };
+    assert!(objects(&all).contains(&1) && objects(&all).contains(&2), "{all}");
+    let second = with("detect", &[&large[..], &["--objects", "2", "--max-grasps-per-object", "3"]].concat());
+    assert_eq!(objects(&second), [2; 3]);
+
+    let poses =
+        all["grasps"].as_array().unwrap().iter().map(
+            |grasp| serde_json::json!({ "position": grasp["position"], "orientation": grasp["orientation_xyzw"] }),
+        );
+    let poses: Vec<Value> = poses.take(2).collect();
+    std::fs::write(path("mine.json"), Value::from(poses).to_string()).unwrap();
+    let mine = path("mine.json");
+    let scores = with("score", &["--grasps", &mine, "--collision", "flag", "--threshold", "0.6", "--json"]);
+    let scores = scores["scores"].as_array().unwrap();
+    assert_eq!(scores.len(), 2);
+    assert!(scores.iter().all(|score| score["quality"].as_f64().unwrap() >= 0.0), "{scores:?}");
+    let table = [&given[..], &["--grasps".to_owned(), mine]].concat();
+    let printed = run(&server, &command(&["score"], &table));
+    assert!(text(&printed.stdout).contains("violations"), "{printed:?}");
 }
 
 fn png_header(
