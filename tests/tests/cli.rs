@@ -389,16 +389,20 @@ fn depth_images_are_read_in_every_format() {
 }
 
 /// Point clouds of the same cameras: in the frames of the cameras, and in the task frame.
+fn points(task_from_camera: &Isometry3<f64>) -> Vec<Point3<f64>> {
+    let point = |(index, depth): (usize, f32)| {
+        let (u, v) = ((index % CAMERA.width) as f64, (index / CAMERA.width) as f64);
+        Point3::new((u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, 1.0) * f64::from(depth)
+    };
+    depth(&task_from_camera.inverse()).into_iter().enumerate().map(point).collect()
+}
+
 fn cloud_files(folder: &Path) -> [Vec<String>; 2] {
     let path = |name: &str| folder.join(name).to_str().unwrap().to_owned();
     let cameras = [camera(30.0, -90.0), camera(45.0, 60.0)].map(|pose| pose.inverse());
     let [mut own, mut placed] = [["--camera-position", "0,0,0"].map(str::to_owned).to_vec(), Vec::new()];
     for (index, task_from_camera) in cameras.iter().enumerate() {
-        let point = |(index, depth): (usize, f32)| {
-            let (u, v) = ((index % CAMERA.width) as f64, (index / CAMERA.width) as f64);
-            Point3::new((u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, 1.0) * f64::from(depth)
-        };
-        let points: Vec<_> = depth(&task_from_camera.inverse()).into_iter().enumerate().map(point).collect();
+        let points = points(task_from_camera);
         let shape = [points.len() as u64, 3];
         own.push(path(&format!("own{index}.npy")));
         let mut writer = npyz::WriteOptions::new().default_dtype().shape(&shape);
@@ -466,6 +470,56 @@ fn point_clouds_are_read_in_every_format() {
 }
 
 #[test]
+fn point_clouds_of_pcl_and_of_meshes_are_read() {
+    let server = Server::run(&[TestModel::new("mirror").resolution(40)], &[]);
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let points: Vec<[f32; 3]> = points(&camera(30.0, -90.0).inverse())
+        .iter()
+        .map(|point| [point.x as f32, point.y as f32, point.z as f32])
+        .collect();
+    let count = points.len();
+    let lines: String = points.iter().map(|[x, y, z]| format!("7 {x} {y} {z}\n")).collect();
+    let header = "# .PCD v0.7\nVERSION 0.7\nFIELDS label x y z\nSIZE 4 4 4 4\nTYPE U F F F\nCOUNT 1 1 1 1\n";
+    let size = format!("WIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA ascii\n");
+    std::fs::write(path("cloud.pcd"), format!("{header}{size}{lines}")).unwrap();
+    let header = format!(
+        "ply\nformat binary_little_endian 1.0\nelement vertex {count}\nproperty float x\nproperty float y\n\
+         property float z\nproperty uchar red\nend_header\n"
+    );
+    let vertices = points.iter().flat_map(|point| point.iter().flat_map(|c| c.to_le_bytes()).chain([9]));
+    std::fs::write(path("cloud.ply"), header.into_bytes().into_iter().chain(vertices).collect::<Vec<_>>()).unwrap();
+    let mut writer = npyz::WriteOptions::new().default_dtype().shape(&[count as u64, 3]);
+    writer = writer.order(npyz::Order::C);
+    let mut writer = writer.writer(File::create(path("cloud.npy")).unwrap()).begin_nd().unwrap();
+    writer.extend(points.iter().flatten().copied()).unwrap();
+    writer.finish().unwrap();
+
+    let pose = camera(30.0, -90.0).inverse();
+    let [x, y, z] = pose.translation.vector.into();
+    let [qx, qy, qz, qw] = pose.rotation.coords.into();
+    let pose = format!("{x},{y},{z},{qx},{qy},{qz},{qw}");
+    let found = ["cloud.npy", "cloud.pcd", "cloud.ply"].map(|name| {
+        let args = ["--camera-position", "0,0,0", "--frame-from-cloud", &pose, "--threshold", "0.6", "--json"];
+        let output = run(&server, &[&["detect", &path(name)][..], &args].concat());
+        let reply: Value = serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{output:?}"));
+        reply["grasps"].clone()
+    });
+    assert!(found[0].as_array().is_some_and(|grasps| !grasps.is_empty()));
+    assert!(found[1] == found[0] && found[2] == found[0]);
+
+    // A file of the wrong kind is named as such.
+    let refused = |args: &[&str]| text(&run(&server, &[&["detect"][..], args].concat()).stderr).to_owned();
+    assert!(refused(&[&path("cloud.ply")]).contains("this is a point cloud; give --camera-position"));
+    let error = refused(&[&path("cloud.pcd"), "--intrinsics", "540,540,320,240", "--find-table"]);
+    assert!(error.contains("give --camera-position instead of --intrinsics"), "{error}");
+    std::fs::write(path("image"), b"\x89PNG\r\n\x1a\n").unwrap();
+    assert!(refused(&[&path("image")]).contains("this is an image; for a depth image give --intrinsics"));
+    std::fs::write(path("text"), "hello").unwrap();
+    assert!(refused(&[&path("text")]).contains("neither a .npy file nor an image or a point cloud"));
+}
+
+#[test]
 fn grasps_are_exported_as_csv_moveit_and_isaac_files() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let (folder, files) = files();
@@ -478,7 +532,7 @@ fn grasps_are_exported_as_csv_moveit_and_isaac_files() {
     let lines: Vec<&str> = csv.lines().collect();
     assert_eq!(lines.len(), 3);
     assert!(lines[0].starts_with("quality,width,x,y,z,qx,qy,qz,qw,"), "{csv}");
-    assert!(lines[0].ends_with(",collides,retreat_x,retreat_y,retreat_z"), "{csv}");
+    assert!(lines[0].ends_with(",collides,retreat_x,retreat_y,retreat_z,object,open_width"), "{csv}");
     assert!(lines[1..].iter().all(|line| line.split(',').count() == lines[0].split(',').count()));
     assert!(moveit.contains("- id: grasp_1\n") && moveit.contains(r#""frame_id":"base""#), "{moveit}");
     assert!(isaac.starts_with("format: isaac_grasp\n") && isaac.contains("  grasp_1:\n"), "{isaac}");

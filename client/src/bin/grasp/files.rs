@@ -1,4 +1,4 @@
-//! Reading of arrays from .npy and .npz files.
+//! The formats of input files, and arrays in .npy and .npz files.
 
 use std::fs::File;
 use std::io::{self, BufReader, Cursor, Read};
@@ -10,6 +10,36 @@ use npyz::{Deserialize, NpyFile, Order, TypeChar};
 
 /// An array of a file; its values have not been read yet.
 pub(crate) type Array = NpyFile<Box<dyn Read>>;
+
+/// Format of a file, judged by its first bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Format {
+    Png,
+    Tiff,
+    Pcd,
+    Ply,
+    /// .npy, .npz, or a file of another kind.
+    Other,
+}
+
+impl Format {
+    pub fn of(path: &Path) -> anyhow::Result<Self> {
+        let mut first = Vec::new();
+        File::open(path)?.take(8).read_to_end(&mut first)?;
+        let starts = |magic: &[u8]| first.starts_with(magic);
+        Ok(if starts(b"\x89PNG") {
+            Self::Png
+        } else if starts(b"II*\0") || starts(b"MM\0*") {
+            Self::Tiff
+        } else if starts(b"# .PCD") || starts(b"VERSION ") {
+            Self::Pcd
+        } else if starts(b"ply\n") || starts(b"ply\r") {
+            Self::Ply
+        } else {
+            Self::Other
+        })
+    }
+}
 
 /// Adds the path to the error of `read`.
 pub(crate) fn in_file<T>(path: &Path, read: impl FnOnce(&Path) -> anyhow::Result<T>) -> anyhow::Result<T> {
@@ -24,7 +54,8 @@ pub(crate) fn has_extension(path: &Path, wanted: &str) -> bool {
 pub(crate) fn array(path: &Path, name: &str) -> anyhow::Result<Array> {
     let file = BufReader::new(File::open(path)?);
     if !has_extension(path, "npz") {
-        return Ok(NpyFile::new(Box::new(file) as Box<dyn Read>)?);
+        let file = NpyFile::new(Box::new(file) as Box<dyn Read>);
+        return file.context("neither a .npy file nor an image or a point cloud of a known format");
     }
     let mut archive = NpzArchive::new(file)?;
     let names: Vec<String> = archive.array_names().map(str::to_owned).collect();

@@ -7,7 +7,7 @@ use grasp_client::Depth;
 use npyz::TypeChar;
 use tiff::decoder::{Decoder, DecodingResult};
 
-use crate::files;
+use crate::files::{self, Format};
 
 /// The unit of integer depths of most cameras, metres.
 pub(crate) const MILLIMETRE: f32 = 1e-3;
@@ -16,10 +16,13 @@ pub(crate) const MILLIMETRE: f32 = 1e-3;
 /// width and the height.
 pub(crate) fn read(path: &Path, scale: f32) -> anyhow::Result<(Depth, u32, u32)> {
     files::in_file(path, |path| {
-        let (depth, width, height) = match path.extension().and_then(|extension| extension.to_str()) {
-            Some("png") => png(path)?,
-            Some("tif" | "tiff") => tiff(path)?,
-            _ => npy(path)?,
+        let (depth, width, height) = match Format::of(path)? {
+            Format::Png => png(path)?,
+            Format::Tiff => tiff(path)?,
+            Format::Pcd | Format::Ply => {
+                bail!("this is a point cloud; give --camera-position instead of --intrinsics")
+            }
+            Format::Other => npy(path)?,
         };
         let depth = match depth {
             Depth::Millimetres(depth) if scale != MILLIMETRE => {
@@ -34,7 +37,10 @@ pub(crate) fn read(path: &Path, scale: f32) -> anyhow::Result<(Depth, u32, u32)>
 fn npy(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
     let array = files::array(path, "depth")?;
     let &[height, width] = array.shape() else {
-        bail!("shape {:?}: a depth image must be height × width", array.shape())
+        bail!(
+            "shape {:?}: a depth image must be height × width; for a volume or a point cloud leave out --intrinsics",
+            array.shape()
+        )
     };
     let supported = [(TypeChar::Float, 4), (TypeChar::Float, 8), (TypeChar::Uint, 2)];
     let depth = match files::kind(&array, "f32 (metres) or u16 (millimetres)", &supported)? {

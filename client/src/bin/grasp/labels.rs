@@ -5,13 +5,14 @@ use std::path::Path;
 use anyhow::{Context, bail, ensure};
 use npyz::TypeChar;
 
-use crate::files;
+use crate::files::{self, Format};
 
 /// Reads the labels of objects from a PNG with 8- or 16-bit grey values or a .npy file with integers.
 pub(crate) fn read(path: &Path) -> anyhow::Result<Vec<u16>> {
-    files::in_file(path, |path| match path.extension().and_then(|extension| extension.to_str()) {
-        Some("png") => png(path),
-        _ => npy(path),
+    files::in_file(path, |path| match Format::of(path)? {
+        Format::Png => png(path),
+        Format::Other => npy(path),
+        format => bail!("a file of the format {format:?}; labels must be PNG or .npy"),
     })
 }
 

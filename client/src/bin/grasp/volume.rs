@@ -6,14 +6,18 @@ use nalgebra::Isometry3;
 use npyz::TypeChar;
 use npyz::half::f16;
 
-use crate::files::{self, Array};
+use crate::files::{self, Array, Format};
 
 /// Name of the volumes' array in VGN's data.
 const ARRAY: &str = "grid";
 
 /// Reads a volume from a .npy or .npz file, with its corner at `pose`.
 pub(crate) fn read(path: &Path, voxel_size: Option<f64>, pose: Isometry3<f64>) -> anyhow::Result<Volume> {
-    files::in_file(path, |path| volume(files::array(path, ARRAY)?, voxel_size, pose))
+    files::in_file(path, |path| match Format::of(path)? {
+        Format::Png | Format::Tiff => bail!("this is an image; for a depth image give --intrinsics"),
+        Format::Pcd | Format::Ply => bail!("this is a point cloud; give --camera-position"),
+        Format::Other => volume(files::array(path, ARRAY)?, voxel_size, pose),
+    })
 }
 
 fn volume(array: Array, voxel_size: Option<f64>, pose: Isometry3<f64>) -> anyhow::Result<Volume> {
@@ -24,6 +28,7 @@ fn volume(array: Array, voxel_size: Option<f64>, pose: Isometry3<f64>) -> anyhow
         !matches!(edges, [_, 3]),
         "shape {shape:?}: a volume must be N×N×N; for a point cloud add --camera-position"
     );
+    ensure!(edges.len() != 2, "shape {shape:?}: a volume must be N×N×N; for a depth image give --intrinsics");
     let &[resolution, y, z] = edges else { bail!("shape {shape:?}: a volume must be N×N×N") };
     ensure!(resolution == y && y == z, "shape {shape:?}: a volume must be N×N×N");
     let resolution = usize::try_from(resolution)?;
