@@ -35,18 +35,18 @@ pub fn camera_at(middle: Point3<f64>, distance: f64, polar: f64, azimuth: f64) -
 /// The depth image of the camera: metres along its optical axis, 0 without a reading.
 #[must_use]
 pub fn depth(camera_from_task: &Isometry3<f64>) -> Vec<f32> {
-    seen(&[BLOCK], camera_from_task).into_iter().map(|(depth, _)| depth).collect()
+    seen(&[BLOCK], &CAMERA, camera_from_task).into_iter().map(|(depth, _)| depth).collect()
 }
 
-/// What each pixel of the camera shows of a table with boxes: the depth in metres, 0 without a reading, and the number of
+/// What each pixel of a camera shows of a table with boxes: the depth in metres, 0 without a reading, and the number of
 /// the box, counted from 1; 0 for the table.
 #[must_use]
-pub fn seen(boxes: &[[[f64; 3]; 2]], camera_from_task: &Isometry3<f64>) -> Vec<(f32, u16)> {
+pub fn seen(boxes: &[[[f64; 3]; 2]], camera: &Intrinsics, camera_from_task: &Isometry3<f64>) -> Vec<(f32, u16)> {
     let task_from_camera = camera_from_task.inverse();
     let eye = task_from_camera * Point3::origin();
     let pixel = |index: usize| {
-        let (u, v) = ((index % CAMERA.width) as f64, (index / CAMERA.width) as f64);
-        let ray = task_from_camera * Vector3::new((u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, 1.0);
+        let (u, v) = ((index % camera.width) as f64, (index / camera.width) as f64);
+        let ray = task_from_camera * Vector3::new((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0);
         let distance = |corners: &[[f64; 3]; 2]| {
             let mut span = (0.0_f64, f64::INFINITY);
             for axis in 0..3 {
@@ -60,13 +60,13 @@ pub fn seen(boxes: &[[[f64; 3]; 2]], camera_from_task: &Isometry3<f64>) -> Vec<(
         let nearest = boxes.chain(table).min_by(|(a, _), (b, _)| a.total_cmp(b));
         nearest.map_or((0.0, 0), |(distance, number)| (distance as f32, number))
     };
-    (0..CAMERA.width * CAMERA.height).map(pixel).collect()
+    (0..camera.width * camera.height).map(pixel).collect()
 }
 
 /// The view of a table with boxes as a client sends it, with the numbers of the boxes as labels.
 #[must_use]
 pub fn labelled(boxes: &[[[f64; 3]; 2]], camera_from_task: &Isometry3<f64>) -> DepthView {
-    let (depth, labels) = seen(boxes, camera_from_task).into_iter().unzip();
+    let (depth, labels) = seen(boxes, &CAMERA, camera_from_task).into_iter().unzip();
     DepthView { depth: Depth::Metres(depth), labels: Some(labels), ..view(camera_from_task) }
 }
 

@@ -657,7 +657,7 @@ async fn objects_are_chosen_by_their_labels_and_own_grasps_are_scored() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
     let boxes = [0.15, 0.45].map(|x| [[x - 0.02, 0.11, TABLE], [x + 0.02, 0.19, 0.15]]);
-    let pixels = seen(&boxes, &camera_at(Point3::new(0.3, 0.15, 0.08), 0.7, 35.0, -90.0));
+    let pixels = seen(&boxes, &CAMERA, &camera_at(Point3::new(0.3, 0.15, 0.08), 0.7, 35.0, -90.0));
     let write = |name: &str, bits: png::BitDepth, bytes: Vec<u8>| {
         let file = File::create(path(name)).unwrap();
         let encoder = png::Encoder::new(file, CAMERA.width as u32, CAMERA.height as u32);

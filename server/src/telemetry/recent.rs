@@ -186,9 +186,15 @@ impl RecentRequest {
                 triangles.extend(mesh.triangles.into_iter().flatten().map(|index| first + index));
             }
             let vertices = vertices.iter().flat_map(|v| [v.x, v.y, v.z].map(|number| (number * 1e4).round() / 1e4));
-            let grasp = |Detected { grasp, collides, .. }: &Detected| {
-                let pose = parts(&(pose.inverse() * grasp.pose));
-                json!({ "pose": pose, "width": grasp.width, "depth": finger_depth, "quality": grasp.quality, "collides": collides })
+            let grasp = |Detected { grasp, collides, object, .. }: &Detected| {
+                json!({
+                    "pose": parts(&(pose.inverse() * grasp.pose)),
+                    "width": grasp.width,
+                    "depth": finger_depth,
+                    "quality": grasp.quality,
+                    "collides": collides,
+                    "object": object,
+                })
             };
             object.insert("size".to_owned(), json!(size));
             object.insert("vertices".to_owned(), vertices.collect());

@@ -9,6 +9,7 @@
 //! compare ratios.
 
 mod conditions;
+mod depth;
 mod findings;
 mod peers;
 
@@ -39,13 +40,15 @@ const CALLERS: [usize; 3] = [1, 8, 32];
 /// Batch sizes. The best throughput of these is the capacity of the machine.
 const BATCHES: [usize; 4] = [1, 2, 4, 8];
 /// Targets. Those with libtorch are shares of the latency of its eager mode in fp32.
-const AIMS: [(&str, Aim); 6] = [
+const AIMS: [(&str, Aim); 8] = [
     ("hop_p50_ms", Aim::AtMost(0.6)),
     ("hop_p99_ms", Aim::AtMost(1.5)),
     ("vgn_vs_torch", Aim::AtMost(1.0 / 12.0)),
     ("transformer_vs_torch", Aim::AtMost(1.0 / 5.5)),
     ("openvino_ratio", Aim::AtMost(1.15)),
     ("throughput_ratio", Aim::AtLeast(0.95)),
+    ("table_p50_ms", Aim::AtMost(100.0)),
+    ("track_p99_ms", Aim::AtMost(33.0)),
 ];
 
 #[tokio::main(flavor = "current_thread")]
@@ -59,6 +62,7 @@ async fn main() -> anyhow::Result<()> {
         bench.latency(network, &mut findings).await?;
     }
     bench.throughput(&mut findings).await?;
+    bench.depth(&mut findings).await?;
     bench.start_up(&mut findings)?;
     findings.compare(&AIMS);
     let stolen = started.percent_until(Stolen::so_far());
