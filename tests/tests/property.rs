@@ -6,6 +6,7 @@ use std::net::TcpStream;
 
 use grasp_proto::pb;
 use grasp_proto::pb::grasp_service_client::GraspServiceClient;
+use grasp_tests::scene::{CAMERA, camera, view};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
 use nalgebra::Isometry3;
 use proptest::collection::vec;
@@ -20,6 +21,7 @@ use tonic::transport::Channel;
 use tonic::{Code, Request, Status};
 
 const VALUES: usize = RESOLUTION.pow(3);
+const PIXELS: usize = CAMERA.width * CAMERA.height;
 const VOXEL_SIZE: f64 = 0.3 / RESOLUTION as f64;
 
 /// Mostly valid requests, so that they pass the first checks, with an invalid value in some fields.
@@ -183,6 +185,71 @@ fn random_requests_are_answered_or_refused() {
     outcome.unwrap();
     let (answered, refused) = (answered.get(), refused.get());
     assert!(answered > 500 && refused > 500, "{answered} answered, {refused} refused: the requests are too uniform");
+    target.assert_usable();
+}
+
+/// Mostly valid requests for scores, from two labelled views of a block.
+fn score_request() -> impl Strategy<Value = pb::ScoreGraspsRequest> {
+    let candidate =
+        (proptest::option::weighted(0.97, pose()), proptest::option::of(prop_oneof![8 => 0.0..0.1, 1 => any::<f64>()]))
+            .prop_map(|(pose, width)| pb::Candidate { pose, width });
+    let margin = || prop_oneof![8 => proptest::option::of(0.0..0.1), 1 => any::<f64>().prop_map(Some)];
+    let objects = prop_oneof![4 => Just(vec![]), 2 => vec(1..4_u32, 1..3), 1 => vec(any::<u32>(), 1..3)];
+    let label_type = prop_oneof![8 => Just(1), 1 => any::<i32>()];
+    let length = prop_oneof![8 => Just(PIXELS), 1 => 0..2 * PIXELS];
+    let labels = (label_type, length).prop_map(|(r#type, length)| {
+        let data: Vec<u8> = (0..length).map(|pixel| (pixel / 50 % 4) as u8).collect();
+        pb::Labels { data: data.into(), r#type }
+    });
+    let extent = proptest::option::weighted(0.1, (any::<f64>(), 0.1..1.0).prop_map(|(x, y)| pb::Extent { x, y }));
+    let options = (objects, margin(), margin(), any::<bool>(), -1..4, proptest::option::weighted(0.2, pose()));
+    (vec(candidate, 0..6), proptest::option::weighted(0.8, labels), extent, options).prop_map(
+        |(candidates, labels, extent, (objects, margin, clearance, hidden, mode, region_pose))| {
+            let views = [-90.0, 90.0].map(|azimuth| {
+                let view = pb::DepthView::from(&view(&camera(35.0, azimuth)));
+                pb::DepthView { labels: labels.clone(), ..view }
+            });
+            let workspace = Some(pb::Workspace { extent, ..Default::default() });
+            let collision = Some(pb::CollisionCheck { mode, clearance, hidden, ..Default::default() });
+            let options = pb::Options { objects, margin, collision, region_pose, ..Default::default() };
+            pb::ScoreGraspsRequest {
+                candidates,
+                scene: Some(pb::score_grasps_request::Scene::Depth(pb::DepthViews { views: views.into(), workspace })),
+                options: Some(options),
+                ..Default::default()
+            }
+        },
+    )
+}
+
+#[test]
+fn random_candidates_are_scored_or_refused() {
+    let target = Target::new();
+    let (answered, refused) = (Cell::new(0), Cell::new(0));
+    let mut runner = TestRunner::new(Config { cases: 600, failure_persistence: None, ..Config::default() });
+    let outcome = runner.run(&score_request().no_shrink(), |request| {
+        let mut client = GraspServiceClient::new(target.channel.clone());
+        let count = request.candidates.len();
+        match target.runtime.block_on(client.score_grasps(request)) {
+            Ok(response) => {
+                answered.set(answered.get() + 1);
+                let scores = &response.get_ref().scores;
+                prop_assert_eq!(scores.len(), count);
+                for score in scores {
+                    prop_assert!((0.0..=1.0).contains(&score.quality), "{score:?}");
+                    prop_assert!(score.open_width.is_none_or(|width| (0.0..=0.081).contains(&width)), "{score:?}");
+                }
+            }
+            Err(status) => {
+                refused.set(refused.get() + 1);
+                prop_assert_eq!(status.code(), Code::InvalidArgument, "{}", status);
+            }
+        }
+        Ok(())
+    });
+    outcome.unwrap();
+    let (answered, refused) = (answered.get(), refused.get());
+    assert!(answered > 60 && refused > 60, "{answered} answered, {refused} refused: the requests are too uniform");
     target.assert_usable();
 }
 

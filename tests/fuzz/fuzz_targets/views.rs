@@ -10,10 +10,11 @@ use prost::Message;
 
 fuzz_target!(|bytes: &[u8]| {
     let Some((&kind, bytes)) = bytes.split_first() else { return };
-    match kind % 4 {
+    match kind % 5 {
         0 => options(bytes),
         1 => depth(bytes),
         2 => cloud(bytes),
+        3 => candidates(bytes),
         _ => fitting(bytes),
     }
 });
@@ -27,6 +28,21 @@ fn options(bytes: &[u8]) {
         assert!(pose.translation.vector.iter().all(|c| c.is_finite()), "{pose}");
     }
     let _ = params.constraints.violation(&grasp, &params.clearance().hand);
+}
+
+/// Valid candidates are finite.
+fn candidates(bytes: &[u8]) {
+    let Ok(request) = pb::ScoreGraspsRequest::decode(bytes) else { return };
+    let Ok(params) = DetectParams::try_from(&request.options.unwrap_or_default()) else { return };
+    match grasp_proto::candidates(&request.candidates, &params) {
+        Ok(candidates) => {
+            for candidate in candidates {
+                let pose = candidate.pose;
+                assert!(pose.translation.vector.iter().all(|c| c.is_finite()), "{pose}");
+            }
+        }
+        Err(error) => assert!(error.message.starts_with(&*error.field), "{error:?}"),
+    }
 }
 
 fn depth(bytes: &[u8]) {
@@ -70,6 +86,7 @@ fn fitting(mut bytes: &[u8]) {
         unit: pb::DepthUnit::F32Metres.into(),
         camera: Some(pb::Camera { width: 12, height: 9, k }),
         extrinsics: Some(pb::depth_view::Extrinsics::CameraFromTask(pose)),
+        labels: Some(pb::Labels { data: vec![3; 12 * 9].into(), r#type: pb::LabelType::U8.into() }),
     };
     check(&view, 0, &Isometry3::identity());
 }
@@ -87,7 +104,7 @@ fn integrate(view: &grasp::View) {
     if let Ok(table) = Tabletop::find(&image, None, 0.05) {
         assert!(table.camera_from_task.translation.vector.iter().all(|c| c.is_finite()), "{table:?}");
     }
-    let mut fusion = Fusion::new(8, 0.3);
+    let mut fusion = Fusion::new(8, 0.3).forgetting(3.0);
     let _ = fusion.contradicted(&image, &view.camera_from_task);
     if fusion.integrate(&image, &view.camera_from_task) == 0 {
         assert!(!fusion.blind(&image, &view.camera_from_task).to_string().is_empty());
