@@ -201,9 +201,11 @@ fn score_request() -> impl Strategy<Value = pb::ScoreGraspsRequest> {
         let data: Vec<u8> = (0..length).map(|pixel| (pixel / 50 % 4) as u8).collect();
         pb::Labels { data: data.into(), r#type }
     });
-    let extent = proptest::option::weighted(0.1, (any::<f64>(), 0.1..1.0).prop_map(|(x, y)| pb::Extent { x, y }));
-    let options = (objects, margin(), margin(), any::<bool>(), -1..4, proptest::option::weighted(0.2, pose()));
-    (vec(candidate, 0..6), proptest::option::weighted(0.8, labels), extent, options).prop_map(
+    let extent = proptest::option::weighted(0.05, (any::<f64>(), 0.1..1.0).prop_map(|(x, y)| pb::Extent { x, y }));
+    let mode = prop_oneof![12 => 0..3, 1 => any::<i32>()];
+    let options = (objects, margin(), margin(), any::<bool>(), mode, proptest::option::weighted(0.05, pose()));
+    let candidates = prop_oneof![12 => vec(candidate, 1..4), 1 => Just(vec![])];
+    (candidates, proptest::option::weighted(0.95, labels), extent, options).prop_map(
         |(candidates, labels, extent, (objects, margin, clearance, hidden, mode, region_pose))| {
             let views = [-90.0, 90.0].map(|azimuth| {
                 let view = pb::DepthView::from(&view(&camera(35.0, azimuth)));
