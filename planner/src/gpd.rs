@@ -26,8 +26,8 @@ impl Gpd {
     ///
     /// # Errors
     /// [`LoadError`] if the file is not a valid classifier.
-    pub fn load(path: &Path) -> Result<Self, LoadError> {
-        Ok(Self::new(Classifier::load(path, &Image::SHAPE, &Options::default())?))
+    pub fn load(path: &Path, options: &Options) -> Result<Self, LoadError> {
+        Ok(Self::new(Classifier::load(path, &Image::SHAPE, options)?))
     }
 
     /// The default parameters: the threshold 0.5 keeps candidates that succeed more likely than not, as in GPD's code.

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use grasp::gpd::Image;
 use grasp::{DecodeParams, Patch};
-use grasp_models::{Backend, Classifier, Entry, LoadError, Metadata, Network, Options};
+use grasp_models::{Backend, Classifier, Entry, LoadError, Metadata, Network, Options, Precision};
 
 use crate::{Evaluator, Gpd, NetworkPlanner, Planner, Shaf};
 
@@ -136,10 +136,13 @@ impl Source {
                 (networks.into_iter().zip(evaluators).map(planner).collect(), backend)
             }
             Self::Gpd(entry) => {
-                // GPD runs in f32 on the CPU everywhere.
-                let options = Options { threads: options.threads, ..Options::default() };
-                let classifiers = Classifier::load_several(entry, &Image::SHAPE, &options, count)?.into_iter();
-                (classifiers.map(|classifier| single(Box::new(Gpd::new(classifier)))).collect(), Backend::REFERENCE)
+                // 8 bits are for the networks that were exported for them.
+                let precision = options.precision.filter(|&precision| precision != Precision::Int8);
+                let options = Options { precision, ..*options };
+                let classifiers = Classifier::load_several(entry, &Image::SHAPE, &options, count)?;
+                let backend = classifiers.first().map_or(Backend::REFERENCE, Classifier::backend);
+                let planner = |classifier| single(Box::new(Gpd::new(classifier)));
+                (classifiers.into_iter().map(planner).collect(), backend)
             }
             Self::Shaf => ((0..count).map(|_| single(Box::new(Shaf))).collect(), Backend::REFERENCE),
         })

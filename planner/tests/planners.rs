@@ -4,8 +4,10 @@ use std::cell::Cell;
 use std::path::PathBuf;
 
 use grasp::{DecodeParams, Decoded, DepthImage, Fusion, RESOLUTION, SurfacePoint, WORKSPACE_SIZE, seen_from};
-use grasp_models::{Network, Options};
-use grasp_planner::{Evaluator, Gpd, HighestProposal, NetworkPlanner, PlanError, PlanParams, Planner, Scene, Shaf};
+use grasp_models::{Backend, Network, Options, Precision, Store};
+use grasp_planner::{
+    Evaluator, Gpd, HighestProposal, NetworkPlanner, PlanError, PlanParams, Planner, Scene, Shaf, Source,
+};
 use nalgebra::{Isometry3, Point3, Vector3};
 
 const TABLE: f64 = 0.05;
@@ -69,7 +71,7 @@ fn planners() -> Vec<(&'static str, Box<dyn Planner>, DecodeParams)> {
         ("network", Box::new(network), decode),
         ("evaluator", Box::new(NetworkPlanner::new(evaluated, Some(evaluator))), of_evaluated),
         ("highest proposal", Box::new(HighestProposal(proposals)), decode),
-        ("gpd", Box::new(Gpd::load(&zoo("classifiers/gpd.onnx")).unwrap()), Gpd::decode_params()),
+        ("gpd", Box::new(Gpd::load(&zoo("classifiers/gpd.onnx"), &Options::default()).unwrap()), Gpd::decode_params()),
         ("shaf", Box::new(Shaf), Shaf::decode_params()),
     ]
 }
@@ -122,6 +124,32 @@ fn grasps_are_sorted_by_the_criterion_of_the_planner() {
 }
 
 #[test]
+fn the_fastest_backend_of_gpd_agrees_with_the_reference() {
+    let scene = scene(Isometry3::identity());
+    let decode = DecodeParams { threshold: 1e-6, ..Gpd::decode_params() };
+    let [reference, fastest] = [Options::default(), Options::auto(1)].map(|options| {
+        let mut gpd = Gpd::load(&zoo("classifiers/gpd.onnx"), &options).unwrap();
+        plan(&mut gpd, &scene, decode).grasps
+    });
+    assert!(!reference.is_empty() && reference.len() == fastest.len());
+    for grasp in &fastest {
+        let same = reference.iter().find(|other| other.pose == grasp.pose).unwrap();
+        // Nothing but the classifier depends on the backend.
+        assert_eq!(same.width, grasp.width);
+        assert!((same.quality - grasp.quality).abs() < 0.02, "{} and {}", same.quality, grasp.quality);
+    }
+}
+
+#[test]
+fn gpd_runs_beside_int8_networks() {
+    let store = Store::open(&zoo("classifiers")).unwrap();
+    let source = Source::Gpd(store.get("gpd", None).unwrap().clone());
+    let (planners, backend) =
+        source.load(&Options { precision: Some(Precision::Int8), ..Options::default() }, 2).unwrap();
+    assert_eq!((planners.len(), backend), (2, Backend::REFERENCE));
+}
+
+#[test]
 fn without_points_the_surface_of_the_volume_is_used() {
     let scene = Scene { points: None, ..scene(Isometry3::identity()) };
     assert!(!plan(&mut Shaf, &scene, Shaf::decode_params()).grasps.is_empty());
@@ -131,7 +159,7 @@ fn without_points_the_surface_of_the_volume_is_used() {
 fn planning_stops_when_it_is_cancelled() {
     let scene = scene(Isometry3::identity());
     let params = PlanParams { decode: Shaf::decode_params(), table: Some(TABLE) };
-    let mut gpd = Gpd::load(&zoo("classifiers/gpd.onnx")).unwrap();
+    let mut gpd = Gpd::load(&zoo("classifiers/gpd.onnx"), &Options::default()).unwrap();
     let planners: [&mut dyn Planner; 2] = [&mut Shaf, &mut gpd];
     for planner in planners {
         let calls = Cell::new(0);

@@ -120,8 +120,8 @@ impl From<&str> for PlannerSpec {
 }
 
 impl PlannerSpec {
-    /// Creates the planner. Networks run with `options` and decode with `params`. GPD and SHAF use their default
-    /// parameters. A server uses its model's parameters except for the threshold and `force`.
+    /// Creates the planner. Networks and classifiers run with `options`, and networks decode with `params`. GPD and
+    /// SHAF use their default parameters. A server uses its model's parameters except for the threshold and `force`.
     ///
     /// # Errors
     /// If the file is not the expected kind of network, or the server cannot be reached.
@@ -140,7 +140,7 @@ impl PlannerSpec {
             Self::Random => BenchPlanner::Random,
             Self::Server(address) => BenchPlanner::Server(Server::connect(address, params)?),
             Self::Highest => local(Box::new(Shaf), Shaf::decode_params(), true),
-            Self::Gpd(path) => local(Box::new(Gpd::load(path)?), Gpd::decode_params(), true),
+            Self::Gpd(path) => local(Box::new(Gpd::load(path, options)?), Gpd::decode_params(), true),
             Self::Network(path) => {
                 let (network, decode) = load(path)?;
                 local(Box::new(network), decode, false)

@@ -1,12 +1,15 @@
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::ops::RangeInclusive;
 
-use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, Unit, UnitQuaternion, Vector3};
 use rand::Rng;
 use rand::seq::index;
 
 use super::Cloud;
 use crate::{Hand, SurfacePoint};
+
+/// Larger than the rounding errors of coordinates, metres. Checks that only skip work have this margin.
+const ROUNDING: f64 = 1e-9;
 
 /// Parameters of the candidate search. The defaults are those of GPD's code.
 #[derive(Clone, Debug, PartialEq)]
@@ -78,18 +81,23 @@ pub fn by_sample(cloud: &Cloud, params: &Params, rng: &mut impl Rng) -> impl Ite
 
 /// The candidates of one sample.
 fn fit_at(cloud: &Cloud, params: &Params, sample: &SurfacePoint) -> Vec<Candidate> {
-    let Params { hand, rotations, .. } = params;
     let (normal, axis) = local_frame(cloud, params, sample);
-    // All points that the fingers can reach with any rotation and offset.
-    let near: Vec<Point3<f64>> =
-        cloud.within(sample.position, hand.outer_diameter + hand.depth).map(|point| point.position).collect();
-    let rotation = |turn: usize| {
-        let angle = turn as f64 / *rotations as f64 * PI - FRAC_PI_2;
-        let approach = Rotation3::from_axis_angle(&nalgebra::Unit::new_unchecked(axis), angle) * -normal;
-        let axes = Matrix3::from_columns(&[axis, approach.cross(&axis), approach]);
-        UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes))
+    let slice = slice(cloud, &params.hand, &sample.position, &axis);
+    (0..params.rotations)
+        .map(|turn| turn as f64 / params.rotations as f64 * PI - FRAC_PI_2)
+        .filter_map(|angle| TurnedHand::new(params, sample.position, normal, axis, angle).fit(cloud, &slice))
+        .collect()
+}
+
+/// The points that can be between the fingers or collide with them, at any rotation about `axis` and any offset,
+/// relative to the sample: those within reach of the hand and within the breadth of its fingers.
+fn slice(cloud: &Cloud, hand: &Hand, sample: &Point3<f64>, axis: &Vector3<f64>) -> Vec<Vector3<f64>> {
+    let (reach, half) = (hand.outer_diameter + hand.depth, hand.height / 2.0 + ROUNDING);
+    let is_near = |offset: &Vector3<f64>, margin: f64| {
+        offset.dot(axis).abs() <= half + margin && offset.norm_squared() <= (reach + margin).powi(2)
     };
-    (0..*rotations).filter_map(|turn| fit(cloud, params, &near, &sample.position, rotation(turn))).collect()
+    let points = cloud.in_cells(|centre, radius| is_near(&(centre - sample), radius));
+    points.map(|point| point.position - sample).filter(|offset| is_near(offset, 0.0)).collect()
 }
 
 /// The normal and the axis of least curvature at a sample. Along this axis normals vary least.
@@ -104,55 +112,79 @@ fn local_frame(cloud: &Cloud, params: &Params, sample: &SurfacePoint) -> (Vector
     (normal, (axis - normal * axis.dot(&normal)).normalize())
 }
 
-/// The candidate of one rotation, if the hand fits.
-fn fit(
-    cloud: &Cloud,
-    params: &Params,
-    near: &[Point3<f64>],
-    sample: &Point3<f64>,
+/// The hand at one rotation about a sample.
+struct TurnedHand<'a> {
+    params: &'a Params,
+    sample: Point3<f64>,
     rotation: UnitQuaternion<f64>,
-) -> Option<Candidate> {
-    let Params { hand, placements, .. } = params;
-    let pose = |offset: f64, bite: f64| {
-        let origin = sample + rotation * Vector3::new(0.0, offset, bite - hand.depth);
-        Isometry3::from_parts(Translation3::from(origin), rotation)
-    };
-    // Only points within the breadth of the fingers can be between them or collide with them.
-    let to_sample = rotation.inverse();
-    let slice: Vec<Point3<f64>> = near
-        .iter()
-        .map(|point| Point3::from(to_sample * (point - sample)))
-        .filter(|point| point.x.abs() <= hand.height / 2.0)
-        .collect();
-    let in_hand = |offset: f64, bite: f64| {
-        slice.iter().map(move |point| Point3::new(point.x, point.y - offset, point.z + hand.depth - bite))
-    };
-    let is_free = |offset: f64, bite: f64| {
-        in_hand(offset, bite).all(|point| !hand.finger_meets(&point) && !hand.palm_meets(&point))
-            && hand.lowest_point(&pose(offset, bite)) >= params.lowest
-    };
+}
 
-    let offset = |placement: usize| {
-        let share = (placement as f64 + 0.5) / *placements as f64;
-        (2.0 * share - 1.0) * hand.half_opening()
-    };
-    let free: Vec<f64> = (0..*placements).map(offset).filter(|&offset| is_free(offset, params.bite)).collect();
-    let offset = *free.get(free.len() / 2)?;
-    let bites = (0..).map(|step| params.bite + f64::from(step) * params.deepening);
-    let bite = bites
-        .take_while(|&bite| bite <= hand.depth + 1e-9 && is_free(offset, bite))
-        .last()
-        .filter(|&bite| palm_is_free(cloud, hand, &pose(offset, bite)))?;
+impl<'a> TurnedHand<'a> {
+    /// The hand whose approach is against `normal`, turned by `angle` about `axis`.
+    fn new(params: &'a Params, sample: Point3<f64>, normal: Vector3<f64>, axis: Vector3<f64>, angle: f64) -> Self {
+        let approach = Rotation3::from_axis_angle(&Unit::new_unchecked(axis), angle) * -normal;
+        let axes = Matrix3::from_columns(&[axis, approach.cross(&axis), approach]);
+        let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
+        Self { params, sample, rotation }
+    }
 
-    let held = in_hand(offset, bite).filter(|point| hand.holds(point)).map(|point| point.y);
-    let (lower, upper) = held.fold((f64::MAX, f64::MIN), |(lower, upper), y| (lower.min(y), upper.max(y)));
-    let width = upper - lower;
-    params.aperture.contains(&width).then(|| Candidate { pose: pose(offset, bite), width, point: *sample })
+    /// The candidate of this rotation, if the hand fits. `slice` holds the points of [`slice`].
+    fn fit(&self, cloud: &Cloud, slice: &[Vector3<f64>]) -> Option<Candidate> {
+        let Params { hand, bite, deepening, aperture, .. } = self.params;
+        // For many rotations the table leaves no offset, and its check needs no points.
+        let mut offsets = self.offsets().filter(|&offset| self.is_above_table(offset, *bite)).peekable();
+        offsets.peek()?;
+        let to_hand = self.rotation.inverse().to_rotation_matrix();
+        let slice: Vec<Vector3<f64>> = slice.iter().map(|point| to_hand * point).collect();
+        // The hand does not reach beyond its fingertips.
+        let reached: Vec<Vector3<f64>> = slice.iter().copied().filter(|point| point.z <= bite + ROUNDING).collect();
+        let free: Vec<f64> = offsets.filter(|&offset| self.is_free(&reached, offset, *bite)).collect();
+        let offset = *free.get(free.len() / 2)?;
+        let bites = (0..).map(|step| bite + f64::from(step) * deepening);
+        let bites = bites.take_while(|&bite| bite <= hand.depth + ROUNDING && self.is_above_table(offset, bite));
+        let bite = bites.take_while(|&bite| self.is_free(&slice, offset, bite)).last()?;
+
+        let held = slice.iter().map(|point| self.in_hand(point, offset, bite)).filter(|point| hand.holds(point));
+        let (lower, upper) = held.fold((f64::MAX, f64::MIN), |(lower, upper), p| (lower.min(p.y), upper.max(p.y)));
+        let candidate = Candidate { pose: self.pose(offset, bite), width: upper - lower, point: self.sample };
+        // The palm is checked last, because its check is the slowest.
+        (aperture.contains(&candidate.width) && palm_is_free(cloud, hand, &candidate.pose)).then_some(candidate)
+    }
+
+    /// The offsets along the closing axis.
+    fn offsets(&self) -> impl Iterator<Item = f64> {
+        let Params { hand, placements, .. } = self.params;
+        let share = |placement: usize| (placement as f64 + 0.5) / *placements as f64;
+        (0..*placements).map(move |placement| (2.0 * share(placement) - 1.0) * hand.half_opening())
+    }
+
+    fn pose(&self, offset: f64, bite: f64) -> Isometry3<f64> {
+        let origin = self.sample + self.rotation * Vector3::new(0.0, offset, bite - self.params.hand.depth);
+        Isometry3::from_parts(Translation3::from(origin), self.rotation)
+    }
+
+    /// A point that is relative to the sample, with the axes of the hand, in the frame of the hand.
+    fn in_hand(&self, point: &Vector3<f64>, offset: f64, bite: f64) -> Point3<f64> {
+        Point3::new(point.x, point.y - offset, point.z + self.params.hand.depth - bite)
+    }
+
+    fn is_above_table(&self, offset: f64, bite: f64) -> bool {
+        self.params.hand.lowest_point(&self.pose(offset, bite)) >= self.params.lowest
+    }
+
+    fn is_free(&self, points: &[Vector3<f64>], offset: f64, bite: f64) -> bool {
+        let hand = &self.params.hand;
+        let mut points = points.iter().map(|point| self.in_hand(point, offset, bite));
+        points.all(|point| !hand.finger_meets(&point) && !hand.palm_meets(&point))
+    }
 }
 
 /// The palm is wider than the fingers, so it is checked against the whole cloud.
 fn palm_is_free(cloud: &Cloud, hand: &Hand, pose: &Isometry3<f64>) -> bool {
-    cloud.points().iter().all(|point| !hand.palm_meets(&pose.inverse_transform_point(&point.position)))
+    let to_hand = pose.rotation.inverse().to_rotation_matrix();
+    let in_hand = |point: &Point3<f64>| Point3::from(to_hand * (point.coords - pose.translation.vector));
+    let mut points = cloud.in_cells(|centre, radius| hand.comes_near(&in_hand(centre), 0.0, radius));
+    points.all(|point| !hand.palm_meets(&in_hand(&point.position)))
 }
 
 #[cfg(test)]
@@ -223,6 +255,56 @@ mod tests {
         let high = candidates(&cloud, &params, &mut ChaCha8Rng::seed_from_u64(2));
         assert!(!high.is_empty() && high.len() < found.len(), "a higher table leaves fewer");
         assert!(high.iter().all(|candidate| hand.lowest_point(&candidate.pose) >= TABLE + 0.06));
+    }
+
+    /// The candidate of a rotation, from a scan of all points at each pose.
+    fn scanned(cloud: &Cloud, hand: &TurnedHand) -> Option<Candidate> {
+        let TurnedHand { params, .. } = hand;
+        let in_hand = |pose: Isometry3<f64>| {
+            cloud.points().iter().map(move |point| pose.inverse_transform_point(&point.position))
+        };
+        let reach = params.hand.outer_diameter + params.hand.depth;
+        let near: Vec<Point3<f64>> = cloud.within(hand.sample, reach).map(|point| point.position).collect();
+        let is_free = |offset: f64, bite: f64| {
+            let pose = hand.pose(offset, bite);
+            params.hand.lowest_point(&pose) >= params.lowest
+                && near.iter().map(|point| pose.inverse_transform_point(point)).all(|point| {
+                    point.x.abs() > params.hand.height / 2.0
+                        || !params.hand.finger_meets(&point) && !params.hand.palm_meets(&point)
+                })
+        };
+        let free: Vec<f64> = hand.offsets().filter(|&offset| is_free(offset, params.bite)).collect();
+        let offset = *free.get(free.len() / 2)?;
+        let bites = (0..9).map(|step| params.bite + f64::from(step) * params.deepening);
+        let bite = bites.take_while(|&bite| bite <= params.hand.depth + 1e-9 && is_free(offset, bite)).last()?;
+        let pose = hand.pose(offset, bite);
+        let held = in_hand(pose).filter(|point| params.hand.holds(point)).map(|point| point.y);
+        let width = held.clone().fold(f64::MIN, f64::max) - held.fold(f64::MAX, f64::min);
+        let is_free = in_hand(pose).all(|point| !params.hand.palm_meets(&point));
+        (is_free && params.aperture.contains(&width)).then_some(Candidate { pose, width, point: hand.sample })
+    }
+
+    #[test]
+    fn candidates_are_those_of_a_scan_of_all_points() {
+        let cloud = Cloud::new(standing_box());
+        let params = Params::above(TABLE);
+        let mut found = 0;
+        for point in cloud.points().iter().step_by(37) {
+            let (normal, axis) = local_frame(&cloud, &params, point);
+            let slice = slice(&cloud, &params.hand, &point.position, &axis);
+            for angle in [-1.2, -0.4, 0.0, 0.4, 1.2] {
+                let hand = TurnedHand::new(&params, point.position, normal, axis, angle);
+                match (hand.fit(&cloud, &slice), scanned(&cloud, &hand)) {
+                    (Some(candidate), Some(expected)) => {
+                        assert_eq!(candidate.pose, expected.pose);
+                        assert!((candidate.width - expected.width).abs() < 1e-12);
+                        found += 1;
+                    }
+                    (candidate, expected) => assert_eq!(candidate, expected),
+                }
+            }
+        }
+        assert!(found > 20, "{found} candidates");
     }
 
     #[test]

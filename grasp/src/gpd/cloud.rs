@@ -1,4 +1,4 @@
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 
 use nalgebra::{Matrix3, Point3, Vector3};
 
@@ -20,11 +20,14 @@ const MAX_POINTS: usize = 20_000;
 pub struct Cloud {
     points: Vec<SurfacePoint>,
     /// Indices into `points` by cell of size [`CELL`].
-    cells: HashMap<[i64; 3], Vec<usize>>,
+    cells: BTreeMap<[i64; 3], Vec<usize>>,
 }
 
-/// Edge of the cells of the neighbour search, metres: a normal's neighbourhood touches 27 of them.
+/// Edge of the cells of the neighbour search, metres.
 const CELL: f64 = NORMALS_RADIUS;
+
+/// Edge of the blocks whose points share a neighbour search for their normals, metres.
+const BLOCK: f64 = NORMALS_RADIUS / 3.0;
 
 impl Cloud {
     /// Downsamples `points` to the means of their voxels and estimates each normal from the plane through its
@@ -47,14 +50,10 @@ impl Cloud {
                 normal: sum.normals.try_normalize(1e-12).unwrap_or(Vector3::z()),
             })
             .collect();
-        let mut cells: HashMap<[i64; 3], Vec<usize>> = HashMap::new();
-        for (index, point) in seen.iter().enumerate() {
-            cells.entry(cell_of(&point.position, CELL)).or_default().push(index);
-        }
+        let cells = by_cell(&seen, CELL);
         let mut cloud = Self { points: seen, cells };
-        let normals: Vec<Vector3<f64>> = cloud.points.iter().map(|point| cloud.normal_at(point)).collect();
-        for (point, normal) in cloud.points.iter_mut().zip(normals) {
-            point.normal = normal;
+        for (index, normal) in cloud.normals() {
+            cloud.points[index].normal = normal;
         }
         cloud
     }
@@ -65,41 +64,57 @@ impl Cloud {
         &self.points
     }
 
-    /// The points within `radius` of `centre`.
+    /// The points within `radius` of `centre`; `radius` is at least 0.
     pub fn within(&self, centre: Point3<f64>, radius: f64) -> impl Iterator<Item = &SurfacePoint> {
-        let lower = cell_of(&(centre - Vector3::repeat(radius)), CELL);
-        let upper = cell_of(&(centre + Vector3::repeat(radius)), CELL);
-        let wanted: f64 = lower.iter().zip(upper).map(|(&lower, upper)| (upper - lower + 1) as f64).product();
-        // For a large radius, scanning all points is cheaper than visiting all cells.
-        let all = wanted > self.points.len() as f64;
-        let cells = (lower[0]..=upper[0])
-            .flat_map(move |x| (lower[1]..=upper[1]).flat_map(move |y| (lower[2]..=upper[2]).map(move |z| [x, y, z])));
-        let cells = cells.take(if all { 0 } else { usize::MAX });
-        let points = self.points.get(if all { 0 } else { self.points.len() }..).unwrap_or_default();
-        cells
-            .filter_map(|cell| self.cells.get(&cell))
-            .flatten()
-            .map(|&index| &self.points[index])
-            .chain(points)
-            .filter(move |point| (point.position - centre).norm_squared() <= radius * radius)
+        let [lower, upper] = [-radius, radius].map(|side| cell_of(&(centre + Vector3::repeat(side)), CELL));
+        let layers = self.cells.range([lower[0], i64::MIN, i64::MIN]..=[upper[0], i64::MAX, i64::MAX]);
+        let cells =
+            layers.filter(move |(cell, _)| (1..3).all(|axis| (lower[axis]..=upper[axis]).contains(&cell[axis])));
+        let points = cells.flat_map(|(_, indices)| indices).map(|&index| &self.points[index]);
+        points.filter(move |point| (point.position - centre).norm_squared() <= radius * radius)
     }
 
-    /// The direction of least variance of the neighbourhood, on the observed side.
-    fn normal_at(&self, point: &SurfacePoint) -> Vector3<f64> {
-        let (mut sum, mut squares, mut count) = (Vector3::zeros(), Matrix3::zeros(), 0.0);
-        for neighbour in self.within(point.position, NORMALS_RADIUS) {
-            let offset = neighbour.position - point.position;
-            sum += offset;
-            squares += offset * offset.transpose();
-            count += 1.0;
-        }
-        if count < 3.0 {
-            return point.normal;
-        }
-        let eigen = (squares - sum * sum.transpose() / count).symmetric_eigen();
-        let normal: Vector3<f64> = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into();
-        if normal.dot(&point.normal) < 0.0 { -normal } else { normal }
+    /// The points, without those of cells that `may_contain` rejects. Its arguments are the centre and the radius of a
+    /// sphere around the cell.
+    pub(super) fn in_cells(
+        &self,
+        may_contain: impl Fn(&Point3<f64>, f64) -> bool,
+    ) -> impl Iterator<Item = &SurfacePoint> {
+        let cells = self.cells.iter().filter(move |(cell, _)| may_contain(&centre_of(cell, CELL), radius_of(CELL)));
+        cells.flat_map(|(_, indices)| indices).map(|&index| &self.points[index])
     }
+
+    /// The indices of all points, and their normals.
+    fn normals(&self) -> Vec<(usize, Vector3<f64>)> {
+        let mut normals = Vec::with_capacity(self.points.len());
+        for (block, indices) in by_cell(&self.points, BLOCK) {
+            // The points of a block share most of their neighbours.
+            let near = self.within(centre_of(&block, BLOCK), NORMALS_RADIUS + radius_of(BLOCK));
+            let near: Vec<Point3<f64>> = near.map(|point| point.position).collect();
+            normals.extend(indices.into_iter().map(|index| (index, normal_at(&self.points[index], &near))));
+        }
+        normals
+    }
+}
+
+/// The direction of least variance of the neighbourhood, on the observed side. The neighbours are among `near`.
+fn normal_at(point: &SurfacePoint, near: &[Point3<f64>]) -> Vector3<f64> {
+    let (mut sum, mut squares, mut count) = (Vector3::zeros(), Matrix3::zeros(), 0.0);
+    for neighbour in near {
+        let offset = neighbour - point.position;
+        // A weight and no branch, because the processor would often mispredict the branch.
+        let weight = if offset.norm_squared() <= NORMALS_RADIUS * NORMALS_RADIUS { 1.0 } else { 0.0 };
+        let offset = offset * weight;
+        sum += offset;
+        squares += offset * offset.transpose();
+        count += weight;
+    }
+    if count < 3.0 {
+        return point.normal;
+    }
+    let eigen = (squares - sum * sum.transpose() / count).symmetric_eigen();
+    let normal: Vector3<f64> = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into();
+    if normal.dot(&point.normal) < 0.0 { -normal } else { normal }
 }
 
 /// Sums over the points of a voxel.
@@ -128,8 +143,27 @@ fn thinned(points: impl Iterator<Item = Sum>, edge: f64) -> BTreeMap<[i64; 3], S
     voxels
 }
 
+/// The indices of the points by cell of size `edge`.
+fn by_cell(points: &[SurfacePoint], edge: f64) -> BTreeMap<[i64; 3], Vec<usize>> {
+    let mut cells: BTreeMap<[i64; 3], Vec<usize>> = BTreeMap::new();
+    for (index, point) in points.iter().enumerate() {
+        cells.entry(cell_of(&point.position, edge)).or_default().push(index);
+    }
+    cells
+}
+
 fn cell_of(point: &Point3<f64>, edge: f64) -> [i64; 3] {
     [point.x, point.y, point.z].map(|coordinate| (coordinate / edge).floor() as i64)
+}
+
+fn centre_of([x, y, z]: &[i64; 3], edge: f64) -> Point3<f64> {
+    let middle = |index: &i64| (*index as f64 + 0.5) * edge;
+    Point3::new(middle(x), middle(y), middle(z))
+}
+
+/// Radius of the sphere around a cell.
+fn radius_of(edge: f64) -> f64 {
+    0.5 * 3.0_f64.sqrt() * edge
 }
 
 #[cfg(test)]
@@ -173,6 +207,29 @@ mod tests {
             let expected = cloud.points().iter().filter(near).count();
             assert!(expected > 0);
             assert_eq!(cloud.within(centre, radius).count(), expected);
+        }
+    }
+
+    #[test]
+    fn only_cells_that_may_contain_a_point_are_searched() {
+        let cloud = Cloud::new(plane(0.2));
+        let in_slab = |point: &Point3<f64>, margin: f64| (0.8 * point.x - 0.6 * point.y).abs() <= 0.004 + margin;
+        let searched = || cloud.in_cells(in_slab).map(|point| point.position);
+        let expected = cloud.points().iter().filter(|point| in_slab(&point.position, 0.0)).count();
+        assert_eq!(searched().filter(|point| in_slab(point, 0.0)).count(), expected);
+        assert!((1..cloud.points().len()).contains(&searched().count()), "some cells are skipped");
+    }
+
+    #[test]
+    fn a_normal_is_that_of_all_neighbours() {
+        let bent = |point: SurfacePoint| {
+            let Point3 { coords } = point.position;
+            SurfacePoint { position: Point3::new(coords.x, coords.y, 5.0 * coords.norm_squared()), ..point }
+        };
+        let cloud = Cloud::new(plane(0.0).into_iter().map(bent));
+        let all: Vec<Point3<f64>> = cloud.points().iter().map(|point| point.position).collect();
+        for point in cloud.points() {
+            assert!((normal_at(point, &all) - point.normal).norm() < 1e-9);
         }
     }
 

@@ -5,6 +5,9 @@ use super::{Candidate, Cloud, VOXEL_SIZE};
 /// Pixels along an edge of an image.
 pub const IMAGE_SIZE: usize = 60;
 
+/// Pixels of a channel.
+const AREA: usize = IMAGE_SIZE * IMAGE_SIZE;
+
 /// Channels of an image: three for normals and one for depth in each of three projections.
 ///
 /// GPD defines images of 3, 12 and 15 channels. The 15-channel image adds shadows, which need ray casting for every
@@ -34,9 +37,9 @@ impl Image {
     #[must_use]
     pub fn of(cloud: &Cloud, candidate: &Candidate) -> Self {
         let points = in_region(cloud, &candidate.pose);
-        let mut pixels = Vec::with_capacity(CHANNELS * IMAGE_SIZE * IMAGE_SIZE);
-        for axis in 0..3 {
-            project(&points, axis, &mut pixels);
+        let mut pixels = vec![0; CHANNELS * AREA];
+        for (axis, channels) in pixels.chunks_exact_mut(4 * AREA).enumerate() {
+            project(&points, axis, channels);
         }
         Self { pixels }
     }
@@ -64,35 +67,48 @@ struct Point {
 fn in_region(cloud: &Cloud, pose: &Isometry3<f64>) -> Vec<Point> {
     let [lower, upper] = REGION.map(Vector3::from);
     let size = upper - lower;
-    let centre = pose * Point3::from((lower + upper) / 2.0);
-    let near = cloud.within(centre, size.norm() / 2.0);
-    near.map(|point| {
-        let position = (pose.inverse_transform_point(&point.position).coords - lower).component_div(&size);
-        let normal = pose.rotation.inverse() * point.normal;
-        Point { position: position.into(), normal: normal.map(|component| component.abs() as f32).into() }
-    })
-    .filter(|point| point.position.iter().all(|coordinate| (0.0..1.0).contains(coordinate)))
-    .collect()
+    // A matrix rotates many points faster than a quaternion.
+    let to_hand = pose.rotation.inverse().to_rotation_matrix();
+    let in_region = |point: &Point3<f64>| to_hand * (point.coords - pose.translation.vector) - lower;
+    let is_near = |position: &Vector3<f64>, margin: f64| {
+        (0..3).all(|axis| (-margin..size[axis] + margin).contains(&position[axis]))
+    };
+    let points = cloud.in_cells(|centre, radius| is_near(&in_region(centre), radius));
+    points
+        .map(|point| (in_region(&point.position), point))
+        .filter(|(position, _)| is_near(position, 0.0))
+        .map(|(position, point)| Point {
+            position: position.component_div(&size).into(),
+            normal: (to_hand * point.normal).map(|component| component.abs() as f32).into(),
+        })
+        .collect()
 }
 
-/// Appends the four channels of the projection along `axis`. Rows and columns are the other two axes in ascending
-/// order.
-fn project(points: &[Point], axis: usize, pixels: &mut Vec<u8>) {
-    let plane = [[1, 2], [0, 2], [0, 1]][axis];
-    let mut sums = vec![[0.0_f32; 5]; IMAGE_SIZE * IMAGE_SIZE];
+/// Draws the four channels of the projection along `axis`, which are 0. Rows and columns are the other two axes in
+/// ascending order.
+fn project(points: &[Point], axis: usize, channels: &mut [u8]) {
+    let [rows, columns] = [[1, 2], [0, 2], [0, 1]][axis];
+    let covered = |position: &[f64; 3], axis: usize| covered(position[axis], REGION[1][axis] - REGION[0][axis]);
+    let mut sums = vec![[0.0_f32; 4]; AREA];
+    let mut counts = vec![0.0_f32; AREA];
     for Point { position, normal: [x, y, z] } in points {
-        let nearness = 1.0 - position[axis] as f32;
-        let [rows, columns] = plane.map(|axis| covered(position[axis], REGION[1][axis] - REGION[0][axis]));
-        for row in rows {
-            for sum in &mut sums[row * IMAGE_SIZE..][columns.clone()] {
-                for (sum, value) in sum.iter_mut().zip([*x, *y, *z, nearness, 1.0]) {
+        let values = [*x, *y, *z, 1.0 - position[axis] as f32];
+        let columns = covered(position, columns);
+        for row in covered(position, rows) {
+            let span = row * IMAGE_SIZE + columns.start..row * IMAGE_SIZE + columns.end;
+            for (sum, count) in sums[span.clone()].iter_mut().zip(&mut counts[span]) {
+                for (sum, value) in sum.iter_mut().zip(values) {
                     *sum += value;
                 }
+                *count += 1.0;
             }
         }
     }
-    for channel in 0..4 {
-        pixels.extend(sums.iter().map(|sum| (255.0 * sum[channel] / sum[4].max(1.0)).round() as u8));
+    for (pixel, (sum, count)) in sums.iter().zip(&counts).enumerate().filter(|(_, (_, count))| **count > 0.0) {
+        for (channel, value) in sum.iter().enumerate() {
+            // Adding 0.5 rounds, because no value is negative.
+            channels[channel * AREA + pixel] = (255.0 * value / count + 0.5) as u8;
+        }
     }
 }
 
@@ -109,8 +125,6 @@ mod tests {
 
     use super::*;
     use crate::SurfacePoint;
-
-    const AREA: usize = IMAGE_SIZE * IMAGE_SIZE;
 
     fn candidate() -> Candidate {
         Candidate { pose: Isometry3::identity(), width: 0.04, point: Point3::origin() }
@@ -167,5 +181,14 @@ mod tests {
         let image = Image::of(&Cloud::new([far(Point3::new(0.0, 0.0, 0.015))]), &candidate());
         let nearness = image.pixels()[11 * AREA..].iter().max();
         assert_eq!(nearness, Some(&191), "a quarter of the way along z");
+    }
+
+    #[test]
+    fn a_pixel_is_the_rounded_mean_of_its_points() {
+        let at = |z| SurfacePoint { position: Point3::new(0.0, 0.0, z), normal: Vector3::z() };
+        let image = Image::of(&Cloud::new([at(0.015), at(0.03)]), &candidate());
+        // Along z: 1 - (0.25 + 0.5) / 2 = 0.625, times 255 = 159.4.
+        let nearness = image.pixels()[11 * AREA..].iter().filter(|&&value| value > 0);
+        assert!(nearness.clone().count() > 0 && nearness.clone().all(|&value| value == 159));
     }
 }
