@@ -36,6 +36,13 @@ impl ObjectMap {
         Self { map_from_frame: frame_from_task.inverse(), cells, wanted: Some(wanted).filter(|set| !set.is_empty()) }
     }
 
+    /// A wanted object that was not observed.
+    #[must_use]
+    pub fn missing(&self) -> Option<u16> {
+        let observed: BTreeSet<u16> = self.cells.values().copied().collect();
+        self.wanted.iter().flatten().copied().find(|label| !observed.contains(label))
+    }
+
     /// The object between the open fingers of a hand at `pose`: the one with the most cells; `None` if there is none.
     #[must_use]
     pub fn object(&self, pose: &Isometry3<f64>, hand: &Hand) -> Option<u16> {
@@ -126,6 +133,8 @@ mod tests {
         let map = ObjectMap::new(points(), &frame_from_task, [7].into());
         let admits = |x| map.admits(&over(x, &frame_from_task), &Hand::PANDA);
         assert_eq!([0.1, 0.2, 0.15].map(admits), [false, true, false]);
+        assert_eq!(map.missing(), None);
+        assert_eq!(ObjectMap::new(points(), &frame_from_task, [7, 9].into()).missing(), Some(9));
     }
 
     #[test]

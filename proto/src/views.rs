@@ -12,6 +12,10 @@ pub const MAX_VIEWS: usize = 64;
 /// Largest extent of a workspace, metres.
 const MAX_EXTENT: f64 = 2.0;
 
+/// Median distance of the points of a cloud from its camera beyond which they are probably not in metres: far beyond the
+/// range of depth cameras.
+const FARTHEST: f64 = 20.0;
+
 /// Longest edge of an image, pixels.
 const MAX_EDGE: u32 = 16_384;
 
@@ -318,7 +322,23 @@ fn try_cloud_view(view: &pb::CloudView, frame_from_task: &Isometry3<f64>) -> Res
     if points.is_empty() {
         return Err(FieldError::new("points", "NaN throughout", "must have at least one finite point"));
     }
-    Ok(Points { points, eye: task_from_cloud * Point3::new(x, y, z), labels })
+    let eye = task_from_cloud * Point3::new(x, y, z);
+    let distance = median(points.iter().map(|point| (point - eye).norm()));
+    if distance > FARTHEST {
+        let value = format_args!("{distance:.0} m from the camera (median)");
+        let needed = "must be in metres but looks like millimetres: divide by 1000";
+        return Err(FieldError::new("points", value, needed));
+    }
+    Ok(Points { points, eye, labels })
+}
+
+/// The median of a sample of the distances; 0 if there are none.
+fn median(distances: impl Iterator<Item = f64>) -> f64 {
+    /// Step between sampled points. More samples would not change the result.
+    const EVERY: usize = 61;
+    let mut sample: Vec<f64> = distances.step_by(EVERY).collect();
+    let middle = sample.len() / 2;
+    if sample.is_empty() { 0.0 } else { *sample.select_nth_unstable_by(middle, f64::total_cmp).1 }
 }
 
 #[cfg(test)]
@@ -382,6 +402,14 @@ mod tests {
         };
         let converted = cloud_view(&cloud, 0, &Isometry3::identity()).unwrap();
         assert_eq!((converted.points.len(), converted.labels), (2, Some(vec![4, 6])));
+        let millimetres = points.iter().flatten().flat_map(|c| (c * 1000.0).to_le_bytes());
+        let cloud = pb::CloudView { points: millimetres.collect::<Vec<u8>>().into(), ..cloud };
+        assert!(
+            cloud_view(&cloud, 0, &Isometry3::identity())
+                .unwrap_err()
+                .to_string()
+                .starts_with("views[0].points is 500 m from the camera (median), must be in metres but looks like")
+        );
     }
 
     #[test]

@@ -144,8 +144,9 @@ async fn grasps_of_chosen_objects_only() {
     objects.sort_unstable();
     assert_eq!(objects, [1, 2, 3, 4].map(Some));
 
-    let absent = DetectOptions { objects: vec![9], ..DetectOptions::default() };
-    assert_eq!(detect(absent, &tabletop()).await.grasps, []);
+    let absent = options(DetectOptions { objects: vec![2, 9], ..DetectOptions::default() });
+    let refused = refusal(client.detect_from_depth(&views(), &tabletop(), absent).await);
+    assert!(refused.starts_with("options.objects is […, 9, …], must have labels of the views only"), "{refused}");
 
     let unlabelled = views().map(|view| DepthView { labels: None, ..view });
     let asked = options(DetectOptions { objects: vec![2], ..DetectOptions::default() });

@@ -347,7 +347,7 @@ fn fuse(
     let mut cubes = Cubes::of(&engine.source, workspace, &observation.cameras(), params.margin)?;
     let integrated = cubes.integrate(observation)?;
     let warnings = integrated.warnings.clone();
-    let objects = observation.objects(cubes.frame_from_task(), &params.objects);
+    let objects = observation.objects(cubes.frame_from_task(), &params.objects)?;
     let scenes = cubes.scenes(integrated, objects.as_ref(), params)?;
     Ok((scenes, Observed { fusion: Some(started.elapsed()), warnings, table }))
 }

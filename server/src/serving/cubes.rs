@@ -138,16 +138,13 @@ impl Cubes {
             Some(CubeScene { scene: Scene { volume, points }, params })
         };
         let mut scenes: Vec<_> = self.cubes.iter().zip(integrated.points).filter_map(scene).collect();
-        if scenes.len() > 1 {
-            let is_used = |scene: &CubeScene| {
-                params.table.is_none_or(|table| scene.scene.volume.has_surface_above(table + OBJECT_HEIGHT))
-            };
-            let first_used = scenes.iter().position(is_used).unwrap_or_default();
-            let mut index = 0;
-            scenes.retain(|scene| {
-                index += 1;
-                index - 1 == first_used || is_used(scene)
-            });
+        let is_used = |scene: &CubeScene| {
+            params.table.is_none_or(|table| scene.scene.volume.has_surface_above(table + OBJECT_HEIGHT))
+        };
+        if scenes.iter().any(is_used) {
+            scenes.retain(is_used);
+        } else {
+            scenes.truncate(1);
         }
         if scenes.is_empty() { Err(empty()) } else { Ok(scenes) }
     }

@@ -60,9 +60,13 @@ impl Observation {
     }
 
     /// The objects that the labels of the views show, of which `wanted` are to be grasped. `None` without labels.
-    pub fn objects(&self, frame_from_task: &Isometry3<f64>, wanted: &BTreeSet<u16>) -> Option<Arc<ObjectMap>> {
+    pub fn objects(
+        &self,
+        frame_from_task: &Isometry3<f64>,
+        wanted: &BTreeSet<u16>,
+    ) -> Result<Option<Arc<ObjectMap>>, FieldError> {
         if !self.is_labelled() {
-            return None;
+            return Ok(None);
         }
         let points: Box<dyn Iterator<Item = (Point3<f64>, u16)>> = match self {
             Self::Depth(views) => Box::new(views.iter().flat_map(labelled)),
@@ -71,7 +75,14 @@ impl Observation {
                 cloud.points.iter().copied().zip(labels)
             })),
         };
-        Some(Arc::new(ObjectMap::new(points, frame_from_task, wanted.clone())))
+        let map = ObjectMap::new(points, frame_from_task, wanted.clone());
+        match map.missing() {
+            None => Ok(Some(Arc::new(map))),
+            Some(label) => {
+                let needed = "must have labels of the views only; no pixel or point with a depth has this one";
+                Err(FieldError::new("options.objects", format_args!("[…, {label}, …]"), needed))
+            }
+        }
     }
 }
 

@@ -145,7 +145,7 @@ impl Track {
         params.check_objects(views.is_labelled())?;
         let integrated = self.cubes.integrate(views)?;
         let warnings = integrated.warnings.clone();
-        let objects = views.objects(self.cubes.frame_from_task(), &params.objects);
+        let objects = views.objects(self.cubes.frame_from_task(), &params.objects)?;
         // Without points: those of earlier views are not stored.
         let scenes = self.cubes.scenes(integrated.without_points(), objects.as_ref(), &params)?;
         self.params = params;
