@@ -154,7 +154,8 @@ class DocsTest(unittest.TestCase):
         def call(option):
             """The call that accepts an option: some need views with labels, or belong to another option."""
             if "object" in option:
-                labelled = "graspd.DepthView(depth, k, camera_from_task=poses[0], labels=(depth > 0).astype(int))"
+                labels = "np.where(np.indices(depth.shape)[1] < 320, 3, 7)"
+                labelled = f"graspd.DepthView(depth, k, camera_from_task=poses[0], labels={labels})"
                 return f"client.detect_from_depth({labelled}, workspace"
             return "client.detect(volume"
 

@@ -122,6 +122,13 @@ async fn a_workspace_that_the_queue_cannot_hold_is_refused() {
     let (_server, client) = server(&["--queue", "1", "--workers", "1"]).await;
     let refused = refusal(client.detect_from_depth(&views(), &tabletop(), options(DetectOptions::default())).await);
     assert!(refused.starts_with("workspace.extent is a workspace of ") && refused.ends_with("(--queue)"), "{refused}");
+    let fine = options(DetectOptions { margin: Some(0.1), ..DetectOptions::default() });
+    let large = Workspace { extent: Some([2.0, 1.5]), ..Workspace::default() };
+    let refused = refusal(client.detect_from_depth(&views(), &large, fine).await);
+    assert!(
+        refused.starts_with("workspace.extent is 2 × 1.5 m, which needs 300 cubes, must need at most 100"),
+        "{refused}"
+    );
     let long = Workspace { extent: Some([0.5, 3.0]), ..Workspace::default() };
     let refused = refusal(client.detect_from_depth(&views(), &long, options(DetectOptions::default())).await);
     assert_eq!(refused, "workspace.extent.y is 3, must be above 0 and at most 2 m");

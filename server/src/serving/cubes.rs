@@ -70,6 +70,11 @@ impl Cubes {
             None => vec![cube([0.0; 2], None)?],
             Some(extent) => {
                 let tiles = Tile::cover(extent, edge, margin.max(Tile::MARGIN));
+                if tiles.len() > MAX_CUBES {
+                    let value = format_args!("{} × {} m, which needs {} cubes", extent[0], extent[1], tiles.len());
+                    let needed = format_args!("must need at most {MAX_CUBES}; reduce it or options.margin");
+                    return Err(FieldError::new("workspace.extent", value, needed));
+                }
                 tiles.iter().map(|tile| cube(tile.corner, Some(tile.inner))).collect::<Result<_, _>>()?
             }
         };
@@ -149,6 +154,9 @@ impl Cubes {
         if scenes.is_empty() { Err(empty()) } else { Ok(scenes) }
     }
 }
+
+/// Most cubes of a workspace, which bounds the memory of a request to 80 MB: those of 2 × 2 m with the default margin.
+const MAX_CUBES: usize = 100;
 
 /// Smallest height of an object above the table, metres. Lower surfaces are noise, or too low for a hand.
 const OBJECT_HEIGHT: f64 = 0.01;
