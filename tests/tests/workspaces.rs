@@ -95,9 +95,9 @@ async fn a_large_workspace_has_the_grasps_of_all_objects() {
     let cubes = server.metric("graspd_batch_size_sum{model=\"graspd-packed 2\"}");
     assert!((4.0..15.0).contains(&cubes), "{cubes} of 15 cubes have an object");
 
-    // Without a table an empty cube cannot be told from one with objects.
-    let clouds = client.detect_from_depth(&views(), &Workspace::default(), options(DetectOptions::default())).await;
-    assert!(clouds.unwrap().grasps.iter().all(|grasp| box_of(grasp) == Some(1)));
+    // A single cube has the grasps of the box in it.
+    let single = client.detect_from_depth(&views(), &Workspace::default(), options(DetectOptions::default())).await;
+    assert!(single.unwrap().grasps.iter().all(|grasp| box_of(grasp) == Some(1)));
 }
 
 #[tokio::test]

@@ -235,13 +235,7 @@ impl Call {
             Ok(pending) => self.reply(pending).await,
             Err(refusal) => Err(refusal),
         };
-        match outcome {
-            Ok(response) => {
-                self.ended = true;
-                Ok(response)
-            }
-            Err(refusal) => Err(self.end(refusal)),
-        }
+        self.concluded(outcome)
     }
 
     /// Waits for the maps of each volume, and records the outcome. The timings are those of the slowest volume.
@@ -278,6 +272,17 @@ impl Call {
         Ok(value)
     }
 
+    /// Ends the call with its outcome. A success is recorded already.
+    fn concluded<T>(mut self, outcome: Result<T, Refusal>) -> Result<T, Refusal> {
+        match outcome {
+            Ok(response) => {
+                self.ended = true;
+                Ok(response)
+            }
+            Err(refusal) => Err(self.end(refusal)),
+        }
+    }
+
     /// Ends the call with a refusal.
     pub fn end(mut self, refusal: Refusal) -> Refusal {
         self.refused(&refusal);
@@ -298,13 +303,7 @@ impl Call {
             Ok(pending) => self.scores(pending).await,
             Err(refusal) => Err(refusal),
         };
-        match outcome {
-            Ok(response) => {
-                self.ended = true;
-                Ok(response)
-            }
-            Err(refusal) => Err(self.end(refusal)),
-        }
+        self.concluded(outcome)
     }
 
     async fn scores(&mut self, pending: PendingReply<Vec<Score>>) -> Result<pb::ScoreGraspsResponse, Refusal> {
