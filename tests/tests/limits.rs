@@ -6,6 +6,7 @@ use nalgebra::Isometry3;
 use prost::Message;
 use tokio_stream::StreamExt;
 use tonic::Code;
+use tonic::codec::CompressionEncoding;
 
 fn request(padding: usize) -> pb::DetectGraspsRequest {
     let volume = encode(&blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]]), pb::DataType::F32, "");
@@ -26,6 +27,30 @@ async fn a_message_at_the_limit_is_accepted_and_a_larger_one_is_refused() {
             assert!(status.message().contains(&number.to_string()), "{}", status.message());
         }
     }
+}
+
+#[tokio::test]
+async fn compressed_messages_are_accepted_up_to_the_limit_of_their_content() {
+    let limit = request(10).encoded_len();
+    let server = Server::run(&[TestModel::new("mirror")], &["--max-message-bytes", &limit.to_string()]);
+    for encoding in [CompressionEncoding::Gzip, CompressionEncoding::Zstd] {
+        let mut client = server.raw().await.send_compressed(encoding);
+        assert_eq!(client.detect_grasps(request(10)).await.unwrap().into_inner().grasps.len(), 1);
+        let status = client.detect_grasps(request(11)).await.unwrap_err();
+        assert_eq!(status.code(), Code::InvalidArgument, "{status}");
+        assert!(status.message().contains(&limit.to_string()), "{status}");
+        // 200 MB of zeros, which are 200 kB when they are compressed.
+        let bomb = pb::Volume { data: vec![0; 200 << 20].into(), ..Default::default() };
+        let status =
+            client.detect_grasps(pb::DetectGraspsRequest { volume: Some(bomb), ..request(0) }).await.unwrap_err();
+        assert_eq!(status.code(), Code::InvalidArgument, "{status}");
+        let mut replies =
+            client.detect_grasps_stream(tokio_stream::iter([request(10), request(11)])).await.unwrap().into_inner();
+        assert_eq!(replies.next().await.unwrap().unwrap().request_id, "x".repeat(10));
+        assert_eq!(replies.next().await.unwrap().unwrap_err().code(), Code::InvalidArgument);
+    }
+    assert_eq!(server.metric("graspd_requests_total{code=\"INVALID_ARGUMENT\",model=\"\"}"), 6.0);
+    assert!(grasp_tests::peak_bytes(server.id()) < 200 << 20, "the bombs were not decompressed");
 }
 
 #[tokio::test]

@@ -8,6 +8,7 @@ use grasp_proto::pb::grasp_service_server::GraspServiceServer;
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tonic::body::Body;
+use tonic::codec::CompressionEncoding;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Server, ServerTlsConfig};
 use tonic_health::pb::health_server::HealthServer;
@@ -61,9 +62,11 @@ pub(crate) async fn serve(
             .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
-    // `RequestBody` enforces the limit on messages and counts refusals.
-    let grasps = GraspServiceServer::new(service).max_decoding_message_size(usize::MAX);
-    let inference = GrpcInferenceServiceServer::new(inference).max_decoding_message_size(usize::MAX);
+    // `RequestBody` enforces the limit on messages as they are sent; this limit is for decompressed ones.
+    let grasps = GraspServiceServer::new(service).max_decoding_message_size(limits.message_bytes);
+    let inference = GrpcInferenceServiceServer::new(inference).max_decoding_message_size(limits.message_bytes);
+    let grasps = grasps.accept_compressed(CompressionEncoding::Gzip).accept_compressed(CompressionEncoding::Zstd);
+    let inference = inference.accept_compressed(CompressionEncoding::Gzip).accept_compressed(CompressionEncoding::Zstd);
     let guard = tokens::guard(tokens, Arc::clone(&metrics));
     let incoming = connections::accept(listener, metrics.connections(connections, limits.stall));
     let counted = Arc::clone(&metrics);

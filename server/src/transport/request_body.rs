@@ -135,13 +135,13 @@ fn late() -> Status {
     Status::deadline_exceeded("the deadline passed before the message was received")
 }
 
-/// Counts malformed messages and changes their status to `INVALID_ARGUMENT`; tonic returns `INTERNAL` for them. tonic's
-/// errors differ from ours by having no details.
+/// Counts malformed messages and changes their status to `INVALID_ARGUMENT`; tonic returns `INTERNAL` for them, and
+/// `RESOURCE_EXHAUSTED` if they are too large when decompressed. tonic's errors differ from ours by having no details.
 pub(crate) fn unreadable(mut response: http::Response<Body>, metrics: &Metrics) -> http::Response<Body> {
     let headers = response.headers_mut();
     let is_tonics = !headers.contains_key(Status::GRPC_STATUS_DETAILS);
     let status = headers.get(Status::GRPC_STATUS).and_then(|code| code.to_str().ok()?.parse().ok());
-    if is_tonics && status == Some(Code::Internal as i32) {
+    if is_tonics && [Code::Internal, Code::ResourceExhausted].map(|code| Some(code as i32)).contains(&status) {
         metrics.ended("", Code::InvalidArgument);
         headers.insert(Status::GRPC_STATUS, HeaderValue::from(Code::InvalidArgument as i32));
     }
@@ -150,7 +150,7 @@ pub(crate) fn unreadable(mut response: http::Response<Body>, metrics: &Metrics) 
 
 /// The same for a message of a stream.
 pub(crate) fn unreadable_message(status: Status, metrics: &Metrics) -> Status {
-    if status.code() != Code::Internal {
+    if !matches!(status.code(), Code::Internal | Code::ResourceExhausted) {
         return status;
     }
     metrics.ended("", Code::InvalidArgument);
