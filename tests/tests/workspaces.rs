@@ -205,6 +205,12 @@ async fn the_callers_grasps_are_scored_in_their_order() {
     let refused = refusal(client.score(seen, &poses, shaf).await);
     assert_eq!(refused, "options.model is `shaf`, which has no network and cannot score");
     assert!(refusal(client.score(seen, &[], options(checked)).await).starts_with("candidates is a list of 0"));
+    let [mut first, second] = views.clone();
+    first.width = 0;
+    let refused = refusal(
+        client.score(Observation::Depth(&[first, second], &workspace), &poses, options(Default::default())).await,
+    );
+    assert!(refused.starts_with("depth.views[0].camera.width is 0"), "{refused}");
     let large = tabletop();
     let refused = refusal(client.score(Observation::Depth(&views, &large), &poses, options(Default::default())).await);
     assert_eq!(refused, "depth.workspace.extent is given, must be absent");

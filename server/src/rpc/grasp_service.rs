@@ -216,11 +216,13 @@ impl GraspRpc {
             }
             Some(Message::Depth(pb::DepthViews { views, workspace })) => {
                 one_cube(&workspace, "depth.workspace.extent")?;
-                self.of_views(views.len(), workspace, &params, call, depth(views)).await?
+                let fused = self.of_views(views.len(), workspace, &params, call, depth(views)).await;
+                fused.map_err(|refusal| inside("depth", refusal))?
             }
             Some(Message::Clouds(pb::CloudViews { views, workspace })) => {
                 one_cube(&workspace, "clouds.workspace.extent")?;
-                self.of_views(views.len(), workspace, &params, call, clouds(views)).await?
+                let fused = self.of_views(views.len(), workspace, &params, call, clouds(views)).await;
+                fused.map_err(|refusal| inside("clouds", refusal))?
             }
         };
         if engine.source.network().is_none() {
@@ -331,6 +333,14 @@ fn clouds(views: Vec<pb::CloudView>) -> impl FnOnce(&mut Workspace, f64) -> Resu
         let views = views.iter().enumerate();
         let views = views.map(|(index, view)| cloud_view(view, index, &workspace.frame_from_task));
         Ok((Observation::Clouds(views.collect::<Result<_, _>>()?), None))
+    }
+}
+
+/// The refusal of a field of `message`, with the path from the request. Options are not in it.
+fn inside(message: &str, refusal: Refusal) -> Refusal {
+    match refusal {
+        Refusal::Field(error) if !error.field.starts_with("options") => Refusal::Field(error.inside(message)),
+        refusal => refusal,
     }
 }
 
