@@ -1,4 +1,4 @@
-use nalgebra::{Isometry3, Point3, Rotation3, Vector3};
+use nalgebra::{Isometry3, Point3, Rotation3, UnitQuaternion, Vector3};
 
 use crate::Intrinsics;
 
@@ -21,6 +21,15 @@ const SIZES: [usize; 2] = [48, 320];
 /// Points of one pixel whose depths differ by more than this belong to different surfaces, metres.
 const LAYER: f32 = 0.01;
 
+/// An overview shows this share of the points. The others, such as a few points on the horizon, would make the rest small.
+const NEARLY_ALL: f64 = 0.97;
+
+/// Range of the tangent of half of the angle of view of an overview.
+const TANGENTS: [f64; 2] = [0.05, 2.0];
+
+/// Cosine of the largest angle between the z axis of the frame of a camera and the direction of its points.
+const MOSTLY_ALONG: f64 = 0.7;
+
 /// Number of neighbours with depth, of eight, from which an empty pixel is filled.
 const FILLED_BY: usize = 5;
 
@@ -38,10 +47,27 @@ pub fn seen_from(points: &[Point3<f64>], eye: &Point3<f64>, size: f64) -> Option
     if !distance.is_finite() || distance <= radius {
         return None;
     }
-    let camera_from_task = look_at(eye, &centre);
     // The frustum encloses the bounding sphere of the cube: its half angle has sine radius / distance.
     let tangent = radius / (distance * distance - radius * radius).sqrt();
+    render(points, look_at(eye, &centre), tangent)
+}
 
+/// Renders a depth image of nearly all points as a camera at `eye` sees them; `camera_from_task` of the view is the pose
+/// of the frame of the points in the frame of this camera. If that frame looks like the frame of a camera (the points lie
+/// along its z axis), the image has the same right, otherwise z points up in it. Returns `None` if no point is in view.
+#[must_use]
+pub fn overview(points: &[Point3<f64>], eye: &Point3<f64>) -> Option<View> {
+    let middle = Point3::from([0, 1, 2].map(|axis| quantile(points.iter().map(|point| point[axis]), 0.5)));
+    let forward = (middle - eye).try_normalize(1e-6)?;
+    let up = if forward.z > MOSTLY_ALONG { -Vector3::y() } else { upwards(&forward) };
+    let camera_from_frame = look_along(eye, &forward, &up);
+    let in_front = points.iter().map(|point| camera_from_frame * point).filter(|p| p.z > 0.0);
+    let tangent = quantile(in_front.map(|p| p.x.abs().max(p.y.abs()) / p.z), NEARLY_ALL);
+    render(points, camera_from_frame, tangent.clamp(TANGENTS[0], TANGENTS[1]))
+}
+
+/// Renders the points that a camera sees whose square image has this tangent of half of its angle of view.
+fn render(points: &[Point3<f64>], camera_from_task: Isometry3<f64>, tangent: f64) -> Option<View> {
     let projected = points.iter().filter_map(|point| {
         let p = camera_from_task * point;
         let (x, y) = (p.x / p.z / tangent, p.y / p.z / tangent);
@@ -79,6 +105,13 @@ pub fn seen_from(points: &[Point3<f64>], eye: &Point3<f64>, size: f64) -> Option
     Some(View { intrinsics, depth: filled(&depth, edge), camera_from_task, labels: None })
 }
 
+/// The value that this share of the values do not exceed; 0 if there are none.
+fn quantile(values: impl Iterator<Item = f64>, share: f64) -> f64 {
+    let mut values: Vec<f64> = values.collect();
+    let index = (share * values.len() as f64) as usize;
+    if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(index, f64::total_cmp).1 }
+}
+
 /// Fills pixels without depth with the median of their neighbours, if enough of these have depth.
 fn filled(depth: &[f32], edge: usize) -> Vec<f32> {
     let fill = |index: usize| {
@@ -100,13 +133,22 @@ fn filled(depth: &[f32], edge: usize) -> Vec<f32> {
     (0..depth.len()).map(fill).collect()
 }
 
-/// `T_camera_task` of a camera at `eye` that looks at `target`. Optical axes: z forward, x right, y down.
+/// `T_camera_task` of a camera at `eye` that looks at `target`.
 fn look_at(eye: &Point3<f64>, target: &Point3<f64>) -> Isometry3<f64> {
-    let forward = target - eye;
-    let up = if forward.normalize().z.abs() > 0.99 { Vector3::x() } else { Vector3::z() };
-    // The rows of the rotation are the camera axes in the task frame.
-    let rotation = Rotation3::look_at_lh(&forward, &-up);
-    let rotation = nalgebra::UnitQuaternion::from_rotation_matrix(&rotation);
+    let forward = (target - eye).normalize();
+    look_along(eye, &forward, &upwards(&forward))
+}
+
+/// The z axis, or for a vertical camera the x axis.
+fn upwards(forward: &Vector3<f64>) -> Vector3<f64> {
+    if forward.z.abs() > 0.99 { Vector3::x() } else { Vector3::z() }
+}
+
+/// `T_camera_frame` of a camera at `eye`. `up` points up in its image. Optical axes: z forward, x right, y down.
+fn look_along(eye: &Point3<f64>, forward: &Vector3<f64>, up: &Vector3<f64>) -> Isometry3<f64> {
+    // The rows of the rotation are the camera axes in the frame.
+    let rotation = Rotation3::look_at_lh(forward, &-up);
+    let rotation = UnitQuaternion::from_rotation_matrix(&rotation);
     Isometry3::from_parts((rotation * -eye.coords).into(), rotation)
 }
 

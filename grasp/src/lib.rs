@@ -33,7 +33,7 @@ mod volume;
 mod warning;
 
 pub use camera::{CameraError, DepthImage, Intrinsics, Unit};
-pub use cloud::{View, seen_from};
+pub use cloud::{View, overview, seen_from};
 pub use constraints::{Cone, Constraints, Region, Violation};
 pub use convention::{ClosingAxis, Convention, Origin, Retreat, before};
 pub use decode::{Border, DecodeParams, decode, quality_at};

@@ -46,7 +46,7 @@ mod tests {
         assert_eq!(of_image(&labels(&[0, 3, 7, 255, 1, 0], pb::LabelType::U8), 3, 2).unwrap(), expected);
         let wide: Vec<u8> = expected.iter().flat_map(|label: &u16| label.to_le_bytes()).collect();
         assert_eq!(of_points(&labels(&wide, pb::LabelType::U16), 6).unwrap(), expected);
-        assert_eq!(of_image(&labels(&png::encoded(&expected, 3, 2), pb::LabelType::Png), 3, 2).unwrap(), expected);
+        assert_eq!(of_image(&labels(&png::grey_png(&expected, 3), pb::LabelType::Png), 3, 2).unwrap(), expected);
     }
 
     #[test]
@@ -62,7 +62,7 @@ mod tests {
         );
         let of_points = of_points(&labels(&[0; 6], pb::LabelType::Png), 6).unwrap_err();
         assert_eq!(of_points.to_string(), "type is LABEL_TYPE_PNG, which is only for images");
-        let other_size = labels(&png::encoded(&[0; 6], 2, 3), pb::LabelType::Png);
+        let other_size = labels(&png::grey_png(&[0; 6], 2), pb::LabelType::Png);
         assert_eq!(refused(&other_size), "data: the PNG has 2 × 3 pixels, the camera has 3 × 2");
     }
 }

@@ -14,6 +14,7 @@ mod pose;
 mod views;
 mod volume;
 mod warning;
+mod workspace;
 
 /// Generated types, client and server of `grasp.v1`.
 #[allow(missing_docs, reason = "the .proto file documents them, and prost copies only existing comments")]
@@ -31,9 +32,11 @@ pub mod oip {
 pub use error::{FieldError, on_a_line};
 pub use grasps::{Candidate, candidates};
 pub use options::{Collision, DetectParams, TABLE_HEIGHT};
+pub use png::grey_png;
 pub use pose::pose;
-pub use views::{MAX_VIEWS, Points, Workspace, check_count, cloud_view, depth_view};
+pub use views::{MAX_VIEWS, Points, check_count, cloud_view, depth_view};
 pub use volume::{encode, resolution};
+pub use workspace::Workspace;
 
 /// Encoded descriptors of both protocols, for the reflection service.
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));

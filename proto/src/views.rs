@@ -1,16 +1,12 @@
-use grasp::{DepthImage, Intrinsics, Tabletop, Unit as DepthUnit, View, WORKSPACE_SIZE};
-use nalgebra::{Isometry3, Point3, Translation3, Unit, Vector3};
+use grasp::{DepthImage, Intrinsics, Unit as DepthUnit, View};
+use nalgebra::{Isometry3, Point3};
 
-use crate::options::direction;
 use crate::pb::depth_view::Extrinsics;
 use crate::pose::{self, PoseFields};
 use crate::{FieldError, labels, pb, png};
 
 /// Largest number of views in one request.
 pub const MAX_VIEWS: usize = 64;
-
-/// Largest extent of a workspace, metres.
-const MAX_EXTENT: f64 = 2.0;
 
 /// Median distance of the points of a cloud from its camera beyond which they are probably not in metres: far beyond the
 /// range of depth cameras.
@@ -23,33 +19,12 @@ const MAX_EDGE: u32 = 16_384;
 /// similar fraction on both axes; those of a cropped image usually are not.
 const OFF_CENTRE: f64 = 0.1;
 
-const WORKSPACE: PoseFields =
-    PoseFields { position: "workspace.pose.position", orientation: "workspace.pose.orientation" };
 const CAMERA_FROM_TASK: PoseFields =
     PoseFields { position: "camera_from_task.position", orientation: "camera_from_task.orientation" };
-const FRAME_FROM_CAMERA: PoseFields =
+pub(crate) const FRAME_FROM_CAMERA: PoseFields =
     PoseFields { position: "frame_from_camera.position", orientation: "frame_from_camera.orientation" };
 const FRAME_FROM_CLOUD: PoseFields =
     PoseFields { position: "frame_from_cloud.position", orientation: "frame_from_cloud.orientation" };
-
-/// The validated workspace.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Workspace {
-    /// `T_frame_task`: pose of the workspace in the caller's frame.
-    pub frame_from_task: Isometry3<f64>,
-    /// Edge, metres; `None` means the size of the model.
-    pub size: Option<f64>,
-    /// Name of the caller's frame.
-    pub frame_id: String,
-    /// Time at which the views were taken.
-    pub stamp: Option<prost_types::Timestamp>,
-    /// Whether to find the table, which determines the pose.
-    pub find_table: bool,
-    /// Direction of gravity in the caller's frame.
-    pub gravity: Option<Unit<Vector3<f64>>>,
-    /// Lengths along x and y, metres; `None` means one cube.
-    pub extent: Option<[f64; 2]>,
-}
 
 /// The points of one camera, in the task frame.
 #[derive(Clone, Debug, PartialEq)]
@@ -60,93 +35,6 @@ pub struct Points {
     pub eye: Point3<f64>,
     /// Label of the object of each point, if it is known; 0 is no object.
     pub labels: Option<Vec<u16>>,
-}
-
-impl TryFrom<pb::Workspace> for Workspace {
-    type Error = FieldError;
-
-    fn try_from(workspace: pb::Workspace) -> Result<Self, FieldError> {
-        let pb::Workspace { pose, size, frame_id, stamp, find_table, gravity, extent } = workspace;
-        if !(0.0..=100.0).contains(&size) {
-            return Err(FieldError::new(
-                "workspace.size",
-                size,
-                "must be above 0 and at most 100 m, or 0 for the size of the model",
-            ));
-        }
-        if find_table && pose.is_some() {
-            return Err(FieldError::new("workspace.pose", "given", "must be absent with workspace.find_table"));
-        }
-        let frame_from_task = pose.map_or(Ok(Isometry3::identity()), |pose| pose::decode(&pose, &WORKSPACE))?;
-        let gravity = gravity.map(|gravity| direction(Some(gravity), "workspace.gravity")).transpose()?;
-        let size = Some(size).filter(|size| *size > 0.0);
-        let extent = extent.map(checked_extent).transpose()?;
-        Ok(Self { frame_from_task, size, frame_id, stamp, find_table, gravity, extent })
-    }
-}
-
-impl Workspace {
-    /// Finds the table in the first of the request's views, if the request asks for it, and sets the pose of the
-    /// workspace. The table is at `height` in it, metres.
-    ///
-    /// # Errors
-    /// [`FieldError`] if the view is invalid or shows no table.
-    pub fn find_table(
-        &mut self,
-        views: &mut [pb::DepthView],
-        height: f64,
-    ) -> Result<Option<pb::FoundTable>, FieldError> {
-        let is_only = views.len() == 1;
-        match views.first_mut() {
-            Some(first) if self.find_table => {
-                let found = self.find_table_in(first, is_only, height);
-                found.map(Some).map_err(|error| error.inside("views[0]"))
-            }
-            _ => Ok(None),
-        }
-    }
-
-    /// Finds the table in a view and sets the pose of the workspace. If it is the only view and has no extrinsics, it
-    /// gets those of a camera at the origin of the caller's frame.
-    ///
-    /// # Errors
-    /// [`FieldError`] names the field of the view.
-    pub fn find_table_in(
-        &mut self,
-        view: &mut pb::DepthView,
-        is_only: bool,
-        height: f64,
-    ) -> Result<pb::FoundTable, FieldError> {
-        if is_only && view.extrinsics.is_none() {
-            view.extrinsics = Some(Extrinsics::FrameFromCamera((&Isometry3::identity()).into()));
-        }
-        let Some(Extrinsics::FrameFromCamera(pose)) = &view.extrinsics else {
-            let given = if view.extrinsics.is_some() { "camera_from_task" } else { "absent" };
-            let needed = "must be frame_from_camera with workspace.find_table; a single view may have none";
-            return Err(FieldError::new("extrinsics", given, needed));
-        };
-        let frame_from_camera = pose::decode(pose, &FRAME_FROM_CAMERA)?;
-        let (intrinsics, depth) = image(view)?;
-        let image = DepthImage::new(intrinsics, &depth).map_err(|error| FieldError::refused("camera", error))?;
-        let gravity = self.gravity.map(|gravity| frame_from_camera.rotation.inverse() * gravity);
-        let found = Tabletop::find(&image, gravity, height).map_err(|error| FieldError::refused("data", error))?;
-        // A larger workspace has its middle over that of the cube which was found.
-        let corner = self.extent.map_or([0.0; 2], |extent| extent.map(|length| (WORKSPACE_SIZE - length) / 2.0));
-        let in_cube = Translation3::new(corner[0], corner[1], 0.0);
-        self.frame_from_task = frame_from_camera * found.camera_from_task * in_cube;
-        let Tabletop { distance, angle, share, deviation, tilt, .. } = found;
-        Ok(pb::FoundTable { workspace: Some((&self.frame_from_task).into()), distance, angle, share, deviation, tilt })
-    }
-}
-
-fn checked_extent(extent: pb::Extent) -> Result<[f64; 2], FieldError> {
-    for (field, length) in [("workspace.extent.x", extent.x), ("workspace.extent.y", extent.y)] {
-        // Written so that NaN fails.
-        if !(length > 0.0 && length <= MAX_EXTENT) {
-            return Err(FieldError::new(field, length, format_args!("must be above 0 and at most {MAX_EXTENT} m")));
-        }
-    }
-    Ok([extent.x, extent.y])
 }
 
 /// Checks the number of views.
@@ -184,7 +72,7 @@ fn try_depth_view(view: &pb::DepthView, frame_from_task: &Isometry3<f64>) -> Res
 }
 
 /// The intrinsics and the depth, metres, row by row, of a view.
-fn image(view: &pb::DepthView) -> Result<(Intrinsics, Vec<f32>), FieldError> {
+pub(crate) fn image(view: &pb::DepthView) -> Result<(Intrinsics, Vec<f32>), FieldError> {
     let camera = view.camera.as_ref().ok_or_else(|| FieldError::new("camera", "absent", "must be given"))?;
     let intrinsics = intrinsics(camera)?;
     let pixels = intrinsics.width * intrinsics.height;
@@ -290,7 +178,7 @@ pub fn cloud_view(view: &pb::CloudView, index: usize, frame_from_task: &Isometry
     try_cloud_view(view, frame_from_task).map_err(|error| error.inside(format_args!("views[{index}]")))
 }
 
-fn try_cloud_view(view: &pb::CloudView, frame_from_task: &Isometry3<f64>) -> Result<Points, FieldError> {
+pub(crate) fn try_cloud_view(view: &pb::CloudView, frame_from_task: &Isometry3<f64>) -> Result<Points, FieldError> {
     const POINT: usize = 12;
     if view.points.is_empty() || !view.points.len().is_multiple_of(POINT) {
         let value = format_args!("{} bytes", view.points.len());
@@ -367,13 +255,13 @@ mod tests {
     #[test]
     fn a_png_gives_the_same_view() {
         let png = pb::DepthView {
-            data: png::encoded(&[500; 12], 4, 3).into(),
+            data: png::grey_png(&[500; 12], 4).into(),
             unit: pb::DepthUnit::PngMillimetres.into(),
             ..view()
         };
         let frame = Isometry3::identity();
         assert_eq!(depth_view(&png, 0, &frame).unwrap().depth, depth_view(&view(), 0, &frame).unwrap().depth);
-        let other = png::encoded(&[500; 12], 3, 4);
+        let other = png::grey_png(&[500; 12], 3);
         let unit = pb::DepthUnit::PngMillimetres.into();
         assert_eq!(
             refused(|view| *view = pb::DepthView { data: other.clone().into(), unit, ..view.clone() }),

@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use grasp::{Volume, WORKSPACE_SIZE};
 use grasp_proto::pb::detect_grasps_stream_response::Outcome;
+use grasp_proto::pb::find_table_request::Observation as Seen;
 use grasp_proto::pb::grasp_service_server::GraspService;
 use grasp_proto::{
     Candidate, DetectParams, FieldError, TABLE_HEIGHT, Workspace, candidates, check_count, cloud_view, depth_view, pb,
@@ -238,8 +239,8 @@ impl GraspRpc {
 
     /// Finds the table in a view.
     async fn table(&self, request: pb::FindTableRequest, call: &mut Call) -> Result<pb::FindTableResponse, Refusal> {
-        let pb::FindTableRequest { view, workspace, table_height, .. } = request;
-        let mut view = view.ok_or_else(|| FieldError::new("view", "absent", "must be given"))?;
+        let pb::FindTableRequest { observation, workspace, table_height, .. } = request;
+        let observation = observation.ok_or_else(|| FieldError::new("view", "absent", "must be given, or cloud"))?;
         let height = table_height.unwrap_or(TABLE_HEIGHT);
         if !(0.0..=WORKSPACE_SIZE).contains(&height) {
             let needed = format_args!("must be from 0 to {WORKSPACE_SIZE} m");
@@ -253,8 +254,15 @@ impl GraspRpc {
         let engine = self.models.select("", "", None)?;
         let permits = (self.conversion_permit(&engine)?, self.fusion_permit(call).await?);
         let find = move || {
-            let found = workspace.find_table_in(&mut view, true, height);
-            found.map(Some).map_err(|error| error.inside("view").into())
+            let found = match observation {
+                Seen::View(mut view) => {
+                    workspace.find_table_in(&mut view, true, height).map_err(|error| error.inside("view"))
+                }
+                Seen::Cloud(cloud) => {
+                    workspace.find_table_in_cloud(&cloud, height).map_err(|error| error.inside("cloud"))
+                }
+            };
+            Ok(Some(found?))
         };
         let table = blocking(permits, find).await?;
         let FrameStamp { frame_id, stamp } = origin;
@@ -324,15 +332,13 @@ fn depth(mut views: Vec<pb::DepthView>) -> impl FnOnce(&mut Workspace, f64) -> R
     }
 }
 
-/// Converts point clouds.
+/// Converts point clouds, and finds the table if the workspace asks for it.
 fn clouds(views: Vec<pb::CloudView>) -> impl FnOnce(&mut Workspace, f64) -> Result<Placed, FieldError> {
-    move |workspace, _| {
-        if workspace.find_table {
-            return Err(FieldError::new("workspace.find_table", true, "needs depth images; send those instead"));
-        }
+    move |workspace, table| {
+        let table = workspace.find_table_in_clouds(&views, table)?;
         let views = views.iter().enumerate();
         let views = views.map(|(index, view)| cloud_view(view, index, &workspace.frame_from_task));
-        Ok((Observation::Clouds(views.collect::<Result<_, _>>()?), None))
+        Ok((Observation::Clouds(views.collect::<Result<_, _>>()?), table))
     }
 }
 

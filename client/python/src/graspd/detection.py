@@ -112,7 +112,7 @@ class GeometryWarning:
 
 @dataclass(frozen=True)
 class FoundTable:
-    """A table in a depth image, and the workspace over what stands on it."""
+    """A table in a depth image or a point cloud, and the workspace over what stands on it."""
 
     workspace: Pose
     """``T_frame_task``: pose of the workspace's corner. z is the normal of the table, x points to the right of the

@@ -122,11 +122,12 @@ def track_request(
 
 
 def table_request(
-    view: DepthView, workspace: Workspace, table_height: float | None, request_id: str
+    view: DepthView | CloudView, workspace: Workspace, table_height: float | None, request_id: str
 ) -> pb.FindTableRequest:
     return pb.FindTableRequest(
         request_id=request_id,
-        view=depth_message(view),
+        view=None if isinstance(view, CloudView) else depth_message(view),
+        cloud=cloud_message(view) if isinstance(view, CloudView) else None,
         workspace=workspace_message(workspace),
         table_height=table_height,
     )

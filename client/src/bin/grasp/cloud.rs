@@ -19,7 +19,7 @@ pub(crate) fn read(path: &Path) -> anyhow::Result<Vec<[f32; 3]>> {
     files::in_file(path, |path| match Format::of(path)? {
         Format::Pcd => pcd(path),
         Format::Ply => ply(path),
-        Format::Png | Format::Tiff => bail!("this is an image; for a depth image give --intrinsics"),
+        Format::Png | Format::Tiff | Format::Exr => bail!("this is an image; for a depth image give --intrinsics"),
         Format::Other => arrays(path),
     })
 }

@@ -16,6 +16,7 @@ pub(crate) type Array = NpyFile<Box<dyn Read>>;
 pub(crate) enum Format {
     Png,
     Tiff,
+    Exr,
     Pcd,
     Ply,
     /// .npy, .npz, or a file of another kind.
@@ -31,6 +32,8 @@ impl Format {
             Self::Png
         } else if starts(b"II*\0") || starts(b"MM\0*") {
             Self::Tiff
+        } else if starts(b"\x76\x2f\x31\x01") {
+            Self::Exr
         } else if starts(b"# .PCD") || starts(b"VERSION ") {
             Self::Pcd
         } else if starts(b"ply\n") || starts(b"ply\r") {

@@ -3,6 +3,7 @@ use std::io::BufReader;
 use std::path::Path;
 
 use anyhow::{Context, bail, ensure};
+use exr::prelude::{ReadChannels, ReadLayers};
 use grasp_client::Depth;
 use npyz::TypeChar;
 use tiff::decoder::{Decoder, DecodingResult};
@@ -12,13 +13,14 @@ use crate::files::{self, Format};
 /// The unit of integer depths of most cameras, metres.
 pub(crate) const MILLIMETRE: f32 = 1e-3;
 
-/// Reads a depth image from a .png, .tiff or .npy file, with integer depths in units of `scale` metres. Returns the depth, the
-/// width and the height.
+/// Reads a depth image from a .png, .tiff, .exr or .npy file, with integer depths in units of `scale` metres. Returns the
+/// depth, the width and the height.
 pub(crate) fn read(path: &Path, scale: f32) -> anyhow::Result<(Depth, u32, u32)> {
     files::in_file(path, |path| {
         let (depth, width, height) = match Format::of(path)? {
             Format::Png => png(path)?,
             Format::Tiff => tiff(path)?,
+            Format::Exr => exr(path)?,
             Format::Pcd | Format::Ply => {
                 bail!("this is a point cloud; give --camera-position instead of --intrinsics")
             }
@@ -62,13 +64,31 @@ fn tiff(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
     let pixels = u64::from(width) * u64::from(height);
     let values = match &depth {
         Depth::Metres(depth) => depth.len(),
-        Depth::Millimetres(depth) => depth.len(),
+        Depth::Millimetres(depth) | Depth::Png(depth) => depth.len(),
     };
     ensure!(
         values as u64 == pixels,
         "TIFF has {values} values for {pixels} pixels; a depth image must have one channel"
     );
     Ok((depth, width, height))
+}
+
+/// Names of the channel with the depth in files of renderers.
+const CHANNELS: [&str; 6] = ["Z", "depth.Z", "Depth.Z", "depth", "Y", "R"];
+
+fn exr(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
+    let reader = exr::prelude::read().no_deep_data().largest_resolution_level().all_channels().all_layers();
+    let image = reader.all_attributes().non_parallel().from_file(path).context("not a valid EXR file")?;
+    let channels = || image.layer_data.iter().flat_map(|layer| layer.channel_data.list.iter().map(move |c| (layer, c)));
+    let found = CHANNELS.iter().find_map(|name| channels().find(|(_, channel)| channel.name == **name));
+    // A depth image of one channel needs no name.
+    let (layer, channel) =
+        found.or_else(|| channels().next().filter(|_| channels().count() == 1)).with_context(|| {
+            let names: Vec<_> = channels().map(|(_, channel)| channel.name.to_string()).collect();
+            format!("no channel {}; channels in the file: {}", CHANNELS.join(", "), names.join(", "))
+        })?;
+    let depth = channel.sample_data.values_as_f32().collect();
+    Ok((Depth::Metres(depth), u32::try_from(layer.size.width())?, u32::try_from(layer.size.height())?))
 }
 
 fn png(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {

@@ -83,7 +83,7 @@ enum Command {
     Detect(Detect),
     /// Detect grasps again whenever an input file changes.
     Watch(Watch),
-    /// Find the table in a depth image, and the workspace over what stands on it. Needs no server.
+    /// Find the table in a depth image or a point cloud, and the workspace over what stands on it. Needs no server.
     Table(Table),
     /// Score your own grasps: the predicted quality of each, and which of the options it violates.
     Score(Score),

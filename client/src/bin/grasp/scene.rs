@@ -18,8 +18,8 @@ use crate::{cloud, image, labels, pose, volume};
 pub(crate) struct SceneArgs {
     /// Volume, depth images or point clouds. A volume is a .npy file, or a .npz file with one array or an array `grid`:
     /// N×N×N values in [0, 1] (u8: 0 to 255), indexed x, y, z, 0.5 on the surface, 0 if unobserved. With --intrinsics
-    /// the files are depth images: PNG, TIFF or .npy with 16 bits per pixel (see --depth-scale), or TIFF or .npy with
-    /// floats in metres; 0 and NaN mean no reading. With --camera-position they are point clouds: PCD, PLY, .npy, or .npz
+    /// the files are depth images: PNG, TIFF or .npy with 16 bits per pixel (see --depth-scale), or TIFF, EXR or .npy
+    /// with floats in metres; 0 and NaN mean no reading. With --camera-position they are point clouds: PCD, PLY, .npy, or .npz
     /// with one array or an array `points`, N×3 or H×W×3, metres.
     #[arg(required = true)]
     files: Vec<PathBuf>,
@@ -37,6 +37,10 @@ pub(crate) struct SceneArgs {
     #[arg(long, value_name = "METRES", default_value_t = image::MILLIMETRE, requires = "intrinsics")]
     depth_scale: f32,
 
+    /// Send depth images as PNG files: fewer bytes on a slow network. They must be in millimetres.
+    #[arg(long, requires = "intrinsics")]
+    png: bool,
+
     /// T_camera_task of each image: 4×4 or N×4×4 .npy, JSON with such matrices, or JSON with poses
     /// {"position": [x, y, z], "orientation": [x, y, z, w]}; of one image also the numbers X,Y,Z or X,Y,Z,QX,QY,QZ,QW.
     #[arg(
@@ -53,8 +57,8 @@ pub(crate) struct SceneArgs {
     #[arg(long, value_name = "FILE|NUMBERS", requires = "intrinsics", allow_hyphen_values = true)]
     frame_from_camera: Option<Poses>,
 
-    /// Find the table in the first depth image, and place the workspace over what stands on it.
-    #[arg(long, requires = "intrinsics", conflicts_with_all = ["workspace", "camera_from_task"])]
+    /// Find the table in the first depth image or point cloud, and place the workspace over what stands on it.
+    #[arg(long, conflicts_with_all = ["workspace", "camera_from_task", "voxel_size"])]
     find_table: bool,
 
     /// Direction of gravity in the frame of the grasps, for --find-table: the reversed reading of an accelerometer at
@@ -122,6 +126,10 @@ impl SceneArgs {
         if !self.camera_position.is_empty() {
             return Ok(Scene::Clouds(self.clouds()?, workspace));
         }
+        ensure!(
+            find_table.is_none(),
+            "--find-table needs depth images (--intrinsics) or point clouds (--camera-position)"
+        );
         let [file] = &self.files[..] else {
             bail!(
                 "{} files given, but a volume is one file; add --intrinsics for depth images or --camera-position for \
@@ -165,6 +173,13 @@ impl SceneArgs {
         let poses = poses.each(self.files.len(), "images")?;
         let view = |((file, pose), labels): ((&PathBuf, Isometry3<f64>), _)| {
             let (depth, width, height) = image::read(file, self.depth_scale)?;
+            let depth = match depth {
+                Depth::Millimetres(depth) if self.png => Depth::Png(depth),
+                Depth::Metres(_) if self.png => {
+                    bail!("{}: --png needs depths in millimetres, in a PNG, TIFF or .npy with 16 bits", file.display())
+                }
+                depth => depth,
+            };
             Ok(DepthView { depth, width, height, k, extrinsics: direction(pose), labels })
         };
         self.files.iter().zip(poses).zip(self.labels()?).map(view).collect()
@@ -233,8 +248,9 @@ impl Scene {
                 (views.iter().map(|view| depth_view(view, &workspace)).collect(), workspace)
             }
             Self::Clouds(views, workspace) => {
-                let views = views.iter().map(|view| rendered_view(view, workspace));
-                (views.collect::<anyhow::Result<Vec<_>>>()?, *workspace)
+                let workspace = found(workspace, detection)?;
+                let views = views.iter().map(|view| rendered_view(view, &workspace));
+                (views.collect::<anyhow::Result<Vec<_>>>()?, workspace)
             }
         };
         let [x, y] = workspace.extent.unwrap_or_default();
@@ -259,7 +275,7 @@ fn found(workspace: &Workspace, detection: &Detection) -> anyhow::Result<Workspa
 pub(crate) fn metres(depth: &Depth) -> Vec<f32> {
     match depth {
         Depth::Metres(depth) => depth.clone(),
-        Depth::Millimetres(depth) => depth.iter().map(|&depth| f32::from(depth) * 1e-3).collect(),
+        Depth::Millimetres(depth) | Depth::Png(depth) => depth.iter().map(|&depth| f32::from(depth) * 1e-3).collect(),
     }
 }
 

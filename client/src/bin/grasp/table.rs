@@ -1,38 +1,43 @@
-//! `grasp table`: finds the table in a depth image, without a server.
+//! `grasp table`: finds the table in a depth image or a point cloud, without a server.
 
 use std::fs;
 use std::path::PathBuf;
 
 use anyhow::Context;
 use clap::Args;
-use grasp::{DepthImage, Tabletop};
-use grasp_client::{Extrinsics, Workspace};
+use grasp::{DepthImage, Tabletop, View, overview};
+use grasp_client::{DepthView, Extrinsics, Workspace};
 use grasp_proto::TABLE_HEIGHT;
-use nalgebra::{Isometry3, Unit, Vector3};
+use nalgebra::{Isometry3, Point3, Unit, Vector3};
 use serde_json::{Value, json};
 
 use crate::files::in_file;
 use crate::numbers::Numbers;
 use crate::overlay::Overlay;
-use crate::scene::{depth_view, metres};
-use crate::{image, pose, show};
+use crate::scene::depth_view;
+use crate::{cloud, image, pose, show};
 
 #[derive(Args)]
 pub(crate) struct Table {
-    /// Depth image: 16-bit PNG or u16 .npy, or f32 .npy in metres.
-    image: PathBuf,
+    /// Depth image, with --intrinsics: PNG, TIFF or .npy with 16 bits per pixel, or TIFF, EXR or .npy with floats in
+    /// metres. Or point cloud, with --camera-position: PCD, PLY, .npy or .npz.
+    file: PathBuf,
 
     /// Intrinsic matrix of the camera: 3×3 .npy, JSON or YAML of ROS's CameraInfo, JSON of Open3D or of RealSense, or
     /// the numbers FX,FY,CX,CY.
-    #[arg(long, value_name = "FILE|NUMBERS")]
-    intrinsics: String,
+    #[arg(long, value_name = "FILE|NUMBERS", required_unless_present = "camera_position")]
+    intrinsics: Option<String>,
+
+    /// Camera position of the point cloud in the frame of its points, metres: 0,0,0 for points in the camera frame.
+    #[arg(long, value_name = "X,Y,Z", conflicts_with = "intrinsics", allow_hyphen_values = true)]
+    camera_position: Option<Numbers<3>>,
 
     /// Unit of integer depths, metres.
     #[arg(long, value_name = "METRES", default_value_t = image::MILLIMETRE)]
     depth_scale: f32,
 
-    /// Direction of gravity in the camera frame (z forward, x right, y down): the reversed reading of an accelerometer
-    /// at rest. Without it a wall that fills the image is taken for a table.
+    /// Direction of gravity in the camera frame (z forward, x right, y down), or in the frame of the points: the reversed
+    /// reading of an accelerometer at rest. Without it a wall that fills the image is taken for a table.
     #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true)]
     gravity: Option<Numbers<3>>,
 
@@ -40,45 +45,62 @@ pub(crate) struct Table {
     #[arg(long, value_name = "METRES", default_value_t = TABLE_HEIGHT)]
     table_height: f64,
 
-    /// Write the pose of the workspace in the camera frame to this file: JSON, for `--workspace` of the other commands.
+    /// Write the pose of the workspace in the frame of the camera, or of the points, to this file: JSON, for `--workspace` of the other commands.
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
 
-    /// Draw the workspace and the table over the depth image: PNG.
+    /// Draw the workspace and the table over the depth image, or the rendered points: PNG.
     #[arg(long, value_name = "FILE")]
     picture: Option<PathBuf>,
 }
 
 impl Table {
     pub fn run(&self, as_json: bool) -> anyhow::Result<()> {
-        let k = pose::intrinsics(&self.intrinsics)?;
-        let (depth, width, height) = image::read(&self.image, self.depth_scale)?;
-        let view = grasp_client::DepthView {
-            depth,
-            width,
-            height,
-            k,
-            extrinsics: Extrinsics::FrameFromCamera(Isometry3::identity()),
-            labels: None,
-        };
         let gravity = self.gravity.map(|Numbers(gravity)| {
             Unit::try_new(Vector3::from(gravity), 1e-9).context("--gravity is 0,0,0; it must be a direction")
         });
-        let seen = depth_view(&view, &Workspace::default());
-        let found = in_file(&self.image, |_| {
-            let image = DepthImage::new(seen.intrinsics, &seen.depth)?;
-            Ok(Tabletop::find(&image, gravity.transpose()?, self.table_height)?)
+        let gravity = gravity.transpose()?;
+        let view = self.view()?;
+        let frame_from_camera = view.camera_from_task.inverse();
+        let found = in_file(&self.file, |_| {
+            let image = DepthImage::new(view.intrinsics, &view.depth)?;
+            let gravity = gravity.map(|gravity| view.camera_from_task.rotation * gravity);
+            Ok(Tabletop::find(&image, gravity, self.table_height)?)
         })?;
-        let workspace = pose_json(&found.camera_from_task);
+        let frame_from_task = frame_from_camera * found.camera_from_task;
+        let workspace = pose_json(&frame_from_task);
         if let Some(path) = &self.out {
             fs::write(path, format!("{workspace:#}\n")).with_context(|| path.display().to_string())?;
         }
         if let Some(path) = &self.picture {
-            let mut overlay = Overlay::of_depth(&metres(&view.depth), seen.intrinsics, found.camera_from_task);
+            let mut overlay = Overlay::of_depth(&view.depth, view.intrinsics, found.camera_from_task);
             overlay.workspace(self.table_height).save(path)?;
         }
-        show::print(&if as_json { format!("{:#}", json(&found, workspace)) } else { text(&found) })?;
+        let frame = if self.camera_position.is_some() { "points" } else { "camera" };
+        show::print(&if as_json {
+            format!("{:#}", json(&found, workspace))
+        } else {
+            text(&found, &frame_from_task, frame)
+        })?;
         Ok(())
+    }
+
+    /// The image in which the table is searched, with the pose of the frame in which it is reported: that of the camera,
+    /// or of the points.
+    fn view(&self) -> anyhow::Result<View> {
+        if let Some(Numbers(eye)) = self.camera_position {
+            let points: Vec<_> = cloud::read(&self.file)?.into_iter().map(|point| Point3::from(point).cast::<f64>()).collect();
+            let finite: Vec<Point3<f64>> = points.into_iter().filter(|p| p.iter().all(|c| c.is_finite())).collect();
+            return in_file(&self.file, |_| {
+                let seen = overview(&finite, &Point3::from(eye));
+                seen.context("--camera-position must be the position from which the points were seen")
+            });
+        }
+        let k = pose::intrinsics(self.intrinsics.as_deref().unwrap_or_default())?;
+        let (depth, width, height) = image::read(&self.file, self.depth_scale)?;
+        let extrinsics = Extrinsics::FrameFromCamera(Isometry3::identity());
+        let view = DepthView { depth, width, height, k, extrinsics, labels: None };
+        Ok(depth_view(&view, &Workspace::default()))
     }
 }
 
@@ -97,7 +119,7 @@ fn json(table: &Tabletop, workspace: Value) -> Value {
     })
 }
 
-fn text(table: &Tabletop) -> String {
+fn text(table: &Tabletop, frame_from_task: &Isometry3<f64>, frame: &str) -> String {
     let mut text = format!(
         "table: {:.3} m from the camera, whose optical axis is {:.1}° from the table's normal\n\
          on the table: {:.0} % of the image, {:.1} mm from the plane (RMS)",
@@ -109,7 +131,7 @@ fn text(table: &Tabletop) -> String {
     if let Some(tilt) = table.tilt {
         text += &format!("\ntilt against gravity: {:.1}°", tilt.to_degrees());
     }
-    let (p, q) = (table.camera_from_task.translation.vector, table.camera_from_task.rotation.coords);
+    let (p, q) = (frame_from_task.translation.vector, frame_from_task.rotation.coords);
     let numbers: Vec<String> = p.iter().chain(&q).map(|number| format!("{number:.5}")).collect();
-    text + &format!("\nworkspace in the camera frame (x, y, z, qx, qy, qz, qw): {}", numbers.join(","))
+    text + &format!("\nworkspace in the frame of the {frame} (x, y, z, qx, qy, qz, qw): {}", numbers.join(","))
 }
