@@ -73,8 +73,9 @@ const MIDDLE: f64 = 0.45;
 const LEVEL: f64 = 12.0 * std::f64::consts::PI / 180.0;
 
 /// A plane below the largest one is the table, if it is parallel, not farther than this, metres, and at least this
-/// large in comparison: the top of a large object covers the middle of the image.
-const BELOW: std::ops::Range<f64> = 0.02..0.3;
+/// large in comparison: the top of a large object covers the middle of the image. What is farther below is the floor
+/// around a bin or a table.
+const BELOW: std::ops::Range<f64> = 0.02..0.2;
 const LARGE: f64 = 0.35;
 
 /// Largest angle between parallel planes, radians.

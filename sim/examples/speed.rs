@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use grasp::RESOLUTION;
-use grasp_sim::camera::{Views, fuse, look};
+use grasp_sim::camera::{DepthNoise, Views, fuse, look};
 use grasp_sim::label::SceneConfig;
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::scene::{SceneKind, generate};
@@ -67,7 +67,7 @@ impl Times {
             points: 120,
             views: Views::Random(1..=6),
             observations: 1,
-            noise: 1.0,
+            noise: DepthNoise::BENCHMARK,
             seed: 1,
         };
         let (points, labelling) =

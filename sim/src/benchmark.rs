@@ -10,7 +10,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
-use crate::camera::{Views, observe};
+use crate::camera::{DepthNoise, Views, observe};
 use crate::objects::ObjectSet;
 use crate::physics::World;
 use crate::planner::{BenchPlanner, Observation, PlannerSpec};
@@ -31,8 +31,8 @@ pub struct Benchmark {
     pub count: usize,
     /// Cameras that observe the scene before each grasp.
     pub views: Views,
-    /// Share of the observations with depth noise.
-    pub noise: f64,
+    /// Depth noise of the observations.
+    pub noise: DepthNoise,
     /// Number of scenes.
     pub rounds: u64,
     /// Seed of the scenes.

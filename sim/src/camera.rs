@@ -99,12 +99,42 @@ pub fn look(world: &World, cameras: &[Isometry3<f64>]) -> Vec<View> {
         .collect()
 }
 
-/// Renders the scene from cameras drawn from `views`. With probability `noise` every image gets noise.
+/// A sensor whose depth noise is simulated.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Sensor {
+    /// The noise of the benchmark, [`add_noise`].
+    #[default]
+    Dex,
+    /// A stereo camera, [`add_stereo_noise`].
+    Stereo,
+}
+
+/// Depth noise of the observations of a scene.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct DepthNoise {
+    /// Share of the observations with noise.
+    pub share: f64,
+    /// The sensor.
+    pub sensor: Sensor,
+}
+
+impl DepthNoise {
+    /// No noise.
+    pub const NONE: Self = Self { share: 0.0, sensor: Sensor::Dex };
+
+    /// The noise of the benchmark in all observations.
+    pub const BENCHMARK: Self = Self { share: 1.0, sensor: Sensor::Dex };
+}
+
+/// Renders the scene from cameras drawn from `views`.
 #[must_use]
-pub fn observe(world: &World, views: &Views, noise: f64, rng: &mut impl Rng) -> Vec<View> {
+pub fn observe(world: &World, views: &Views, noise: DepthNoise, rng: &mut impl Rng) -> Vec<View> {
     let mut views = look(world, &views.sample(rng));
-    if rng.random_bool(noise) {
-        views.iter_mut().for_each(|view| add_noise(view, rng));
+    if rng.random_bool(noise.share) {
+        views.iter_mut().for_each(|view| match noise.sensor {
+            Sensor::Dex => add_noise(view, rng),
+            Sensor::Stereo => add_stereo_noise(view, rng),
+        });
     }
     views
 }

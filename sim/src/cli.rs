@@ -22,7 +22,7 @@ use std::sync::Arc;
 use anyhow::{Context, bail, ensure};
 use clap::{Args, Parser, ValueEnum};
 use grasp_picture::{Picture, object_color};
-use grasp_sim::camera::Views;
+use grasp_sim::camera::{self, DepthNoise, Views};
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::physics::World;
 use grasp_sim::scene::SceneKind;
@@ -112,13 +112,48 @@ struct SceneArgs {
     #[arg(long, default_value = "side", value_parser = parse_camera_words)]
     views: String,
 
-    /// Share of the observations with the benchmark's depth noise.
+    /// Share of the observations with depth noise.
     #[arg(long, default_value_t = 1.0, value_parser = parse_share)]
     noise: f64,
+
+    /// Sensor whose depth noise is simulated: that of the benchmark (dex, for Dex-Net), or a stereo camera with steps,
+    /// holes and flying pixels (stereo).
+    #[arg(long, value_enum, default_value = "dex")]
+    sensor: Sensor,
 
     /// Random seed.
     #[arg(long, default_value_t = 1)]
     seed: u64,
+}
+
+/// A sensor of the simulator, by its name.
+#[derive(Clone, Copy, ValueEnum)]
+enum Sensor {
+    Dex,
+    Stereo,
+}
+
+impl Sensor {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Dex => "dex",
+            Self::Stereo => "stereo",
+        }
+    }
+
+    /// The sensor of this name in the provenance of a data set.
+    fn of(name: &str) -> anyhow::Result<camera::Sensor> {
+        Self::from_str(name, false).map(Into::into).map_err(anyhow::Error::msg)
+    }
+}
+
+impl From<Sensor> for camera::Sensor {
+    fn from(sensor: Sensor) -> Self {
+        match sensor {
+            Sensor::Dex => Self::Dex,
+            Sensor::Stereo => Self::Stereo,
+        }
+    }
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -194,6 +229,10 @@ impl Scene {
 }
 
 impl SceneArgs {
+    fn noise(&self) -> DepthNoise {
+        DepthNoise { share: self.noise, sensor: self.sensor.into() }
+    }
+
     fn kind(&self) -> SceneKind {
         self.scene.kind()
     }

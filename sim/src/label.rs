@@ -9,7 +9,7 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Poisson, StandardNormal};
 
-use crate::camera::{View, Views, fuse, look, observe};
+use crate::camera::{DepthNoise, View, Views, fuse, look, observe};
 use crate::objects::ObjectSet;
 use crate::physics::World;
 use crate::scene::{SceneKind, generate};
@@ -52,8 +52,8 @@ pub struct SceneConfig {
     pub views: Views,
     /// Observations per scene, with different views and noise.
     pub observations: usize,
-    /// Share of the observations with the benchmark's noise.
-    pub noise: f64,
+    /// Depth noise of the observations.
+    pub noise: DepthNoise,
     /// Seed of the data set.
     pub seed: u64,
 }

@@ -8,7 +8,7 @@ use grasp_models::Options;
 use grasp_planner::object_points;
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
-use grasp_sim::camera::{Views, points};
+use grasp_sim::camera::{DepthNoise, Views, points};
 use grasp_sim::label::SceneConfig;
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::planner::{Observation, PlannerSpec};
@@ -25,7 +25,7 @@ fn benchmark() -> Benchmark {
         objects: ObjectSet::procedural(Split::PackedTest),
         count: 3,
         views: Views::Side { azimuth: 0.0 },
-        noise: 0.0,
+        noise: DepthNoise::NONE,
         rounds: 1,
         seed: 5,
     }
@@ -46,7 +46,7 @@ fn candidates_depend_on_the_seed_and_not_on_the_threads() {
             points: 8,
             views: Views::Side { azimuth: 0.0 },
             observations: 1,
-            noise: 1.0,
+            noise: DepthNoise::BENCHMARK,
             seed,
         };
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();

@@ -9,7 +9,7 @@ use grasp_picture::{Instance, render};
 use grasp_planner::{Evaluator, NetworkPlanner, PlanParams, Planner, Scene};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
-use grasp_sim::camera::{View, Views, add_stereo_noise};
+use grasp_sim::camera::{DepthNoise, View, Views, add_stereo_noise};
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::scene::SceneKind;
 use nalgebra::Isometry3;
@@ -31,7 +31,8 @@ fn most_objects_have_a_probable_grasp() {
     let params = PlanParams { decode, table: Some(TABLE_HEIGHT) };
     let objects = ObjectSet::procedural(Split::PackedTest);
     let views = Views::Random(1..=1);
-    let bench = Benchmark { kind: SceneKind::Packed, objects, count: 4, views, noise: 0.0, rounds: 10, seed: 23 };
+    let bench =
+        Benchmark { kind: SceneKind::Packed, objects, count: 4, views, noise: DepthNoise::NONE, rounds: 10, seed: 23 };
     let (mut grasped, mut seen) = (0, 0);
     for number in 0..bench.rounds {
         let (world, mut rng) = bench.scene(number);

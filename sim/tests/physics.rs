@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use grasp_picture::Mesh;
 use grasp_sim::TABLE_HEIGHT;
-use grasp_sim::camera::Views;
+use grasp_sim::camera::{DepthNoise, Views};
 use grasp_sim::hull::convex_hull;
 use grasp_sim::label::{LabelledScene, SceneConfig};
 use grasp_sim::objects::{Object, ObjectSet, Split};
@@ -178,7 +178,7 @@ fn labels_do_not_depend_on_order_or_threads() {
         points: 10,
         views: Views::Random(1..=2),
         observations: 2,
-        noise: 1.0,
+        noise: DepthNoise::BENCHMARK,
         seed: 3,
     };
     let forward: Vec<Option<LabelledScene>> = (0..4).map(|index| config.label(index)).collect();

@@ -1,9 +1,9 @@
 //! The table in depth images of simulated scenes, from cameras in random poses.
 
-use grasp::{DepthImage, Intrinsics, NoTabletop, Tabletop, WORKSPACE_SIZE};
+use grasp::{DepthImage, Intrinsics, NoTabletop, Tabletop, WORKSPACE_SIZE, overview};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
-use grasp_sim::camera::{View, Views, add_stereo_noise, look};
+use grasp_sim::camera::{DepthNoise, View, Views, add_stereo_noise, look};
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::physics::World;
 use grasp_sim::scene::SceneKind;
@@ -16,7 +16,8 @@ fn scenes(views: &Views) -> Vec<(World, View, ChaCha8Rng)> {
     let kinds = [(SceneKind::Packed, Split::PackedTest), (SceneKind::Pile, Split::PileTest)];
     let of_kind = |(kind, split)| {
         let objects = ObjectSet::procedural(split);
-        let bench = Benchmark { kind, objects, count: 5, views: views.clone(), noise: 0.0, rounds: 12, seed: 11 };
+        let bench =
+            Benchmark { kind, objects, count: 5, views: views.clone(), noise: DepthNoise::NONE, rounds: 12, seed: 11 };
         (0..bench.rounds).map(move |number| {
             let (world, mut rng) = bench.scene(number);
             let camera = bench.views.sample(&mut rng);
@@ -72,20 +73,115 @@ fn gravity_tells_a_wall_from_the_table() {
     // Seen from the side, the wall of the next room is larger than the table.
     for (_, mut view, _) in scenes(&Views::Side { azimuth: 0.0 }).into_iter().take(4) {
         let down = Unit::new_normalize(view.camera_from_task * -Vector3::z());
-        let task_from_camera = view.camera_from_task.inverse();
-        let eye = task_from_camera * Point3::origin();
-        let camera = Intrinsics::BENCHMARK;
-        for (index, depth) in view.depth.iter_mut().enumerate() {
-            let (u, v) = ((index % camera.width) as f64, (index / camera.width) as f64);
-            let ray = Vector3::new((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0);
-            let to_wall = ((0.26 - eye.y) / (task_from_camera * ray).y) as f32;
-            if to_wall > 0.0 && (*depth == 0.0 || to_wall < *depth) {
-                *depth = to_wall;
-            }
-        }
+        add_surface(&mut view, |eye, ray| Some((0.26 - eye.y) / ray.y));
         let table = found(&view, Some(down)).unwrap();
         let (height, tilt) = errors(&table, &view);
         assert!(height < 0.005 && tilt.to_degrees() < 1.0, "{height} {tilt} {table:?}");
+    }
+}
+
+/// Adds a surface to a view: where the ray of a pixel, from `eye` along `ray` in the task frame, meets it, as a multiple
+/// of `ray`, which is the depth.
+fn add_surface(view: &mut View, distance: impl Fn(&Point3<f64>, &Vector3<f64>) -> Option<f64>) {
+    let task_from_camera = view.camera_from_task.inverse();
+    let eye = task_from_camera * Point3::origin();
+    let camera = Intrinsics::BENCHMARK;
+    for (index, depth) in view.depth.iter_mut().enumerate() {
+        let (u, v) = ((index % camera.width) as f64, (index / camera.width) as f64);
+        let ray = task_from_camera * Vector3::new((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0);
+        if let Some(distance) = distance(&eye, &ray).filter(|distance| *distance > 0.0)
+            && (*depth == 0.0 || distance < f64::from(*depth))
+        {
+            *depth = distance as f32;
+        }
+    }
+}
+
+#[test]
+fn the_table_is_found_in_point_clouds() {
+    for (number, (_, mut view, mut rng)) in scenes(&Views::Random(1..=1)).into_iter().enumerate() {
+        add_stereo_noise(&mut view, &mut rng);
+        let image = DepthImage::new(Intrinsics::BENCHMARK, &view.depth).unwrap();
+        let Intrinsics { width, height, .. } = Intrinsics::BENCHMARK;
+        let pixels = (0..height).flat_map(|v| (0..width).map(move |u| (u, v)));
+        let of_camera: Vec<Point3<f64>> = pixels.filter_map(|(u, v)| image.point(u, v)).collect();
+        let task_from_camera = view.camera_from_task.inverse();
+        // In the frame of the camera, and in that of the task.
+        for task_from_cloud in [task_from_camera, Isometry3::identity()] {
+            let cloud_from_camera = task_from_cloud.inverse() * task_from_camera;
+            let points: Vec<_> = of_camera.iter().map(|point| cloud_from_camera * point).collect();
+            let seen = overview(&points, &(cloud_from_camera * Point3::origin())).unwrap();
+            let rendered = DepthImage::new(seen.intrinsics, &seen.depth).unwrap();
+            let found = Tabletop::find(&rendered, None, TABLE_HEIGHT).unwrap();
+            let true_from_found = task_from_cloud * seen.camera_from_task.inverse() * found.camera_from_task;
+            let middle = true_from_found * Point3::new(WORKSPACE_SIZE / 2.0, WORKSPACE_SIZE / 2.0, TABLE_HEIGHT);
+            let height = (middle.z - TABLE_HEIGHT).abs();
+            let tilt = (true_from_found.rotation * Vector3::z()).angle(&Vector3::z()).to_degrees();
+            assert!(height < 0.005 && tilt < 1.0, "scene {number}: {height} m, {tilt}°, {found:?}");
+        }
+    }
+}
+
+#[test]
+fn in_a_bin_its_floor_is_the_table() {
+    /// Edge of the bin around the middle of the workspace, height of its walls, and depth of the floor around it.
+    const BIN: [f64; 3] = [0.4, 0.12, 0.25];
+    let [edge, walls, below] = BIN;
+    let (low, high) = (WORKSPACE_SIZE / 2.0 - edge / 2.0, WORKSPACE_SIZE / 2.0 + edge / 2.0);
+    let is_inside = |at: f64| (low..=high).contains(&at);
+    let mut looked_into = 0;
+    for (number, (_, mut view, mut rng)) in scenes(&Views::Random(1..=1)).into_iter().enumerate() {
+        let task_from_camera = view.camera_from_task.inverse();
+        // From the side the walls hide the floor of the bin, and the floor around it is larger.
+        if (task_from_camera * Vector3::z()).angle(&-Vector3::z()).to_degrees() > 40.0 {
+            continue;
+        }
+        looked_into += 1;
+        // The simulated table is larger than the bin.
+        let table: Vec<bool> = {
+            let image = DepthImage::new(Intrinsics::BENCHMARK, &view.depth).unwrap();
+            let width = Intrinsics::BENCHMARK.width;
+            let outside = |at: Point3<f64>| !is_inside(at.x) || !is_inside(at.y);
+            let at = |index: usize| image.point(index % width, index / width).map(|point| task_from_camera * point);
+            (0..view.depth.len()).map(|index| at(index).is_some_and(outside)).collect()
+        };
+        view.depth.iter_mut().zip(table).filter(|(_, outside)| *outside).for_each(|(depth, _)| *depth = 0.0);
+        for (axis, side) in [(0, low), (0, high), (1, low), (1, high)] {
+            add_surface(&mut view, |eye, ray| {
+                let distance = (side - eye[axis]) / ray[axis];
+                let at = eye + ray * distance;
+                ((TABLE_HEIGHT..TABLE_HEIGHT + walls).contains(&at.z) && is_inside(at[1 - axis])).then_some(distance)
+            });
+        }
+        add_surface(&mut view, |eye, ray| {
+            let distance = (TABLE_HEIGHT - below - eye.z) / ray.z;
+            let at = eye + ray * distance;
+            (!is_inside(at.x) || !is_inside(at.y)).then_some(distance).filter(|distance| *distance < 2.0)
+        });
+        add_stereo_noise(&mut view, &mut rng);
+        let down = Unit::new_normalize(view.camera_from_task * -Vector3::z());
+        let table = found(&view, Some(down)).unwrap();
+        let (height, tilt) = errors(&table, &view);
+        assert!(height < 0.005 && tilt.to_degrees() < 1.0, "scene {number}: {height} m, {tilt}, {table:?}");
+    }
+    assert!(looked_into >= 5, "{looked_into} cameras look into the bin");
+}
+
+#[test]
+fn of_two_tables_the_one_in_the_middle_is_found() {
+    for (number, (_, mut view, mut rng)) in scenes(&Views::Random(1..=1)).into_iter().enumerate() {
+        // Another table beside the workspace, 15 cm higher. A camera over it would see little else.
+        if (view.camera_from_task.inverse() * Point3::origin()).x > WORKSPACE_SIZE {
+            continue;
+        }
+        add_surface(&mut view, |eye, ray| {
+            let distance = (TABLE_HEIGHT + 0.15 - eye.z) / ray.z;
+            ((eye + ray * distance).x > WORKSPACE_SIZE + 0.1).then_some(distance).filter(|distance| *distance < 2.0)
+        });
+        add_stereo_noise(&mut view, &mut rng);
+        let table = found(&view, None).unwrap();
+        let (height, tilt) = errors(&table, &view);
+        assert!(height < 0.005 && tilt.to_degrees() < 1.0, "scene {number}: {height} m, {tilt}, {table:?}");
     }
 }
 

@@ -7,7 +7,7 @@ use grasp::{DepthImage, Fusion, Intrinsics, RESOLUTION, WORKSPACE_SIZE};
 use grasp_picture::{Instance, render};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
-use grasp_sim::camera::{View, Views, add_stereo_noise, look_at};
+use grasp_sim::camera::{DepthNoise, View, Views, add_stereo_noise, look_at};
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::physics::World;
 use grasp_sim::scene::SceneKind;
@@ -23,7 +23,8 @@ const HALF_LIFE: f64 = 10.0;
 fn scenes() -> impl Iterator<Item = World> {
     let objects = ObjectSet::procedural(Split::PackedTest);
     let views = Views::Side { azimuth: 0.0 };
-    let bench = Benchmark { kind: SceneKind::Packed, objects, count: 4, views, noise: 0.0, rounds: 4, seed: 17 };
+    let bench =
+        Benchmark { kind: SceneKind::Packed, objects, count: 4, views, noise: DepthNoise::NONE, rounds: 4, seed: 17 };
     (0..bench.rounds).map(move |number| bench.scene(number).0)
 }
 

@@ -4,7 +4,7 @@
 use grasp::{DepthImage, Fusion, Intrinsics, RESOLUTION, WORKSPACE_SIZE, Warning};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
-use grasp_sim::camera::{View, Views, observe};
+use grasp_sim::camera::{DepthNoise, View, Views, observe};
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::scene::SceneKind;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
@@ -14,7 +14,8 @@ fn observations(views: &Views) -> Vec<Vec<View>> {
     let kinds = [(SceneKind::Packed, Split::PackedTest), (SceneKind::Pile, Split::PileTest)];
     let of_kind = |(kind, split)| {
         let objects = ObjectSet::procedural(split);
-        let bench = Benchmark { kind, objects, count: 5, views: views.clone(), noise: 0.0, rounds: 6, seed: 5 };
+        let bench =
+            Benchmark { kind, objects, count: 5, views: views.clone(), noise: DepthNoise::NONE, rounds: 6, seed: 5 };
         (0..bench.rounds).map(move |number| {
             let (world, mut rng) = bench.scene(number);
             observe(&world, &bench.views, bench.noise, &mut rng)

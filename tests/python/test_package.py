@@ -151,6 +151,17 @@ class DetectTest(ServerTest):
         with self.assertRaisesRegex(graspd.InvalidArgument, "table_height is -1, must be from 0 to 0.3 m"):
             self.client.find_table(view, table_height=-1)
 
+    def test_the_table_is_found_in_a_point_cloud(self):
+        depth = scene.depth(CAMERAS[0])
+        v, u = np.indices(depth.shape)
+        rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(scene.K).T
+        cloud = graspd.CloudView((rays * depth[..., None])[depth > 0], (0, 0, 0))
+        found = self.client.find_table(cloud)
+        table = np.linalg.inv(CAMERAS[0]) @ found.workspace.matrix() @ [0.15, 0.15, 0.05, 1]
+        self.assertAlmostEqual(table[2], scene.TABLE, delta=0.004)
+        detected = self.client.detect_from_cloud(cloud, graspd.Workspace(find_table=True), LOW)
+        self.assertEqual(detected.table, found)
+
     def test_a_png_gives_the_same_grasps(self):
         millimetres = [np.rint(scene.depth(camera) * 1e3).astype(np.uint16) for camera in CAMERAS]
         detections = [

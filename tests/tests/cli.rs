@@ -5,6 +5,7 @@ use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
+use exr::prelude::WritableImage;
 use foxglove::Decode;
 use foxglove::messages::{PointCloud, SceneUpdate};
 use grasp::Volume;
@@ -330,6 +331,13 @@ fn depth_files(folder: &Path) -> Vec<Vec<String>> {
         let bytes: Vec<u8> = millimetres.iter().flat_map(|v| v.to_be_bytes()).collect();
         encoder.write_header().unwrap().write_image_data(&bytes).unwrap();
         rename("mm", "png");
+        let metres = depth(pose);
+        let channel = exr::prelude::SpecificChannels::build().with_channel("Z").with_pixel_fn(|at| {
+            let exr::prelude::Vec2(u, v) = at;
+            (metres[v * CAMERA.width + u],)
+        });
+        let size = (CAMERA.width, CAMERA.height);
+        exr::prelude::Image::from_channels(size, channel).write().to_file(path(&format!("z{index}.exr"))).unwrap();
     }
     let k = [CAMERA.fx, 0.0, CAMERA.cx, 0.0, CAMERA.fy, CAMERA.cy, 0.0, 0.0, 1.0];
     std::fs::write(path("camera_info.json"), serde_json::json!({ "width": 160, "k": k }).to_string()).unwrap();
@@ -358,6 +366,7 @@ fn depth_files(folder: &Path) -> Vec<Vec<String>> {
     vec![
         flags(["m0.npy", "m1.npy"], ["--intrinsics", "k.npy", "--camera-from-task", "poses.npy"]),
         flags(["mm0.png", "mm1.png"], ["--intrinsics", "camera_info.json", "--frame-from-camera", "hand_eye.json"]),
+        flags(["z0.exr", "z1.exr"], ["--intrinsics", "k.npy", "--camera-from-task", "poses.npy"]),
     ]
 }
 
@@ -380,6 +389,14 @@ fn depth_images_are_read_in_every_format() {
         found.push(reply["grasps"].as_array().unwrap().len());
     }
     assert!(found[0] > 5 && found[0].abs_diff(found[1]) <= found[0] / 4, "{found:?}");
+    assert_eq!(found[0], found[2], "of the same metres");
+
+    let [in_metres, in_millimetres, _] = &depth_files(folder.path())[..] else { panic!("three formats") };
+    let as_png = run(&server, &command(&["detect", "--threshold", "0.6", "--json", "--png"], in_millimetres));
+    let reply: Value = serde_json::from_slice(&as_png.stdout).unwrap_or_else(|_| panic!("{as_png:?}"));
+    assert_eq!(reply["grasps"].as_array().unwrap().len(), found[1]);
+    let output = run(&server, &command(&["detect", "--png"], in_metres));
+    assert!(text(&output.stderr).contains("--png needs depths in millimetres"), "{output:?}");
 
     let flags = &depth_files(folder.path())[0];
     let output = run(&server, &["detect", &flags[0], "--intrinsics", &flags[3]]);
@@ -448,12 +465,20 @@ fn point_clouds_are_read_in_every_format() {
     // Points on the border between two pixels may be assigned to either.
     assert!(found[0] > 5 && found[0].abs_diff(found[1]) <= 1 + found[0] / 4, "{found:?}");
 
+    let [own, _] = &clouds;
+    let table = run(&server, &["table", &own[2], "--camera-position", "0,0,0", "--json"]);
+    let table: Value = serde_json::from_slice(&table.stdout).unwrap_or_else(|_| panic!("{table:?}"));
+    let placed = &["detect", &own[2], "--camera-position", "0,0,0", "--find-table", "--threshold", "0.6", "--json"];
+    let placed: Value = serde_json::from_slice(&run(&server, placed).stdout).unwrap();
+    assert_eq!(placed["table"]["workspace"]["position"], table["workspace"]["position"]);
+    let distance = camera(30.0, -90.0).inverse().translation.z - TABLE;
+    assert!((table["distance"].as_f64().unwrap() - distance).abs() < 0.004, "{table}, not {distance}");
+
     let refused = |args: &[&str]| {
         let output = run(&server, args);
         assert_eq!(output.status.code(), Some(1), "{args:?}");
         text(&output.stderr).to_owned()
     };
-    let [own, _] = &clouds;
     let (cloud, poses) = (own[2].as_str(), own[5].as_str());
     let origin = ["--camera-position", "0,0,0"];
     let error = refused(&["detect", cloud]);

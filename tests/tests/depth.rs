@@ -124,24 +124,28 @@ async fn the_grid_is_rotated_to_the_camera_azimuth_of_the_network() {
     assert!(message.starts_with("options.model is `mirror`, which requires a different grid"), "{message}");
 }
 
-#[tokio::test]
-async fn point_clouds_give_grasps_in_the_workspace() {
-    let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS)], &[]);
-    let client = server.client().await;
-    let pose = camera(35.0, -60.0);
-    let image = depth(&pose);
+/// What a camera sees as a point cloud in its own frame, as drivers publish it.
+fn cloud(camera_from_task: &Isometry3<f64>) -> CloudView {
+    let image = depth(camera_from_task);
     let pixels = image.iter().enumerate().filter(|(_, depth)| **depth > 0.0).map(|(index, &depth)| {
         let (u, v) = ((index % CAMERA.width) as f64, (index / CAMERA.width) as f64);
         let z = f64::from(depth);
         [(u - CAMERA.cx) / CAMERA.fx * z, (v - CAMERA.cy) / CAMERA.fy * z, z].map(|c| c as f32)
     });
-    // In the frame of the camera, as drivers publish point clouds.
-    let cloud = CloudView {
+    CloudView {
         points: pixels.chain([[f32::NAN; 3]]).collect(),
-        frame_from_cloud: pose.inverse(),
+        frame_from_cloud: Isometry3::identity(),
         camera_position: [0.0; 3],
         labels: None,
-    };
+    }
+}
+
+#[tokio::test]
+async fn point_clouds_give_grasps_in_the_workspace() {
+    let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS)], &[]);
+    let client = server.client().await;
+    let pose = camera(35.0, -60.0);
+    let cloud = CloudView { frame_from_cloud: pose.inverse(), ..cloud(&pose) };
     let network = client.detect_from_cloud(std::slice::from_ref(&cloud), &Workspace::default(), low()).await.unwrap();
     assert!(!network.grasps.is_empty() && network.latency.fusion > 0.0);
     let shaf = || with_options(DetectOptions { model: "shaf".to_owned(), ..DetectOptions::default() });
@@ -562,12 +566,33 @@ async fn the_table_is_found_in_the_first_view() {
     refused(&views[..1], nowhere, "workspace.gravity is (0, 0, 0), must be finite and of a length above 0").await;
     let nothing = DepthView { depth: Depth::Metres(vec![0.0; 160 * 120]), ..views[0].clone() };
     refused(&[nothing], any, "views[0].data: only 0 % of the image has a depth").await;
-    let cloud = CloudView {
-        points: vec![[0.1, 0.1, 0.1]],
-        frame_from_cloud: Isometry3::identity(),
-        camera_position: [0.0; 3],
-        labels: None,
+}
+
+#[tokio::test]
+async fn the_table_is_found_in_a_point_cloud() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let client = server.client().await;
+    let camera_from_task = camera(35.0, -90.0);
+    let auto = Workspace { find_table: Some(FindTable::default()), ..Workspace::default() };
+    let seen = cloud(&camera_from_task);
+    let shaf = || with_options(DetectOptions { model: "shaf".to_owned(), ..DetectOptions::default() });
+    let detection = client.detect_from_cloud(std::slice::from_ref(&seen), &auto, shaf()).await.unwrap();
+    let table = detection.table.unwrap();
+    let camera_from_found = grasp_proto::pose(table.workspace.as_ref().unwrap(), "workspace").unwrap();
+    let height = (camera_from_task.inverse() * camera_from_found * Point3::new(0.15, 0.15, TABLE)).z;
+    assert!((height - TABLE).abs() < 0.004, "{height}");
+    assert!((table.angle.to_degrees() - 35.0).abs() < 6.0 && table.tilt.is_none(), "{table:?}");
+    let best = detection.grasps[0];
+    assert_at_the_block(&Proposal { pose: camera_from_task.inverse() * best.pose, ..best });
+
+    let refused = async |view: CloudView, expected: &str| {
+        let (code, message) = refusal(client.detect_from_cloud(&[view], &auto, low()).await);
+        assert_eq!(code, Code::InvalidArgument);
+        assert!(message.contains(expected), "{message}");
     };
-    let (_, message) = refusal(client.detect_from_cloud(&[cloud], &auto, low()).await);
-    assert!(message.starts_with("workspace.find_table is true, needs depth images"), "{message}");
+    let inside =
+        CloudView { points: vec![[0.1, 0.1, 0.1]], camera_position: [0.1_f32; 3].map(f64::from), ..seen.clone() };
+    refused(inside, "views[0].camera_position is (0.1").await;
+    let line = (0..1000).map(|index| [index as f32 * 1e-4, 0.0, 0.5]).collect();
+    refused(CloudView { points: line, ..seen }, "views[0].points: seen from camera_position, only").await;
 }

@@ -55,8 +55,11 @@ pub struct Provenance {
     /// Observations per scene.
     #[serde(alias = "looks")]
     pub observations: usize,
-    /// Fraction of the observations with the benchmark's depth noise.
+    /// Fraction of the observations with depth noise.
     pub noise: f64,
+    /// Sensor of the depth noise: `dex`, that of the benchmark, or `stereo`.
+    #[serde(default = "dex", skip_serializing_if = "is_dex")]
+    pub sensor: String,
     /// Seed of the data set. Each scene number selects a random stream.
     pub seed: u64,
     /// Seed of the observations, if they were not generated with the labels.
@@ -70,6 +73,15 @@ pub struct Provenance {
     pub evaluator: Option<String>,
     /// Version of the simulator. Labels can differ between versions.
     pub version: String,
+}
+
+/// The sensor of data sets that do not store one.
+fn dex() -> String {
+    "dex".to_owned()
+}
+
+fn is_dex(sensor: &str) -> bool {
+    sensor == "dex"
 }
 
 /// The part of data sets that do not store one.

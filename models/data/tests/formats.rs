@@ -20,6 +20,7 @@ fn setup() -> Setup {
         views: "side".into(),
         observations: 2,
         noise: 0.0,
+        sensor: "dex".into(),
         seed: 1,
         observation_seed: None,
         network: None,

@@ -148,17 +148,18 @@ impl Bench {
             objects: self.scene.objects("test")?,
             count: self.count,
             views: self.scene.views()?,
-            noise: self.scene.noise,
+            noise: self.scene.noise(),
             rounds: self.rounds,
             seed: self.scene.seed,
         };
         let setup = format!(
-            "{}, objects {}{}, views {}, noise {}, {} objects per scene, {} rounds, seed {}",
+            "{}, objects {}{}, views {}, noise {} ({}), {} objects per scene, {} rounds, seed {}",
             self.scene.scene.name(),
             self.scene.objects.as_deref().unwrap_or("test"),
             self.scene.part.suffix(),
             self.scene.views,
-            benchmark.noise,
+            benchmark.noise.share,
+            self.scene.sensor.name(),
             benchmark.count,
             benchmark.rounds,
             benchmark.seed

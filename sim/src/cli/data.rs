@@ -28,7 +28,7 @@ impl DataArgs {
             points,
             views: self.scene.views()?,
             observations,
-            noise: self.scene.noise,
+            noise: self.scene.noise(),
             seed: self.scene.seed,
         })
     }
@@ -43,7 +43,8 @@ impl DataArgs {
             points: config.points,
             views: self.scene.views.clone(),
             observations: config.observations,
-            noise: config.noise,
+            noise: config.noise.share,
+            sensor: self.scene.sensor.name().to_owned(),
             seed: config.seed,
             observation_seed: None,
             network: None,

@@ -44,7 +44,7 @@ impl Demo {
             objects: self.scene.objects("test")?,
             count: 5,
             views: self.scene.views()?,
-            noise: self.scene.noise,
+            noise: self.scene.noise(),
             rounds: 1,
             seed: self.scene.seed,
         };

@@ -4,11 +4,12 @@ use anyhow::{Context, ensure};
 use clap::{Args, ValueEnum};
 use grasp_data::packed::{Reader, Writer};
 use grasp_data::{Provenance, Setup, quantise};
+use grasp_sim::camera::DepthNoise;
 use grasp_sim::label::SceneConfig;
 use grasp_sim::ordered;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{Part, Scene, VIEWS, parse_camera_words, parse_share, parse_views, refuse_looks};
+use super::{Part, Scene, Sensor, VIEWS, parse_camera_words, parse_share, parse_views, refuse_looks};
 
 /// Much faster than labelling, because no grasp is tried. An interrupted run continues where it stopped.
 #[derive(Args)]
@@ -27,9 +28,13 @@ pub struct Observe {
     #[arg(long, hide = true, value_parser = refuse_looks)]
     looks: Option<String>,
 
-    /// Share of the observations with the benchmark's depth noise.
+    /// Share of the observations with depth noise.
     #[arg(long, default_value_t = 1.0, value_parser = parse_share)]
     noise: f64,
+
+    /// Sensor whose depth noise is simulated.
+    #[arg(long, value_enum, default_value = "dex")]
+    sensor: Sensor,
 
     /// Seed of the views and the noise. The scenes stay the same.
     #[arg(long, default_value_t = 1)]
@@ -64,7 +69,7 @@ impl Observe {
             points: made.points,
             views: parse(&made.views)?,
             observations: made.observations,
-            noise: made.noise,
+            noise: DepthNoise { share: made.noise, sensor: Sensor::of(&made.sensor)? },
             seed: made.seed,
         };
         if let Some(&first) = scenes.first() {
@@ -81,6 +86,7 @@ impl Observe {
             views: self.views.clone(),
             observations: self.observations,
             noise: self.noise,
+            sensor: self.sensor.name().to_owned(),
             observation_seed: Some(self.seed),
             ..made
         });
@@ -91,7 +97,8 @@ impl Observe {
         let progress = ProgressBar::new(scenes.len() as u64).with_style(ProgressStyle::with_template(style)?);
         progress.set_position(done as u64);
         progress.reset_eta();
-        let config = SceneConfig { views, observations: self.observations, noise: self.noise, ..before };
+        let noise = DepthNoise { share: self.noise, sensor: self.sensor.into() };
+        let config = SceneConfig { views, observations: self.observations, noise, ..before };
         ordered::for_each(
             done as u64..scenes.len() as u64,
             |place| config.observe_again(data.number(scenes[place as usize]), self.seed),

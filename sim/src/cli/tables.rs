@@ -12,6 +12,7 @@ use grasp::DecodeParams;
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Metadata, Options, Store};
 use grasp_sim::benchmark::{Benchmark, Event};
+use grasp_sim::camera::DepthNoise;
 use grasp_sim::objects::ObjectSet;
 use grasp_sim::planner::PlannerSpec;
 use grasp_sim::score::{Spread, Summary};
@@ -284,7 +285,7 @@ impl Tables {
             objects,
             count: 5,
             views: parse_views(&condition.views).context("views of a table")?,
-            noise: 1.0,
+            noise: DepthNoise::BENCHMARK,
             rounds: self.rounds,
             seed,
         })

@@ -89,7 +89,8 @@ impl Table {
     /// or of the points.
     fn view(&self) -> anyhow::Result<View> {
         if let Some(Numbers(eye)) = self.camera_position {
-            let points: Vec<_> = cloud::read(&self.file)?.into_iter().map(|point| Point3::from(point).cast::<f64>()).collect();
+            let points: Vec<_> =
+                cloud::read(&self.file)?.into_iter().map(|point| Point3::from(point).cast::<f64>()).collect();
             let finite: Vec<Point3<f64>> = points.into_iter().filter(|p| p.iter().all(|c| c.is_finite())).collect();
             return in_file(&self.file, |_| {
                 let seen = overview(&finite, &Point3::from(eye));

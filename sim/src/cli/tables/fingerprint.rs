@@ -5,6 +5,7 @@ use std::{fs, io};
 
 use anyhow::Context;
 use grasp::{Grasp, Maps, RESOLUTION, Volume, WORKSPACE_SIZE, decode};
+use grasp_sim::camera::DepthNoise;
 use grasp_sim::label::SceneConfig;
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::tables::{EPSILON, VIEWS};
@@ -25,7 +26,7 @@ pub(super) fn simulator() -> String {
             points: 10,
             views: parse_views(VIEWS[0].0).expect("the paper's view is one"),
             observations: 1,
-            noise: 1.0,
+            noise: DepthNoise::BENCHMARK,
             seed: 1,
         };
         config.label(1)
