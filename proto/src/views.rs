@@ -232,6 +232,7 @@ fn median(distances: impl Iterator<Item = f64>) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Workspace;
 
     /// A wall at a distance of 0.5 m.
     fn view() -> pb::DepthView {
