@@ -51,6 +51,7 @@ pub fn provenance() -> Provenance {
         views: "all".into(),
         observations: 1,
         noise: 0.0,
+        sensor: "dex".to_owned(),
         seed: 0,
         observation_seed: None,
         network: None,
