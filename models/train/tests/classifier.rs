@@ -11,7 +11,7 @@ use grasp_models::gpd::gpd;
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Classifier, Metadata, Options};
 use grasp_sim::benchmark::Benchmark;
-use grasp_sim::camera::Views;
+use grasp_sim::camera::{DepthNoise, Views};
 use grasp_sim::label::SceneConfig;
 use grasp_sim::objects::{ObjectSet, Split};
 use grasp_sim::planner::PlannerSpec;
@@ -84,7 +84,7 @@ fn a_trained_classifier_plans_in_the_benchmark() {
         points: 10,
         views: Views::Side { azimuth: 0.0 },
         observations: 1,
-        noise: 1.0,
+        noise: DepthNoise::BENCHMARK,
         seed: 1,
     };
     let mut candidates = Candidates::default();
@@ -112,7 +112,7 @@ fn a_trained_classifier_plans_in_the_benchmark() {
         objects: ObjectSet::procedural(Split::PackedTest),
         count: 3,
         views: config.views,
-        noise: 1.0,
+        noise: DepthNoise::BENCHMARK,
         rounds: 2,
         seed: 1,
     };
