@@ -35,17 +35,17 @@ pub(crate) fn grey(file: &[u8], width: usize, height: usize) -> Result<Vec<u16>,
     })
 }
 
-/// A PNG file of 16-bit grey values, row by row, compressed quickly. Empty if there is no whole row.
+/// A PNG file of 16-bit grey values, row by row, compressed quickly. Values after the last whole row are left out; without
+/// a whole row the file is empty, which the server refuses.
 #[must_use]
 pub fn grey_png(values: &[u16], width: u32) -> Vec<u8> {
     let mut file = Vec::new();
-    let height = values.len().checked_div(width as usize).and_then(|height| u32::try_from(height).ok());
-    let mut encoder = png::Encoder::new(&mut file, width, height.unwrap_or(0));
+    let rows = values.chunks_exact(width.max(1) as usize);
+    let mut encoder = png::Encoder::new(&mut file, width, u32::try_from(rows.len()).unwrap_or(0));
     encoder.set_color(ColorType::Grayscale);
     encoder.set_depth(BitDepth::Sixteen);
     encoder.set_compression(png::Compression::Fast);
-    let rows = values.len().checked_div(width as usize).unwrap_or(0) * width as usize;
-    let bytes: Vec<u8> = values[..rows].iter().flat_map(|value| value.to_be_bytes()).collect();
+    let bytes: Vec<u8> = rows.flatten().flat_map(|value| value.to_be_bytes()).collect();
     match encoder.write_header().and_then(|mut writer| writer.write_image_data(&bytes)) {
         Ok(()) => file,
         Err(_) => Vec::new(),

@@ -100,17 +100,16 @@ pub fn look(world: &World, cameras: &[Isometry3<f64>]) -> Vec<View> {
 }
 
 /// A sensor whose depth noise is simulated.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sensor {
     /// The noise of the benchmark, [`add_noise`].
-    #[default]
     Dex,
     /// A stereo camera, [`add_stereo_noise`].
     Stereo,
 }
 
 /// Depth noise of the observations of a scene.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DepthNoise {
     /// Share of the observations with noise.
     pub share: f64,

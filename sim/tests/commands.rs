@@ -340,6 +340,15 @@ fn scenes_are_observed_again() {
     desk.run("observe part --views side --seed 4 --out part-again");
     assert_eq!(desk.scenes("part-again"), desk.scenes("part"));
 
+    // The sensor is stored: without it the first scene would differ, and the command would refuse.
+    desk.run(&format!("{LABEL} --scenes 5 --sensor stereo --out stereo"));
+    desk.run("observe stereo --views random:1-2 --observations 2 --sensor stereo --seed 4 --out stereo-again");
+    assert_eq!(desk.scenes("stereo-again"), desk.scenes("stereo"));
+    for ((_, volumes, trials), (_, volumes_before, trials_before)) in desk.scenes("stereo").iter().zip(&before) {
+        assert_eq!(trials, trials_before);
+        assert_ne!(volumes, volumes_before);
+    }
+
     // A data set of another simulator: its first scene differs.
     let setup = fs::read_to_string(desk.path("data/setup.json")).unwrap();
     fs::write(desk.path("data/setup.json"), setup.replace("\"seed\": 4", "\"seed\": 5")).unwrap();

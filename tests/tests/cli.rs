@@ -397,6 +397,11 @@ fn depth_images_are_read_in_every_format() {
     assert_eq!(reply["grasps"].as_array().unwrap().len(), found[1]);
     let output = run(&server, &command(&["detect", "--png"], in_metres));
     assert!(text(&output.stderr).contains("--png needs depths in millimetres"), "{output:?}");
+    let colour = folder.path().join("colour.exr");
+    exr::prelude::write_rgb_file(&colour, CAMERA.width, CAMERA.height, |_, _| (0.5_f32, 0.5_f32, 0.5_f32)).unwrap();
+    let output = run(&server, &["detect", colour.to_str().unwrap(), "--intrinsics", &in_metres[3], "--find-table"]);
+    let error = text(&output.stderr);
+    assert!(error.contains("colour.exr") && error.contains("channels in the file: B, G, R"), "{error}");
 
     let flags = &depth_files(folder.path())[0];
     let output = run(&server, &["detect", &flags[0], "--intrinsics", &flags[3]]);

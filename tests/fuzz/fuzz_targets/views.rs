@@ -59,6 +59,11 @@ fn depth(bytes: &[u8]) {
 
 fn cloud(bytes: &[u8]) {
     let Ok(request) = pb::DetectGraspsFromCloudRequest::decode(bytes) else { return };
+    if let Ok(mut workspace) = Workspace::try_from(request.workspace.unwrap_or_default())
+        && let Err(error) = workspace.find_table_in_clouds(&request.views, 0.05)
+    {
+        assert!(error.message.starts_with(&*error.field), "{error:?}");
+    }
     for (index, view) in request.views.iter().enumerate() {
         if let Ok(points) = cloud_view(view, index, &Isometry3::identity())
             && let Some(view) = seen_from(&points.points, &points.eye, 0.3)

@@ -123,8 +123,9 @@ class Client(Connection[grpc.Channel]):
         table_height: float | None = None,
         request_id: str = "",
     ) -> FoundTable:
-        """Finds the table in a depth image or a point cloud, and the workspace over what stands on it. Of `workspace` only
-        `gravity` is used. `table_height` is the height of the table above the bottom of the workspace, metres; None: 0.05."""
+        """Finds the table in a depth image or a point cloud, and the workspace over what stands on it. Of `workspace`
+        only `gravity`, `extent`, `frame_id` and `stamp` are used. `table_height` is the height of the table above the
+        bottom of the workspace, metres; None: 0.05."""
         return self._call(methods.FIND_TABLE, wire.table_request(view, workspace, table_height, request_id))
 
     def models(self) -> tuple[Model, ...]:

@@ -102,8 +102,8 @@ class Workspace:
     stamp: int | None = None
     """Time of the observation, nanoseconds since 1970. The server returns it unchanged."""
     find_table: bool = False
-    """Find the table in the first depth image or point cloud, and place the cube over what stands on it near the middle of
-    the image. `pose` must be None; the pose that was found is in `Detection.table`."""
+    """Find the table in the first depth image or point cloud, and place the cube over what stands on it near the middle
+    of the image. `pose` must be None; the pose that was found is in `Detection.table`."""
     gravity: Vector | None = None
     """For `find_table`: direction of gravity in `frame_id`, of any length above 0. An accelerometer at rest measures the
     opposite. None: unknown; a wall that fills the image is then taken for a table."""

@@ -73,8 +73,8 @@ fn tiff(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
     Ok((depth, width, height))
 }
 
-/// Names of the channel with the depth in files of renderers.
-const CHANNELS: [&str; 6] = ["Z", "depth.Z", "Depth.Z", "depth", "Y", "R"];
+/// Names of the channel with the depth in files of renderers that have several channels. Not R: a colour image has it.
+const CHANNELS: [&str; 4] = ["Z", "depth.Z", "Depth.Z", "depth"];
 
 fn exr(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
     let reader = exr::prelude::read().no_deep_data().largest_resolution_level().all_channels().all_layers();
@@ -85,7 +85,7 @@ fn exr(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
     let (layer, channel) =
         found.or_else(|| channels().next().filter(|_| channels().count() == 1)).with_context(|| {
             let names: Vec<_> = channels().map(|(_, channel)| channel.name.to_string()).collect();
-            format!("no channel {}; channels in the file: {}", CHANNELS.join(", "), names.join(", "))
+            format!("no channel {}; channels in the file: {}", CHANNELS.join(" or "), names.join(", "))
         })?;
     let depth = channel.sample_data.values_as_f32().collect();
     Ok((Depth::Metres(depth), u32::try_from(layer.size.width())?, u32::try_from(layer.size.height())?))

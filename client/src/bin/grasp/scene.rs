@@ -19,8 +19,8 @@ pub(crate) struct SceneArgs {
     /// Volume, depth images or point clouds. A volume is a .npy file, or a .npz file with one array or an array `grid`:
     /// N×N×N values in [0, 1] (u8: 0 to 255), indexed x, y, z, 0.5 on the surface, 0 if unobserved. With --intrinsics
     /// the files are depth images: PNG, TIFF or .npy with 16 bits per pixel (see --depth-scale), or TIFF, EXR or .npy
-    /// with floats in metres; 0 and NaN mean no reading. With --camera-position they are point clouds: PCD, PLY, .npy, or .npz
-    /// with one array or an array `points`, N×3 or H×W×3, metres.
+    /// with floats in metres; 0 and NaN mean no reading. With --camera-position they are point clouds: PCD, PLY, .npy, or
+    /// .npz with one array or an array `points`, N×3 or H×W×3, metres.
     #[arg(required = true)]
     files: Vec<PathBuf>,
 

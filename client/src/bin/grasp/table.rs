@@ -45,7 +45,8 @@ pub(crate) struct Table {
     #[arg(long, value_name = "METRES", default_value_t = TABLE_HEIGHT)]
     table_height: f64,
 
-    /// Write the pose of the workspace in the frame of the camera, or of the points, to this file: JSON, for `--workspace` of the other commands.
+    /// Write the pose of the workspace in the frame of the camera, or of the points, to this file: JSON, for
+    /// `--workspace` of the other commands.
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
 
@@ -89,11 +90,10 @@ impl Table {
     /// or of the points.
     fn view(&self) -> anyhow::Result<View> {
         if let Some(Numbers(eye)) = self.camera_position {
-            let points: Vec<_> =
-                cloud::read(&self.file)?.into_iter().map(|point| Point3::from(point).cast::<f64>()).collect();
-            let finite: Vec<Point3<f64>> = points.into_iter().filter(|p| p.iter().all(|c| c.is_finite())).collect();
+            let points = cloud::read(&self.file)?.into_iter().map(|point| Point3::from(point).cast::<f64>());
+            let points: Vec<Point3<f64>> = points.filter(|point| point.iter().all(|c| c.is_finite())).collect();
             return in_file(&self.file, |_| {
-                let seen = overview(&finite, &Point3::from(eye));
+                let seen = overview(&points, &Point3::from(eye));
                 seen.context("--camera-position must be the position from which the points were seen")
             });
         }
