@@ -27,6 +27,9 @@ pub(crate) struct Classify {
     /// Name of the network whose grasps the evaluator scores.
     #[arg(long, required_if_eq("network", "evaluator"))]
     proposals_of: Option<String>,
+    /// Start from the weights of this classifier instead of random ones.
+    #[arg(long)]
+    from: Option<PathBuf>,
     /// Files of `grasp-sim candidates`, or for the evaluator folders of `grasp-sim proposals`; several are mixed.
     #[arg(long, required = true, num_args = 1..)]
     data: Vec<PathBuf>,
@@ -127,7 +130,7 @@ impl Classify {
             mirror: self.network == Kind::Evaluator,
             bf16: self.bf16,
         };
-        let mut trainer = ClassifierTrainer::new(self.network.build(self.seed), examples, settings)?;
+        let mut trainer = ClassifierTrainer::new(self.initial_classifier()?, examples, settings)?;
         let (training, held_out) = trainer.candidates();
         ensure!(training > 0, "--val is {}, which leaves no scene for training; use a smaller share", self.val);
         eprintln!(
@@ -149,6 +152,22 @@ impl Classify {
             }
         }
         Ok(())
+    }
+
+    /// The classifier before the first step.
+    fn initial_classifier(&self) -> Result<ModelProto> {
+        let random = self.network.build(self.seed);
+        let Some(path) = &self.from else { return Ok(random) };
+        let model = ModelProto::read(path)?;
+        let nodes = |model: &ModelProto| model.graph.as_ref().map(|graph| graph.node.clone());
+        ensure!(
+            nodes(&model) == nodes(&random),
+            "--from {}: the graph is not that of {}; give a classifier that `grasp-train classify --network {}` wrote",
+            path.display(),
+            self.network.name(),
+            self.network.name()
+        );
+        Ok(model)
     }
 
     fn progress_bar(&self, steps: u64, epoch: u64) -> Result<ProgressBar> {
@@ -177,6 +196,9 @@ impl Classify {
         note("weight_decay", self.weight_decay.to_string());
         note("bf16", self.bf16.to_string());
         note("seed", self.seed.to_string());
+        if let Some(from) = &self.from {
+            note("from", name(from));
+        }
         note("date", OffsetDateTime::now_utc().date().to_string());
         note("trainer", format!("grasp-train {}", env!("CARGO_PKG_VERSION")));
         if let Some(validation) = record.validation {

@@ -162,8 +162,21 @@ fn an_evaluator_separates_full_from_empty_volumes() {
     let scores = evaluator.score(2, |index, patch| Patch::write(&volumes[index], &grasp(0.5).pose, patch)).unwrap();
     assert!(scores[0] > 0.0 && scores[1] < 0.0, "{scores:?}");
 
+    let arguments = "--network evaluator --proposals-of vgn-packed --data proposals --from evaluator.onnx --out \
+                     further.onnx --epochs 1 --lr 1e-9";
+    let output = classify(folder.path(), arguments);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let further = ModelProto::read(&folder.path().join("further.onnx")).unwrap();
+    let from = further.metadata_props.iter().find(|property| property.key() == "graspd.provenance.from").unwrap();
+    assert_eq!(from.value(), "evaluator");
+    let mut further =
+        Classifier::load(&folder.path().join("further.onnx"), &Patch::SHAPE, &Options::default()).unwrap();
+    let again = further.score(2, |index, patch| Patch::write(&volumes[index], &grasp(0.5).pose, patch)).unwrap();
+    assert!(scores.iter().zip(&again).all(|(a, b)| (a - b).abs() < 1e-3), "{scores:?}, {again:?}");
+
     candidate_file(folder.path(), 8);
     for (arguments, expected) in [
+        ("--data walls.npz --from evaluator.onnx --out x.onnx", "the graph is not that of gpd"),
         ("--network evaluator --data proposals --out x.onnx", "--proposals-of"),
         ("--network evaluator --proposals-of vgn --data walls.npz --out x.onnx", "walls.npz: "),
         ("--data proposals --out x.onnx", "proposals: "),
