@@ -5,6 +5,7 @@
 
 #![warn(missing_docs)]
 
+mod bounded;
 mod error;
 mod grasps;
 mod labels;
@@ -29,6 +30,7 @@ pub mod oip {
     tonic::include_proto!("inference");
 }
 
+pub use bounded::{BoundedCodec, BoundedDecoder};
 pub use error::{FieldError, on_a_line};
 pub use grasps::{Candidate, candidates};
 pub use options::{Collision, DetectParams, TABLE_HEIGHT};

@@ -46,6 +46,8 @@ pub(crate) struct Config {
     pub tokens: Option<Arc<Tokens>>,
     pub max_connections: usize,
     pub limits: Limits,
+    /// Messages that are being received, together, bytes.
+    pub max_receiving_bytes: usize,
     /// Concurrent TrackGrasps streams, each with one volume.
     pub max_tracked: usize,
     /// Time without a request after which a TrackGrasps stream ends.
@@ -68,6 +70,10 @@ impl Config {
         let flags: Flags = ConfigErrors::parse()?;
         if let Some(name) = &flags.default_model {
             flags.models.store.get(name, None).map_err(ConfigErrors::of_default_model)?;
+        }
+        let (receiving, message) = (flags.max_receiving_bytes.get(), flags.max_message_bytes.get());
+        if receiving / 2 < message {
+            return Err(ConfigErrors::of_receiving_bytes(receiving, message));
         }
         Ok(flags.into())
     }
@@ -105,6 +111,7 @@ impl From<Flags> for Config {
             tls,
             max_connections: flags.max_connections.get(),
             limits: Limits { message_bytes: flags.max_message_bytes.get(), stall: flags.stall_timeout },
+            max_receiving_bytes: flags.max_receiving_bytes.get(),
             max_tracked: flags.max_tracked.into(),
             track_timeout: flags.track_timeout,
             recent: flags.recent.unwrap_or(if flags.token_file.is_some() { 0 } else { RECENT }),

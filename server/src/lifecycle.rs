@@ -110,7 +110,13 @@ async fn serve(
     if let Some(tokens) = tokens {
         tokio::spawn(Arc::clone(tokens).watch(self::hangup().context("cannot install a signal handler")?));
     }
-    let grpc_config = GrpcConfig { tls: tls.clone(), tokens: tokens.clone(), connections, limits: *limits };
+    let grpc_config = GrpcConfig {
+        tls: tls.clone(),
+        tokens: tokens.clone(),
+        connections,
+        receiving_bytes: config.max_receiving_bytes,
+        limits: *limits,
+    };
     let mut grpc =
         tokio::spawn(listener::serve(grpc, grpc_config, service, inference, Arc::clone(metrics), state.clone()));
 

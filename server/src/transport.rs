@@ -3,6 +3,7 @@
 pub(crate) mod connections;
 pub(crate) mod deadline;
 pub(crate) mod listener;
+pub(crate) mod receive_budget;
 pub(crate) mod request_body;
 pub(crate) mod response_buffer;
 pub(crate) mod tokens;

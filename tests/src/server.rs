@@ -98,13 +98,22 @@ impl Server {
     /// # Panics
     /// If the metric does not have the value within a minute.
     pub async fn wait_for(&self, series: &str, value: f64) {
+        self.wait_until(series, |now| now == value).await;
+    }
+
+    /// Waits until a metric has a value that fits, and returns it.
+    ///
+    /// # Panics
+    /// If that takes a minute.
+    pub async fn wait_until(&self, series: &str, fits: impl Fn(f64) -> bool) -> f64 {
         for _ in 0..6000 {
-            if self.metric(series) == value {
-                return;
+            let value = self.metric(series);
+            if fits(value) {
+                return value;
             }
             tokio::time::sleep(std::time::Duration::from_millis(10)).await;
         }
-        panic!("{series} is {}, not {value}", self.metric(series));
+        panic!("{series} is {}", self.metric(series));
     }
 
     /// The folder of the models.

@@ -194,6 +194,52 @@ async fn incomplete_messages_are_refused_after_the_stall_timeout() {
 }
 
 #[tokio::test]
+async fn the_memory_of_incomplete_messages_is_bounded_and_shared() {
+    const MESSAGE: usize = 1 << 20;
+    const BUDGET: usize = 4 * MESSAGE;
+    let budget = BUDGET.to_string();
+    let server = Server::run(
+        &[TestModel::new("mirror")],
+        &["--max-message-bytes", "1048576", "--max-receiving-bytes", &budget, "--stall-timeout", "5"],
+    );
+    let mut incomplete = vec![0];
+    incomplete.extend((MESSAGE as u32).to_be_bytes());
+    incomplete.resize(4 + MESSAGE, 0);
+    let incomplete: &'static [u8] = incomplete.leak();
+
+    let mut flood = connect(&server).await;
+    let mut calls = Vec::new();
+    for _ in 0..32 {
+        let mut flood = flood.clone();
+        calls.push(tokio::spawn(async move {
+            call("1M", &mut flood, "DetectGrasps", &[incomplete], Duration::ZERO, false).await
+        }));
+    }
+    let used = server.wait_until("graspd_receiving_bytes", |bytes| bytes > MESSAGE as f64).await;
+    assert!(used <= (BUDGET / 2) as f64, "{used} bytes on one connection");
+    // Others are served, also with the largest message.
+    let other = server.client().await;
+    other.detect(&volume(), Options::default()).await.unwrap();
+    let padded = pb::DetectGraspsRequest { request_id: "x".repeat(MESSAGE - 4), ..Default::default() };
+    let code = server.raw().await.detect_grasps(padded).await.unwrap_err().code();
+    assert_eq!(code, Code::InvalidArgument, "the request id is too long, which only a received message can show");
+
+    let mut codes = Vec::new();
+    for call in calls {
+        let (code, message) = call.await.unwrap();
+        assert!(code != Code::ResourceExhausted || message.contains("--max-receiving-bytes"), "{message}");
+        codes.push(code);
+    }
+    let count = |code: Code| codes.iter().filter(|known| **known == code).count();
+    assert!(count(Code::ResourceExhausted) >= 30 && count(Code::DeadlineExceeded) >= 1, "{codes:?}");
+    assert_eq!(count(Code::ResourceExhausted) + count(Code::DeadlineExceeded), 32, "{codes:?}");
+    server.wait_for("graspd_receiving_bytes", 0.0).await;
+    assert_eq!(server.metric("graspd_receiving_limit_bytes"), BUDGET as f64);
+    let (code, _) = call("1M", &mut flood, "DetectGrasps", &[&[0, 0, 0, 0, 0]], Duration::ZERO, true).await;
+    assert_eq!(code, Code::InvalidArgument, "the connection is still served");
+}
+
+#[tokio::test]
 async fn incomplete_messages_are_refused_at_the_deadline_of_the_request() {
     let server = Server::run(&[TestModel::new("mirror")], &[]);
     let mut h2 = connect(&server).await;

@@ -1,12 +1,18 @@
 //! Size limits, at the exact boundaries.
 
-use grasp_proto::{encode, pb};
+use std::collections::BTreeMap;
+
+use grasp_proto::{FILE_DESCRIPTOR_SET, encode, pb};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
 use nalgebra::Isometry3;
 use prost::Message;
+use prost::bytes::{Buf, BufMut, Bytes};
+use prost::encoding::WireType;
+use prost_types::field_descriptor_proto::{Label, Type};
+use prost_types::{DescriptorProto, FileDescriptorSet};
 use tokio_stream::StreamExt;
-use tonic::Code;
-use tonic::codec::CompressionEncoding;
+use tonic::codec::{Codec, CompressionEncoding, DecodeBuf, Decoder, EncodeBuf, Encoder};
+use tonic::{Code, Request, Status};
 
 fn request(padding: usize) -> pb::DetectGraspsRequest {
     let volume = encode(&blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]]), pb::DataType::F32, "");
@@ -51,6 +57,115 @@ async fn compressed_messages_are_accepted_up_to_the_limit_of_their_content() {
     }
     assert_eq!(server.metric("graspd_requests_total{code=\"INVALID_ARGUMENT\",model=\"\"}"), 6.0);
     assert!(grasp_tests::peak_bytes(server.id()) < 200 << 20, "the bombs were not decompressed");
+}
+
+/// Passes encoded messages on.
+#[derive(Default)]
+struct Encoded;
+
+impl Codec for Encoded {
+    type Encode = Bytes;
+    type Decode = Bytes;
+    type Encoder = Self;
+    type Decoder = Self;
+
+    fn encoder(&mut self) -> Self {
+        Self
+    }
+
+    fn decoder(&mut self) -> Self {
+        Self
+    }
+}
+
+impl Encoder for Encoded {
+    type Item = Bytes;
+    type Error = Status;
+
+    fn encode(&mut self, message: Bytes, buffer: &mut EncodeBuf<'_>) -> Result<(), Status> {
+        buffer.put(message);
+        Ok(())
+    }
+}
+
+impl Decoder for Encoded {
+    type Item = Bytes;
+    type Error = Status;
+
+    fn decode(&mut self, buffer: &mut DecodeBuf<'_>) -> Result<Option<Bytes>, Status> {
+        Ok(Some(buffer.copy_to_bytes(buffer.remaining())))
+    }
+}
+
+/// Adds a message and the messages declared in it, by their full names.
+fn collect<'a>(message: &'a DescriptorProto, scope: &str, messages: &mut BTreeMap<String, &'a DescriptorProto>) {
+    let name = format!("{scope}.{}", message.name());
+    message.nested_type.iter().for_each(|nested| collect(nested, &name, messages));
+    messages.insert(name, message);
+}
+
+/// Many empty or small elements of each repeated field of a message and of the messages in it: the path of the field
+/// and the encoded message of about `size` bytes.
+fn floods(messages: &BTreeMap<String, &DescriptorProto>, message: &str, size: usize) -> Vec<(String, Vec<u8>)> {
+    let mut all = Vec::new();
+    for field in &messages[message].field {
+        let prefixed = |content: &[u8]| {
+            let mut bytes = Vec::new();
+            prost::encoding::encode_key(field.number() as u32, WireType::LengthDelimited, &mut bytes);
+            prost::encode_length_delimiter(content.len(), &mut bytes).unwrap();
+            bytes.extend(content);
+            bytes
+        };
+        let is_length_delimited = matches!(field.r#type(), Type::Message | Type::String | Type::Bytes);
+        // These numbers are not larger in memory than in the message.
+        if field.label() == Label::Repeated && !matches!(field.r#type(), Type::Bool | Type::Float | Type::Double) {
+            let many = if is_length_delimited { prefixed(&[]).repeat(size / 2) } else { prefixed(&vec![1; size]) };
+            all.push((field.name().to_owned(), many));
+        }
+        if field.r#type() == Type::Message {
+            let inner = floods(messages, field.type_name(), size);
+            all.extend(inner.into_iter().map(|(path, bytes)| (format!("{}.{path}", field.name()), prefixed(&bytes))));
+        }
+    }
+    all
+}
+
+#[tokio::test]
+async fn a_message_of_many_small_elements_is_refused_before_it_is_decoded() {
+    const SIZE: usize = 15 << 20;
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let channel = server.channel().await;
+    let files = FileDescriptorSet::decode(FILE_DESCRIPTOR_SET).unwrap();
+    let mut messages = BTreeMap::new();
+    for file in &files.file {
+        file.message_type.iter().for_each(|message| collect(message, &format!(".{}", file.package()), &mut messages));
+    }
+    let before = grasp_tests::peak_bytes(server.id());
+    let mut paths = Vec::new();
+    for file in &files.file {
+        for service in &file.service {
+            for method in &service.method {
+                let path = format!("/{}.{}/{}", file.package(), service.name(), method.name());
+                for (field, message) in floods(&messages, method.input_type(), SIZE) {
+                    let mut client = tonic::client::Grpc::new(channel.clone());
+                    client.ready().await.unwrap();
+                    let request = Request::new(tokio_stream::once(Bytes::from(message)));
+                    let replies = client.streaming(request, path.parse().unwrap(), Encoded).await;
+                    let status = match replies {
+                        Ok(replies) => replies.into_inner().next().await.and_then(Result::err),
+                        Err(status) => Some(status),
+                    };
+                    let status = status.unwrap_or_else(|| panic!("{path}: {field} was accepted"));
+                    assert_eq!(status.code(), Code::InvalidArgument, "{path}: {field}: {status}");
+                    paths.push(field);
+                }
+            }
+        }
+    }
+    let peak = grasp_tests::peak_bytes(server.id()) - before;
+    println!("{} fields, {} MiB above {} MiB", paths.len(), peak >> 20, before >> 20);
+    assert!(paths.iter().any(|path| path == "inputs.contents.int64_contents") && paths.len() > 20, "{paths:?}");
+    assert!(peak < 3 * SIZE as u64, "{} MiB for messages of {} MiB", peak >> 20, SIZE >> 20);
 }
 
 #[tokio::test]

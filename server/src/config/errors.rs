@@ -40,6 +40,14 @@ impl ConfigErrors {
         Self(vec![format!("--default-model (GRASPD_DEFAULT_MODEL): {error}")])
     }
 
+    pub(super) fn of_receiving_bytes(bytes: usize, message: usize) -> Self {
+        Self(vec![format!(
+            "--max-receiving-bytes (GRASPD_MAX_RECEIVING_BYTES) is `{bytes}`: must be at least twice --max-message-bytes, \
+             {}",
+            message.saturating_mul(2)
+        )])
+    }
+
     fn add(&mut self, flag: &Arg, error: impl Display) {
         let name = flag.get_long().unwrap_or_default();
         let variable = flag.get_env().unwrap_or_default().to_string_lossy();

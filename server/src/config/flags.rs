@@ -172,6 +172,11 @@ pub(super) struct Flags {
     #[arg(long, env = "GRASPD_MAX_MESSAGE_BYTES", value_name = "N", default_value = "16777216")]
     pub max_message_bytes: NonZeroUsize,
 
+    /// Maximum number of received bytes of messages that are not complete yet, on all connections together. Messages
+    /// beyond it are refused. A connection may use half of what the others leave.
+    #[arg(long, env = "GRASPD_MAX_RECEIVING_BYTES", value_name = "N", default_value = "268435456")]
+    pub max_receiving_bytes: NonZeroUsize,
+
     /// Time that accepted requests have to finish after SIGTERM, seconds.
     #[arg(
         long,

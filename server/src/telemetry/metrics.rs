@@ -1,3 +1,4 @@
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
@@ -15,6 +16,7 @@ use tracing_appender::non_blocking::ErrorCounter;
 use crate::readiness::State;
 use crate::telemetry::timings::StageTimings;
 use crate::transport::connections::ConnectionLimit;
+use crate::transport::receive_budget::ReceiveBudget;
 
 /// Seconds: from the fastest stages to a full queue of a large network on a slow CPU.
 const BUCKETS: [f64; 33] = [
@@ -41,6 +43,8 @@ pub(crate) struct Metrics {
     reloads: IntCounterVec,
     rejected: IntGauge,
     connections: IntGauge,
+    receiving: IntGauge,
+    receiving_limit: IntGauge,
     connections_limit: IntGauge,
     connections_refused: IntCounter,
     ready: IntGauge,
@@ -107,6 +111,8 @@ impl Metrics {
             ),
             rejected: gauge("graspd_rejected_files", "Model files that could not be loaded at the last reload."),
             connections: gauge("graspd_connections", "Open connections to the gRPC listener."),
+            receiving: gauge("graspd_receiving_bytes", "Received bytes of messages that are not complete yet."),
+            receiving_limit: gauge("graspd_receiving_limit_bytes", "Maximum of graspd_receiving_bytes."),
             connections_limit: gauge("graspd_connections_limit", "Maximum number of open connections."),
             connections_refused: counter(
                 "graspd_connections_refused_total",
@@ -190,6 +196,12 @@ impl Metrics {
     pub fn connections(&self, limit: usize, timeout: Duration) -> ConnectionLimit {
         self.connections_limit.set(i64::try_from(limit).unwrap_or(i64::MAX));
         ConnectionLimit { limit, timeout, open: self.connections.clone(), refused: self.connections_refused.clone() }
+    }
+
+    /// A budget of `capacity` bytes for messages that are being received, with its metrics.
+    pub fn receiving(&self, capacity: usize) -> Arc<ReceiveBudget> {
+        self.receiving_limit.set(i64::try_from(capacity).unwrap_or(i64::MAX));
+        ReceiveBudget::new(capacity, self.receiving.clone())
     }
 
     /// The gauge of open TrackGrasps streams.

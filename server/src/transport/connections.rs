@@ -1,15 +1,19 @@
 use std::io;
 use std::pin::Pin;
+use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
+use http::Extensions;
 use prometheus::{IntCounter, IntGauge};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::{Sleep, sleep};
 use tokio_stream::{Stream, StreamExt};
-use tonic::transport::server::{Connected, TcpConnectInfo, TcpIncoming};
+use tonic::transport::server::{Connected, TcpIncoming, TlsConnectInfo};
 use tracing::warn;
+
+use crate::transport::receive_budget::{ConnectionShare, ReceiveBudget};
 
 /// The limit on open connections, with its metrics.
 pub(crate) struct ConnectionLimit {
@@ -22,7 +26,11 @@ pub(crate) struct ConnectionLimit {
 
 /// Accepts the connections of a listener. Connections beyond the limit are closed immediately, which clients report as
 /// UNAVAILABLE.
-pub(crate) fn accept(listener: TcpListener, limit: ConnectionLimit) -> impl Stream<Item = io::Result<Connection>> {
+pub(crate) fn accept(
+    listener: TcpListener,
+    limit: ConnectionLimit,
+    budget: Arc<ReceiveBudget>,
+) -> impl Stream<Item = io::Result<Connection>> {
     let ConnectionLimit { limit, timeout, open, refused } = limit;
     // `Server::tcp_nodelay` has no effect on a listener that is already bound. Without TCP_NODELAY, a response of
     // several packets is delayed by 40 ms until the client acknowledges the first.
@@ -36,7 +44,7 @@ pub(crate) fn accept(listener: TcpListener, limit: ConnectionLimit) -> impl Stre
     });
     accepted.filter_map(move |accepted| match accepted {
         Ok(stream) if open.get() < i64::try_from(limit).unwrap_or(i64::MAX) => {
-            Some(Ok(Connection::new(stream, timeout, &open)))
+            Some(Ok(Connection::new(stream, timeout, &open, &budget)))
         }
         Ok(_) => {
             refused.inc();
@@ -60,12 +68,27 @@ pub(crate) struct Connection {
     /// Missing bytes of the preface and their timeout; None after the preface.
     preface: Option<(usize, Pin<Box<Sleep>>)>,
     open: IntGauge,
+    peer: Peer,
+}
+
+/// The client of a connection.
+#[derive(Clone)]
+pub(crate) struct Peer {
+    pub share: ConnectionShare,
+}
+
+impl Peer {
+    /// The client that sent a request.
+    pub fn of(extensions: &Extensions) -> Option<&Self> {
+        extensions.get().or_else(|| extensions.get::<TlsConnectInfo<Self>>().map(TlsConnectInfo::get_ref))
+    }
 }
 
 impl Connection {
-    fn new(stream: TcpStream, timeout: Duration, open: &IntGauge) -> Self {
+    fn new(stream: TcpStream, timeout: Duration, open: &IntGauge, budget: &Arc<ReceiveBudget>) -> Self {
         open.inc();
-        Self { stream, preface: Some((PREFACE, Box::pin(sleep(timeout)))), open: open.clone() }
+        let peer = Peer { share: budget.connection() };
+        Self { stream, preface: Some((PREFACE, Box::pin(sleep(timeout)))), open: open.clone(), peer }
     }
 }
 
@@ -76,10 +99,10 @@ impl Drop for Connection {
 }
 
 impl Connected for Connection {
-    type ConnectInfo = TcpConnectInfo;
+    type ConnectInfo = Peer;
 
-    fn connect_info(&self) -> TcpConnectInfo {
-        self.stream.connect_info()
+    fn connect_info(&self) -> Peer {
+        self.peer.clone()
     }
 }
 
@@ -139,6 +162,10 @@ mod tests {
 
     use super::*;
 
+    fn budget() -> Arc<ReceiveBudget> {
+        ReceiveBudget::new(1, IntGauge::new("receiving", "Bytes.").unwrap())
+    }
+
     #[tokio::test(start_paused = true)]
     async fn a_connection_without_a_preface_ends_after_the_timeout() {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -146,7 +173,7 @@ mod tests {
         let open = IntGauge::new("open", "Open connections.").unwrap();
         let refused = IntCounter::new("refused", "Refused connections.").unwrap();
         let timeout = Duration::from_secs(10);
-        let mut incoming = pin!(accept(listener, ConnectionLimit { limit: 1, timeout, open, refused }));
+        let mut incoming = pin!(accept(listener, ConnectionLimit { limit: 1, timeout, open, refused }, budget()));
 
         let _silent = TcpStream::connect(address).await.unwrap();
         let mut connection = incoming.next().await.unwrap().unwrap();
@@ -167,7 +194,7 @@ mod tests {
             open: open.clone(),
             refused: refused.clone(),
         };
-        let mut incoming = pin!(accept(listener, limit));
+        let mut incoming = pin!(accept(listener, limit, budget()));
 
         let _first = TcpStream::connect(address).await.unwrap();
         let connection = incoming.next().await.unwrap().unwrap();

@@ -18,6 +18,7 @@ use crate::readiness::{Health, State, draining};
 use crate::rpc::grasp_service::GraspRpc;
 use crate::rpc::inference_service::InferenceRpc;
 use crate::telemetry::metrics::Metrics;
+use crate::transport::connections::Peer;
 use crate::transport::request_body::{Limits, RequestBody};
 use crate::transport::response_buffer::keep_permit;
 use crate::transport::tokens::Tokens;
@@ -44,6 +45,8 @@ pub(crate) struct GrpcConfig {
     pub tokens: Option<Arc<Tokens>>,
     /// Maximum number of open connections.
     pub connections: usize,
+    /// Maximum number of bytes of messages that are being received.
+    pub receiving_bytes: usize,
     pub limits: Limits,
 }
 
@@ -56,7 +59,7 @@ pub(crate) async fn serve(
     metrics: Arc<Metrics>,
     state: watch::Receiver<State>,
 ) -> anyhow::Result<()> {
-    let GrpcConfig { tls, tokens, connections, limits } = config;
+    let GrpcConfig { tls, tokens, connections, receiving_bytes, limits } = config;
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
@@ -68,7 +71,8 @@ pub(crate) async fn serve(
     let grasps = grasps.accept_compressed(CompressionEncoding::Gzip).accept_compressed(CompressionEncoding::Zstd);
     let inference = inference.accept_compressed(CompressionEncoding::Gzip).accept_compressed(CompressionEncoding::Zstd);
     let guard = tokens::guard(tokens, Arc::clone(&metrics));
-    let incoming = connections::accept(listener, metrics.connections(connections, limits.stall));
+    let budget = metrics.receiving(receiving_bytes);
+    let incoming = connections::accept(listener, metrics.connections(connections, limits.stall), Arc::clone(&budget));
     let counted = Arc::clone(&metrics);
     let outgoing = MapResponseLayer::new(move |response| keep_permit(request_body::unreadable(response, &counted)));
     let intake = MapRequestLayer::new(move |request: http::Request<Body>| {
@@ -77,7 +81,9 @@ pub(crate) async fn serve(
         if let Some(deadline) = deadline {
             parts.extensions.insert(deadline);
         }
-        let body = RequestBody::new(parts.uri.path(), body, deadline, limits, Arc::clone(&metrics));
+        // Every request belongs to a connection.
+        let share = Peer::of(&parts.extensions).map_or_else(|| budget.connection(), |peer| peer.share.clone());
+        let body = RequestBody::new(parts.uri.path(), body, deadline, limits, share, Arc::clone(&metrics));
         http::Request::from_parts(parts, Body::new(body))
     });
     let mut server = Server::builder();

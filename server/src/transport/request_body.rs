@@ -14,6 +14,7 @@ use tonic::{Code, Status};
 
 use crate::telemetry::metrics::Metrics;
 use crate::transport::deadline::Deadline;
+use crate::transport::receive_budget::{ConnectionShare, Received};
 
 /// Length of a gRPC message's prefix: the compression flag, then the message's length as a big-endian u32.
 const PREFIX: usize = 5;
@@ -43,6 +44,8 @@ pub(crate) struct RequestBody {
     /// Whether pauses between messages are allowed, as in a client stream.
     is_stream: bool,
     message: Message,
+    /// The memory of the current message.
+    received: Received,
     /// Since when the server has been waiting for the client.
     since: Option<Instant>,
     /// Time that the server has waited for the client within this message. Time in which the server does not read is
@@ -73,7 +76,14 @@ struct Message {
 
 impl RequestBody {
     /// The body of a request for a method at `path`.
-    pub fn new(path: &str, body: Body, deadline: Option<Deadline>, limits: Limits, metrics: Arc<Metrics>) -> Self {
+    pub fn new(
+        path: &str,
+        body: Body,
+        deadline: Option<Deadline>,
+        limits: Limits,
+        share: ConnectionShare,
+        metrics: Arc<Metrics>,
+    ) -> Self {
         let is_stream = STREAMS.iter().any(|stream| path.ends_with(stream));
         Self {
             body,
@@ -83,6 +93,7 @@ impl RequestBody {
             metrics,
             is_stream,
             message: Message::default(),
+            received: share.message(),
             since: None,
             waited: Duration::ZERO,
             timeout: Box::pin(sleep(Duration::ZERO)),
@@ -104,6 +115,7 @@ impl RequestBody {
 
     fn refuse(&mut self, status: Status) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
         self.state = State::Refused;
+        self.received.clear();
         self.metrics.ended("", status.code());
         Poll::Ready(Some(Err(status)))
     }
@@ -262,6 +274,12 @@ impl http_body::Body for RequestBody {
         }
         if this.message.number != before {
             this.waited = Duration::ZERO;
+            this.received.clear();
+        }
+        if !this.message.has_begun() {
+            this.received.clear();
+        } else if let Err(status) = this.received.add(data.len()) {
+            return this.refuse(status);
         }
         Poll::Ready(frame)
     }
@@ -309,7 +327,8 @@ mod tests {
         let (log, _guard) = tracing_appender::non_blocking(io::sink());
         let metrics = Arc::new(Metrics::new(log.error_counter()));
         let limits = Limits { message_bytes: 1 << 20, stall: STALL };
-        (RequestBody::new(path, Body::new(Sent(data)), None, limits, metrics), sender)
+        let share = metrics.receiving(4 << 20).connection();
+        (RequestBody::new(path, Body::new(Sent(data)), None, limits, share, metrics), sender)
     }
 
     /// Reads to the end. Returns the refusal, if there is one, and the seconds until then.
