@@ -33,5 +33,5 @@ pub use runtime::{
     Backend, BackendError, Choice, Classifier, INPUT, LoadError, LoadReason, NameError, Network, OUTPUTS, Options,
     Output, Precision, Provider, RuntimeError, RuntimeInfo, batch_sizes, init,
 };
-pub use store::{Entry, EntryError, Scan, Store, StoreError};
+pub use store::{Entry, EntryError, MAX_MODEL_BYTES, Scan, Store, StoreError, read_regular_file};
 pub use upsampling::{upsampled_convolutions, upsampled_taps};

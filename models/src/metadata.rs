@@ -51,6 +51,9 @@ pub enum MetadataError {
     Resolution(usize),
 }
 
+/// Maximum length of a name or version, bytes.
+const MAX_NAME: usize = 128;
+
 pub(crate) const PREFIX: &str = "graspd.";
 pub(crate) const PROVENANCE: &str = "provenance.";
 
@@ -92,8 +95,8 @@ impl Metadata {
         for (key, value) in properties {
             let Some(key) = key.strip_prefix(PREFIX) else { continue };
             match key {
-                "name" => metadata.name = value,
-                "version" => metadata.version = value,
+                "name" => metadata.name = printable("name", value)?,
+                "version" => metadata.version = printable("version", value)?,
                 "resolution" => {
                     let resolution = parse("resolution", &value, "a whole number of voxels above 0", |&n| n > 0)?;
                     metadata.resolution = check_resolution(resolution)?;
@@ -122,7 +125,7 @@ impl Metadata {
                         parse("camera_azimuth", &value, "a number of degrees", |angle: &f64| angle.is_finite())?;
                     metadata.camera_azimuth = Some(azimuth);
                 }
-                "network" => metadata.network = Some(value),
+                "network" => metadata.network = Some(printable("network", value)?),
                 // Only checked here; the classifier reads it.
                 "calibration" => {
                     if let Err(expected) = value.parse::<Calibration>() {
@@ -177,6 +180,16 @@ fn fixed_resolution(input: &ValueInfoProto) -> Option<usize> {
         Some(DimensionValue::DimValue(size)) => usize::try_from(size).ok().filter(|&size| size > 0),
         _ => None,
     }
+}
+
+/// Names and versions are labels of metrics and parts of log lines, so their length and characters are limited.
+fn printable(key: &'static str, value: String) -> Result<String, MetadataError> {
+    let is_printable = |character: char| !character.is_control() && !character.is_whitespace() || character == ' ';
+    if value.len() <= MAX_NAME && value.chars().all(is_printable) {
+        return Ok(value);
+    }
+    let value = format!("{}…", value.chars().take(20).collect::<String>().escape_debug());
+    Err(MetadataError::Property { key, value, expected: "at most 128 bytes of printable characters" })
 }
 
 /// Checked when the file is read, so that a server does not start with a network that no request can use.

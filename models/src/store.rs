@@ -1,6 +1,9 @@
 use std::cmp::Ordering;
+use std::fs::{self, OpenOptions};
+use std::io::{self, Read};
+#[cfg(unix)]
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
-use std::{fs, io};
 
 use sha2::{Digest, Sha256};
 use thiserror::Error;
@@ -8,6 +11,9 @@ use thiserror::Error;
 use crate::onnx::{FileError, ModelProto};
 use crate::runtime::LoadReason;
 use crate::{Metadata, MetadataError};
+
+/// Default limit on the size of a model file, bytes.
+pub const MAX_MODEL_BYTES: u64 = 1 << 30;
 
 /// The models in a folder with their metadata. Nothing is loaded into ONNX Runtime.
 #[derive(Clone, Debug)]
@@ -25,6 +31,8 @@ pub struct Entry {
     pub metadata: Metadata,
     /// SHA-256 of the file, in hexadecimal.
     pub sha256: String,
+    /// Size of the file, bytes.
+    pub size: u64,
 }
 
 /// Why a folder of models cannot be used.
@@ -125,11 +133,11 @@ pub struct Scan {
 }
 
 impl Scan {
-    /// Reads every `*.onnx` file of a folder.
+    /// Reads every `*.onnx` file of a folder of at most `max_bytes`.
     ///
     /// # Errors
     /// [`StoreError`] if the folder cannot be read or holds no such file.
-    pub fn read(directory: &Path) -> Result<Self, StoreError> {
+    pub fn read(directory: &Path, max_bytes: u64) -> Result<Self, StoreError> {
         let files = fs::read_dir(directory).and_then(|files| files.map(|file| Ok(file?.path())).collect());
         let mut paths: Vec<PathBuf> = files.map_err(|source| StoreError::Io { path: directory.to_owned(), source })?;
         paths.retain(|path| path.extension().is_some_and(|extension| extension == "onnx"));
@@ -140,7 +148,7 @@ impl Scan {
         paths.sort();
         let (mut entries, mut rejected) = (Vec::<Entry>::new(), Vec::new());
         for path in paths {
-            match Entry::read(path) {
+            match Entry::read(path, max_bytes) {
                 Ok(entry) => entries.push(entry),
                 Err(error) => rejected.push(error),
             }
@@ -163,12 +171,20 @@ impl Scan {
 }
 
 impl Store {
-    /// Reads every `*.onnx` file of a folder. Each must be a valid model.
+    /// Reads every `*.onnx` file of a folder. Each must be a valid model of at most [`MAX_MODEL_BYTES`].
     ///
     /// # Errors
     /// [`StoreError`] names every invalid file, or the folder if it cannot be read.
     pub fn open(directory: &Path) -> Result<Self, StoreError> {
-        let Scan { entries, rejected } = Scan::read(directory)?;
+        Self::open_limited(directory, MAX_MODEL_BYTES)
+    }
+
+    /// Like [`open`](Self::open), for files of at most `max_bytes`.
+    ///
+    /// # Errors
+    /// [`StoreError`] names every invalid file, or the folder if it cannot be read.
+    pub fn open_limited(directory: &Path, max_bytes: u64) -> Result<Self, StoreError> {
+        let Scan { entries, rejected } = Scan::read(directory, max_bytes)?;
         let directory = directory.to_owned();
         if rejected.is_empty() {
             Ok(Self { directory, entries })
@@ -211,21 +227,22 @@ impl Store {
 }
 
 impl Entry {
-    fn read(path: PathBuf) -> Result<Self, EntryError> {
+    fn read(path: PathBuf, max_bytes: u64) -> Result<Self, EntryError> {
         // Read once, so that hash and model belong to the same content.
-        let bytes = fs::read(&path).map_err(|source| FileError::Io { path: path.clone(), source })?;
+        let bytes =
+            read_regular_file(&path, max_bytes).map_err(|source| FileError::Io { path: path.clone(), source })?;
         let model =
             ModelProto::from_bytes(&bytes).map_err(|reason| FileError::Decode { path: path.clone(), reason })?;
         let metadata = match Metadata::of(&model, &path) {
             Ok(metadata) => metadata,
             Err(source) => return Err(EntryError::Metadata { path, source }),
         };
-        Ok(Self { path, metadata, sha256: sha256(&bytes) })
+        Ok(Self { path, metadata, sha256: sha256(&bytes), size: bytes.len() as u64 })
     }
 
     /// The content of the file. An error if it changed since the folder was read.
     pub(crate) fn bytes(&self) -> Result<Vec<u8>, LoadReason> {
-        let bytes = fs::read(&self.path)?;
+        let bytes = read_regular_file(&self.path, self.size)?;
         let found = sha256(&bytes);
         if found == self.sha256 { Ok(bytes) } else { Err(LoadReason::Changed { expected: self.sha256.clone(), found }) }
     }
@@ -239,6 +256,34 @@ impl Entry {
     pub fn by_version(&self, other: &Self) -> Ordering {
         compare_versions(&self.metadata.version, &other.metadata.version)
     }
+}
+
+/// Reads a file of at most `max_bytes`. Other kinds of files are refused: reading a named pipe may never end, and
+/// neither does a device.
+///
+/// # Errors
+/// If it is not a regular file, is too large, or cannot be read.
+pub fn read_regular_file(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
+    let mut options = OpenOptions::new();
+    options.read(true);
+    // Without it, opening a named pipe waits for a writer.
+    #[cfg(unix)]
+    options.custom_flags(rustix::fs::OFlags::NONBLOCK.bits().cast_signed());
+    let file = options.open(path)?;
+    let metadata = file.metadata()?;
+    if !metadata.is_file() {
+        return Err(io::Error::other("is not a regular file"));
+    }
+    let mut bytes = Vec::new();
+    // The file may grow while it is read.
+    if metadata.len() <= max_bytes {
+        file.take(max_bytes.saturating_add(1)).read_to_end(&mut bytes)?;
+    }
+    let size = metadata.len().max(bytes.len() as u64);
+    if size > max_bytes {
+        return Err(io::Error::other(format!("has {size} bytes, must have at most {max_bytes}")));
+    }
+    Ok(bytes)
 }
 
 fn sha256(bytes: &[u8]) -> String {

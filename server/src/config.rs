@@ -11,7 +11,7 @@ use grasp_models::{Choice, Precision, Provider, Store};
 use tonic::transport::{Certificate, Identity, ServerTlsConfig};
 
 use crate::serving::queue::Batching;
-use crate::serving::stamps::Stamps;
+use crate::serving::stamps::{Stamps, stamps};
 use crate::transport::request_body::Limits;
 use crate::transport::tokens::Tokens;
 use errors::ConfigErrors;
@@ -23,9 +23,15 @@ pub(crate) struct Config {
     pub store: Store,
     /// Taken before the store's files were read.
     pub stamps: Stamps,
+    /// Maximum size of a model file.
+    pub max_model_bytes: u64,
+    /// Time after which a reload no longer delays the next one.
+    pub reload_timeout: Duration,
     pub default_model: Option<String>,
     pub listen: SocketAddr,
     pub http: SocketAddr,
+    /// Further names of the HTTP listener.
+    pub http_hosts: Vec<String>,
     /// Sessions per model.
     pub workers: usize,
     /// Threads per session.
@@ -68,19 +74,32 @@ impl Config {
     /// Reads the command line and the environment. The process ends on `--help` and on unknown flags.
     pub fn from_args() -> Result<Self, ConfigErrors> {
         let flags: Flags = ConfigErrors::parse()?;
-        if let Some(name) = &flags.default_model {
-            flags.models.store.get(name, None).map_err(ConfigErrors::of_default_model)?;
-        }
+        let mut errors = ConfigErrors::default();
         let (receiving, message) = (flags.max_receiving_bytes.get(), flags.max_message_bytes.get());
         if receiving / 2 < message {
-            return Err(ConfigErrors::of_receiving_bytes(receiving, message));
+            let least = message.saturating_mul(2);
+            errors.add::<Flags>(
+                "max_receiving_bytes",
+                format_args!("is `{receiving}`: must be at least twice --max-message-bytes, {least}"),
+            );
         }
-        Ok(flags.into())
+        let stamps = stamps(&flags.models);
+        let store = Store::open_limited(&flags.models, flags.max_model_bytes);
+        let store = store.inspect_err(|error| {
+            errors.add::<Flags>("models", format_args!("is `{}`: {error}", flags.models.display()));
+        });
+        if let (Some(name), Ok(store)) = (&flags.default_model, &store)
+            && let Err(error) = store.get(name, None)
+        {
+            errors.add::<Flags>("default_model", format_args!("is `{name}`: {error}"));
+        }
+        match store {
+            Ok(store) if errors.is_empty() => Ok(Self::new(flags, store, stamps)),
+            _ => Err(errors),
+        }
     }
-}
 
-impl From<Flags> for Config {
-    fn from(flags: Flags) -> Self {
+    fn new(flags: Flags, store: Store, stamps: Stamps) -> Self {
         let cpus = available_parallelism().map_or(1, NonZeroUsize::get);
         let workers = usize::from(flags.workers);
         let Choice(provider) = flags.provider;
@@ -94,11 +113,14 @@ impl From<Flags> for Config {
             }
         });
         Self {
-            store: flags.models.store,
-            stamps: flags.models.stamps,
+            store,
+            stamps,
+            max_model_bytes: flags.max_model_bytes,
+            reload_timeout: flags.reload_timeout,
             default_model: flags.default_model,
             listen: flags.listen,
             http: flags.http,
+            http_hosts: flags.http_host,
             workers,
             threads: flags.threads.map_or((cpus / workers).max(1), usize::from),
             provider,

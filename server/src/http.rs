@@ -1,12 +1,15 @@
+mod connections;
+
 use std::convert::Infallible;
-use std::io;
+use std::net::IpAddr;
 use std::sync::Arc;
 
-use axum::extract::{Path, State as Shared};
+use axum::extract::{Path, Request, State as Shared};
 use axum::http::StatusCode;
-use axum::http::header::CONTENT_TYPE;
+use axum::http::header::{CONTENT_TYPE, HOST};
+use axum::middleware::{Next, from_fn_with_state};
 use axum::response::sse::{Event, KeepAlive, Sse};
-use axum::response::{Html, IntoResponse};
+use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
 use serde_json::{Value, json};
@@ -21,6 +24,8 @@ use crate::serving::registry::ModelRegistry;
 use crate::telemetry::metrics::Metrics;
 use crate::telemetry::recent::RecentRequests;
 
+pub(crate) use connections::CONNECTIONS;
+
 /// State shared by the HTTP handlers.
 #[derive(Clone)]
 pub(crate) struct HttpState {
@@ -29,8 +34,14 @@ pub(crate) struct HttpState {
     pub recent: Arc<RecentRequests>,
 }
 
-/// Serves `/metrics` for Prometheus, the probes `/healthz` and `/readyz`, and the web page with its API.
-pub(crate) async fn serve(listener: TcpListener, pages: HttpState, state: watch::Receiver<State>) -> io::Result<()> {
+/// Serves `/metrics` for Prometheus, the probes `/healthz` and `/readyz`, and the web page with its API. `hosts` are
+/// further names of the server.
+pub(crate) async fn serve(
+    listener: TcpListener,
+    hosts: Vec<String>,
+    pages: HttpState,
+    state: watch::Receiver<State>,
+) -> Infallible {
     let (metrics, now) = (Arc::clone(&pages.metrics), state.clone());
     let mut app = Router::new()
         .route("/metrics", get(async move || ([(CONTENT_TYPE, Metrics::CONTENT_TYPE)], metrics.render(*now.borrow()))))
@@ -45,7 +56,31 @@ pub(crate) async fn serve(listener: TcpListener, pages: HttpState, state: watch:
             .route("/api/events", get(events));
         app = app.merge(page.with_state(pages));
     }
-    axum::serve(listener, app).await
+    connections::serve(listener, app.layer(from_fn_with_state(Arc::new(hosts), check_host))).await
+}
+
+/// Refuses requests to names that are not this server's. Otherwise a page of another site could read the responses in
+/// the browser of someone who can reach this server, if the site's name resolves to this server's address (DNS
+/// rebinding).
+async fn check_host(Shared(hosts): Shared<Arc<Vec<String>>>, request: Request, next: Next) -> Response {
+    let host = request.headers().get(HOST).map(|host| String::from_utf8_lossy(host.as_bytes()).into_owned());
+    match host {
+        Some(host) if !is_own(&host, &hosts) => {
+            let reason = format!("`{host}` is not a name of this server; use its IP address, or add --http-host\n");
+            (StatusCode::MISDIRECTED_REQUEST, reason).into_response()
+        }
+        _ => next.run(request).await,
+    }
+}
+
+/// Whether a `Host` header is an IP address, one of `hosts`, or a name without a dot, which no other site can have.
+fn is_own(host: &str, hosts: &[String]) -> bool {
+    let is_port = |text: &str| text.bytes().all(|byte| byte.is_ascii_digit());
+    let name = host.rsplit_once(':').filter(|(_, port)| is_port(port)).map_or(host, |(name, _)| name);
+    let address = name.strip_prefix('[').and_then(|name| name.strip_suffix(']')).unwrap_or(name);
+    address.parse::<IpAddr>().is_ok()
+        || !name.trim_end_matches('.').contains('.')
+        || hosts.iter().any(|own| own.eq_ignore_ascii_case(name))
 }
 
 fn readiness(state: State) -> impl IntoResponse {
@@ -85,4 +120,20 @@ async fn models(Shared(pages): Shared<HttpState>) -> Json<Value> {
 async fn events(Shared(pages): Shared<HttpState>) -> Sse<impl Stream<Item = Result<Event, Infallible>>> {
     let numbers = WatchStream::new(pages.recent.last());
     Sse::new(numbers.map(|number| Ok(Event::default().data(number.to_string())))).keep_alive(KeepAlive::default())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_addresses_local_names_and_given_names_are_own() {
+        let hosts = ["graspd.example.com".to_owned()];
+        for own in ["127.0.0.1:9090", "10.1.2.3", "[::1]:9090", "localhost:9090", "graspd", "GraspD.example.com:80"] {
+            assert!(is_own(own, &hosts), "{own}");
+        }
+        for other in ["example.com", "attacker.example.com:9090", "127.0.0.1.example.com:9090", "a.b.", "[::1].a.b"] {
+            assert!(!is_own(other, &hosts), "{other}");
+        }
+    }
 }

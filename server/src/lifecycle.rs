@@ -101,7 +101,7 @@ async fn serve(
     let models = Arc::new(ModelRegistry::default());
     let recent = Arc::new(RecentRequests::new(config.recent));
     let pages = HttpState { metrics: Arc::clone(metrics), models: Arc::clone(&models), recent: Arc::clone(&recent) };
-    let http = tokio::spawn(crate::http::serve(http, pages, state.clone()));
+    let http = tokio::spawn(crate::http::serve(http, config.http_hosts.clone(), pages, state.clone()));
     let Config { tls, tokens, limits, max_tracked, track_timeout, queue, .. } = config;
     let calls = Calls::new(Arc::clone(metrics), recent, state.clone());
     let inference = InferenceRpc::new(Arc::clone(&models), calls.clone());
@@ -157,8 +157,8 @@ async fn bind(address: SocketAddr, flag: &str) -> anyhow::Result<TcpListener> {
 /// Raises the soft limit of open files, often 1024, to the hard limit. Returns the connection limit: `connections`, or
 /// less if the limit of open files is too low.
 fn allow_connections(connections: usize) -> usize {
-    // Files that are not connections: models, listeners, the log.
-    const OTHERS: u64 = 64;
+    // Files that are not gRPC connections: models, listeners, the log, HTTP connections.
+    const OTHERS: u64 = 64 + crate::http::CONNECTIONS as u64;
     let limit = getrlimit(Resource::Nofile);
     if let Err(error) = setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit }) {
         warn!(%error, "cannot raise the limit of open files");

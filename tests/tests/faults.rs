@@ -12,7 +12,7 @@ use h2::client::SendRequest;
 use nalgebra::Isometry3;
 use prost::Message;
 use tempfile::TempDir;
-use tokio::io::AsyncWriteExt;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
@@ -249,6 +249,37 @@ async fn incomplete_messages_are_refused_at_the_deadline_of_the_request() {
         assert_eq!(message, "the deadline passed before the message was received");
     }
     assert_eq!(server.metric("graspd_requests_total{code=\"DEADLINE_EXCEEDED\",model=\"\"}"), 2.0);
+}
+
+/// The status line of an HTTP request with this `Host`.
+async fn http_status(server: &Server, host: &str) -> String {
+    let mut stream = TcpStream::connect(server.http()).await.unwrap();
+    let request = format!("GET /healthz HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n");
+    stream.write_all(request.as_bytes()).await.unwrap();
+    let mut response = String::new();
+    stream.read_to_string(&mut response).await.unwrap();
+    response.lines().next().unwrap_or_default().to_owned()
+}
+
+#[tokio::test]
+async fn silent_and_slow_http_clients_block_neither_probes_nor_grpc() {
+    let server = Server::run(&[TestModel::new("mirror")], &["--http-host", "graspd.example.com,other.example.com"]);
+    let mut silent = Vec::new();
+    for _ in 0..1000 {
+        silent.push(TcpStream::connect(server.http()).await.unwrap());
+    }
+    for own in ["127.0.0.1:9090", "localhost", "other.example.com"] {
+        assert_eq!(http_status(&server, own).await, "HTTP/1.1 200 OK", "{own}");
+    }
+    assert_eq!(http_status(&server, "attacker.example.com").await, "HTTP/1.1 421 Misdirected Request");
+    server.client().await.detect(&volume(), Options::default()).await.unwrap();
+
+    // Half a request is dropped in seconds.
+    let mut half = TcpStream::connect(server.http()).await.unwrap();
+    half.write_all(b"GET /metrics HTTP/1.1\r\nHos").await.unwrap();
+    let mut rest = Vec::new();
+    tokio::time::timeout(Duration::from_secs(60), half.read_to_end(&mut rest)).await.unwrap().unwrap();
+    assert!(!String::from_utf8_lossy(&rest).contains("200 OK"));
 }
 
 #[tokio::test]

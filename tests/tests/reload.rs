@@ -1,12 +1,16 @@
 //! Changes of the model folder while the server runs.
 
-use std::fs;
+use std::fs::{self, File};
+use std::io::{BufRead, BufReader};
+use std::os::unix::fs::symlink;
+use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use grasp::Volume;
 use grasp_client::{Client, DetectOptions, Options};
-use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
+use grasp_models::onnx::ModelProto;
+use grasp_tests::{RESOLUTION, Server, TestModel, blobs, graspd, peak_bytes};
 use nalgebra::Isometry3;
 use tokio::task::JoinSet;
 
@@ -111,6 +115,89 @@ async fn invalid_files_change_nothing_and_are_counted() {
     server.reload().unwrap();
     server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
     assert_eq!(server.metric("graspd_rejected_files"), 0.0);
+}
+
+#[tokio::test]
+async fn only_regular_files_of_limited_size_with_short_names_are_loaded() {
+    let server = Server::run(&[TestModel::new("mirror")], &["--watch", "0", "--max-model-bytes", "1000000"]);
+    let client = server.client().await;
+    let path = server.models().join("bad.onnx");
+    let with_name = |name: &str| {
+        TestModel::new("long").write(server.models());
+        let written = server.models().join("long-1.onnx");
+        let mut model = ModelProto::read(&written).unwrap();
+        let property = model.metadata_props.iter_mut().find(|property| property.key() == "graspd.name").unwrap();
+        property.value = Some(name.to_owned());
+        model.write(&path).unwrap();
+        fs::remove_file(written).unwrap();
+    };
+    let make: [&dyn Fn(); 7] = [
+        &|| assert!(Command::new("mkfifo").arg(&path).status().unwrap().success()),
+        &|| symlink("/dev/zero", &path).unwrap(),
+        &|| fs::create_dir(&path).unwrap(),
+        // A file of 100 GB that takes no space.
+        &|| File::create(&path).unwrap().set_len(100 << 30).unwrap(),
+        &|| with_name(&"x".repeat(129)),
+        &|| with_name("two\nlines"),
+        &|| with_name(&"x".repeat(500_000)),
+    ];
+    for (count, make) in make.into_iter().enumerate() {
+        make();
+        server.reload().unwrap();
+        server.wait_for("graspd_reloads_total{outcome=\"failed\"}", count as f64 + 1.0).await;
+        assert_eq!(server.metric("graspd_rejected_files"), 1.0);
+        assert_eq!(served(&client).await, ["mirror 1"]);
+        if path.is_dir() { fs::remove_dir(&path).unwrap() } else { fs::remove_file(&path).unwrap() }
+    }
+    with_name(&"x".repeat(128));
+    server.reload().unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
+    assert_eq!(served(&client).await, ["mirror 1".to_owned(), format!("{} 1", "x".repeat(128))]);
+    assert!(server.get("/metrics").1.len() < 1 << 20);
+    assert!(peak_bytes(server.id()) < 200 << 20);
+}
+
+#[test]
+fn a_default_file_that_is_a_link_does_not_show_the_content_of_another_file() {
+    let folder = tempfile::tempdir().unwrap();
+    TestModel::new("mirror").write(folder.path());
+    let (secret, log) = (folder.path().join("token"), folder.path().join("log"));
+    fs::write(&secret, "secret-token").unwrap();
+    symlink(&secret, folder.path().join("default")).unwrap();
+    let mut server = Command::new(graspd())
+        .args(["--models".as_ref(), folder.path().as_os_str()])
+        .args(["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0", "--provider", "cpu"])
+        .stdout(Stdio::piped())
+        .stderr(File::create(&log).unwrap())
+        .spawn()
+        .unwrap();
+    let lines = BufReader::new(server.stdout.take().unwrap()).lines();
+    assert!(lines.map_while(Result::ok).any(|line| line == "ready"));
+    // Not killed, so that the log is complete.
+    assert!(Command::new("kill").arg(server.id().to_string()).status().unwrap().success());
+    server.wait().unwrap();
+    let log = fs::read_to_string(log).unwrap();
+    assert!(log.contains("the model named by the file `default` is not served"), "{log}");
+    assert!(!log.contains("secret-token"), "{log}");
+}
+
+#[tokio::test]
+async fn a_reload_that_takes_too_long_is_reported_and_does_not_delay_the_next() {
+    let server = Server::run(&[TestModel::new("mirror")], &["--watch", "0", "--reload-timeout", "0.2"]);
+    let client = server.client().await;
+    // Its warm-up takes seconds.
+    TestModel::new("slow").convolutions(300).write(server.models());
+    server.reload().unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 1.0).await;
+    assert_eq!(served(&client).await, ["mirror 1"]);
+    fs::remove_file(server.models().join("slow-1.onnx")).unwrap();
+    TestModel::new("mirror").version("2").write(server.models());
+    server.reload().unwrap();
+    server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
+    assert_eq!(served(&client).await, ["mirror 2", "mirror 1"]);
+    // The first reload ends, and changes nothing.
+    server.wait_for("graspd_reloads_total{outcome=\"superseded\"}", 1.0).await;
+    assert_eq!(served(&client).await, ["mirror 2", "mirror 1"]);
 }
 
 #[tokio::test]

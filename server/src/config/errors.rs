@@ -23,11 +23,11 @@ impl ConfigErrors {
                 Err(error) => match error.kind() {
                     ErrorKind::ValueValidation | ErrorKind::InvalidValue => {
                         let Some(flag) = flags(&command, &error).pop() else { error.exit() };
-                        errors.add(&flag, invalid_value(&error));
+                        errors.add_of(&flag, invalid_value(&error));
                         command = command.mut_arg(flag.get_id(), |flag| flag.value_parser(value_parser!(OsString)));
                     }
                     ErrorKind::MissingRequiredArgument => {
-                        flags(&command, &error).iter().for_each(|flag| errors.add(flag, "is missing"));
+                        flags(&command, &error).iter().for_each(|flag| errors.add_of(flag, "is missing"));
                         return Err(errors);
                     }
                     _ => error.exit(),
@@ -36,19 +36,18 @@ impl ConfigErrors {
         }
     }
 
-    pub(super) fn of_default_model(error: impl Display) -> Self {
-        Self(vec![format!("--default-model (GRASPD_DEFAULT_MODEL): {error}")])
+    /// Adds an error of the flag with this id.
+    pub(super) fn add<F: Parser>(&mut self, id: &str, error: impl Display) {
+        if let Some(flag) = F::command().get_arguments().find(|flag| flag.get_id() == id) {
+            self.add_of(flag, error);
+        }
     }
 
-    pub(super) fn of_receiving_bytes(bytes: usize, message: usize) -> Self {
-        Self(vec![format!(
-            "--max-receiving-bytes (GRASPD_MAX_RECEIVING_BYTES) is `{bytes}`: must be at least twice --max-message-bytes, \
-             {}",
-            message.saturating_mul(2)
-        )])
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.is_empty()
     }
 
-    fn add(&mut self, flag: &Arg, error: impl Display) {
+    fn add_of(&mut self, flag: &Arg, error: impl Display) {
         let name = flag.get_long().unwrap_or_default();
         let variable = flag.get_env().unwrap_or_default().to_string_lossy();
         self.0.push(format!("--{name} ({variable}) {error}"));

@@ -7,11 +7,10 @@ use std::time::Duration;
 
 use clap::builder::{PathBufValueParser, RangedI64ValueParser, TypedValueParser};
 use clap::{Parser, ValueEnum, value_parser};
-use grasp_models::{Choice, Precision, Provider, Store};
+use grasp_models::{Choice, MAX_MODEL_BYTES, Precision, Provider, StoreError};
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::ParseError;
 
-use crate::serving::stamps::{Stamps, stamps};
 use crate::transport::tokens::Tokens;
 
 /// Detects 6-DoF grasps in depth images, point clouds and TSDF volumes, over gRPC.
@@ -25,9 +24,13 @@ pub(super) struct Flags {
         long,
         env = "GRASPD_MODELS",
         value_name = "DIR",
-        value_parser = PathBufValueParser::new().try_map(Models::read),
+        value_parser = PathBufValueParser::new().try_map(model_folder),
     )]
-    pub models: Models,
+    pub models: PathBuf,
+
+    /// Maximum size of a model file, bytes. Larger files, and files that are not regular, are not opened.
+    #[arg(long, env = "GRASPD_MAX_MODEL_BYTES", value_name = "N", default_value_t = MAX_MODEL_BYTES)]
+    pub max_model_bytes: u64,
 
     /// Model for requests that name no model, if it accepts their resolution. If not set, the file `default` in the
     /// model folder names it; without that file it is the first network by name.
@@ -41,6 +44,11 @@ pub(super) struct Flags {
     /// Address of the HTTP listener: /metrics (Prometheus), /healthz, /readyz and the web page at /.
     #[arg(long, env = "GRASPD_HTTP", value_name = "ADDR", default_value = "127.0.0.1:9090")]
     pub http: SocketAddr,
+
+    /// Names by which the HTTP listener is reached, comma-separated. Requests to other names are refused, unless the
+    /// name is an IP address or has no dot, so that no page of another site can read the responses in a browser.
+    #[arg(long, env = "GRASPD_HTTP_HOST", value_name = "NAMES", value_delimiter = ',')]
+    pub http_host: Vec<String>,
 
     /// Sessions per model. Each session processes one batch at a time.
     #[arg(long, env = "GRASPD_WORKERS", value_name = "N", default_value = "1", value_parser = count())]
@@ -92,6 +100,17 @@ pub(super) struct Flags {
         value_parser = seconds,
     )]
     pub watch: Duration,
+
+    /// Time after which a reload is reported as failed and no longer delays the next one, seconds.
+    #[arg(
+        long,
+        env = "GRASPD_RELOAD_TIMEOUT",
+        value_name = "SECONDS",
+        default_value = "60",
+        allow_negative_numbers = true,
+        value_parser = positive_seconds,
+    )]
+    pub reload_timeout: Duration,
 
     /// Certificate chain of the gRPC listener, PEM. Enables TLS; plaintext connections are then refused.
     #[arg(
@@ -210,18 +229,11 @@ pub(crate) enum LogFormat {
     Json,
 }
 
-/// A model folder and its files' metadata.
-#[derive(Clone)]
-pub(super) struct Models {
-    pub store: Store,
-    /// Taken before the store's files were read.
-    pub stamps: Stamps,
-}
-
-impl Models {
-    fn read(folder: PathBuf) -> Result<Self, grasp_models::StoreError> {
-        let stamps = stamps(&folder);
-        Ok(Self { store: Store::open(&folder)?, stamps })
+/// A folder that can be read. Its files are read after the other flags.
+fn model_folder(folder: PathBuf) -> Result<PathBuf, StoreError> {
+    match fs::read_dir(&folder) {
+        Ok(_) => Ok(folder),
+        Err(source) => Err(StoreError::Io { path: folder, source }),
     }
 }
 

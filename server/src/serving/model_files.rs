@@ -15,17 +15,17 @@ pub(super) struct ModelFiles {
 }
 
 impl ModelFiles {
-    /// Reads the networks in the folder, and the files in its subfolders.
-    pub fn read(directory: &Path) -> Result<Self, StoreError> {
-        let Scan { entries, rejected } = Scan::read(directory)?;
-        let files = Self::with_networks(directory, entries)?;
+    /// Reads the networks in the folder, and the files in its subfolders. Each file has at most `max_bytes`.
+    pub fn read(directory: &Path, max_bytes: u64) -> Result<Self, StoreError> {
+        let Scan { entries, rejected } = Scan::read(directory, max_bytes)?;
+        let files = Self::with_networks(directory, entries, max_bytes)?;
         Ok(Self { rejected: rejected.into_iter().chain(files.rejected).collect(), ..files })
     }
 
     /// Reads the files in the subfolders, and combines them with networks that were read before.
-    pub fn with_networks(directory: &Path, networks: Vec<Entry>) -> Result<Self, StoreError> {
-        let classifiers = subfolder(&directory.join(CLASSIFIERS))?;
-        let evaluators = subfolder(&directory.join(EVALUATORS))?;
+    pub fn with_networks(directory: &Path, networks: Vec<Entry>, max_bytes: u64) -> Result<Self, StoreError> {
+        let classifiers = subfolder(&directory.join(CLASSIFIERS), max_bytes)?;
+        let evaluators = subfolder(&directory.join(EVALUATORS), max_bytes)?;
         let mut rejected: Vec<EntryError> = classifiers.rejected.into_iter().chain(evaluators.rejected).collect();
         let mut evaluated = Vec::new();
         for evaluator in evaluators.entries {
@@ -45,12 +45,12 @@ impl ModelFiles {
 }
 
 /// The files in a subfolder, which may be missing or empty.
-fn subfolder(directory: &Path) -> Result<Scan, StoreError> {
+fn subfolder(directory: &Path, max_bytes: u64) -> Result<Scan, StoreError> {
     let none = || Scan { entries: Vec::new(), rejected: Vec::new() };
     if !directory.is_dir() {
         return Ok(none());
     }
-    match Scan::read(directory) {
+    match Scan::read(directory, max_bytes) {
         Err(StoreError::Empty(_)) => Ok(none()),
         scan => scan,
     }

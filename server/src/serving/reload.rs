@@ -1,11 +1,13 @@
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use grasp_models::{Entry, Options};
+use grasp_models::{Entry, Options, read_regular_file};
 use tokio::signal::unix::Signal;
 use tokio::sync::watch;
+use tokio::task::JoinHandle;
+use tokio::time::timeout;
 use tracing::{error, info, warn};
 
 use crate::config::Config;
@@ -17,12 +19,25 @@ use crate::serving::stamps::{DEFAULT, Stamps, stamps};
 use crate::telemetry::metrics::Metrics;
 use grasp_planner::Source;
 
+/// Reloads that may hang, for example on a network file system, before the folder is no longer read. Each blocks a
+/// thread.
+const MAX_HANGING: usize = 4;
+
+/// Maximum size of the file [`DEFAULT`], bytes: a name and a line end.
+const MAX_DEFAULT: u64 = 130;
+
 /// Loads the models of a folder into the registry, and reloads them when files change.
 pub(crate) struct ModelFolder {
     directory: PathBuf,
     /// Taken before the folder was first read.
     stamps: Stamps,
     default_model: Option<String>,
+    /// Maximum size of a model file.
+    max_bytes: u64,
+    /// Time after which a reload no longer delays the next one.
+    timeout: Duration,
+    /// Number of the latest reload. Earlier ones that are still running change nothing.
+    latest: AtomicU64,
     serving: Serving,
     models: Arc<ModelRegistry>,
     sessions: Arc<SessionThreads>,
@@ -41,14 +56,25 @@ impl ModelFolder {
         let serving = Serving { workers, options, capacity: queue, batching };
         let (directory, default_model) = (config.store.directory().to_owned(), config.default_model.clone());
         let stamps = config.stamps.clone();
-        Self { directory, stamps, default_model, serving, models, sessions, metrics }
+        Self {
+            directory,
+            stamps,
+            default_model,
+            max_bytes: config.max_model_bytes,
+            timeout: config.reload_timeout,
+            latest: AtomicU64::new(0),
+            serving,
+            models,
+            sessions,
+            metrics,
+        }
     }
 
     /// Loads the networks `entries` and the planners of the subfolders, and serves them. Returns early
     /// when the server is draining.
     pub fn load(&self, entries: &[Entry], state: &watch::Receiver<State>) -> anyhow::Result<()> {
         let mut engines = Vec::new();
-        let files = ModelFiles::with_networks(&self.directory, entries.to_vec())?;
+        let files = ModelFiles::with_networks(&self.directory, entries.to_vec(), self.max_bytes)?;
         if let Some(error) = files.rejected.into_iter().next() {
             return Err(error.into());
         }
@@ -68,30 +94,64 @@ impl ModelFolder {
         let folder = Arc::new(self);
         let mut loaded = folder.stamps.clone();
         let mut last = loaded.clone();
+        let mut hanging: Vec<JoinHandle<()>> = Vec::new();
         loop {
             let is_requested = tokio::select! {
                 _ = hangup.recv() => true,
                 () = tokio::time::sleep(interval.unwrap_or_default()), if interval.is_some() => false,
             };
-            // On a blocking thread, because network file systems may be slow.
-            let polled = Arc::clone(&folder);
-            let Ok(now) = tokio::task::spawn_blocking(move || stamps(&polled.directory)).await else { continue };
-            if is_requested || (now != loaded && now == last) {
-                let reloading = Arc::clone(&folder);
-                if let Err(panic) = tokio::task::spawn_blocking(move || reloading.reload()).await {
-                    error!(%panic, "reloading the models panicked; the served models are unchanged");
+            hanging.retain(|task| !task.is_finished());
+            if hanging.len() >= MAX_HANGING {
+                if is_requested {
+                    error!("{MAX_HANGING} reloads are still running; restart the server to load the models");
                     folder.metrics.reloaded(Err(()));
                 }
+                continue;
+            }
+            // On blocking threads, because network file systems may be slow, or hang.
+            let (sender, receiver) = tokio::sync::oneshot::channel();
+            let polled = Arc::clone(&folder);
+            let poll = tokio::task::spawn_blocking(move || {
+                let _ = sender.send(stamps(&polled.directory));
+            });
+            hanging.extend(folder.finish("polling the model folder", poll).await);
+            let Ok(now) = receiver.await else { continue };
+            if is_requested || (now != loaded && now == last) {
+                let number = folder.latest.fetch_add(1, Ordering::Relaxed) + 1;
+                let reloading = Arc::clone(&folder);
+                let reload = tokio::task::spawn_blocking(move || reloading.reload(number));
+                hanging.extend(folder.finish("reloading the models", reload).await);
                 loaded.clone_from(&now);
             }
             last = now;
         }
     }
 
+    /// Waits for a task, at most until the timeout. Returns it if it is still running.
+    async fn finish(&self, what: &str, mut task: JoinHandle<()>) -> Option<JoinHandle<()>> {
+        match timeout(self.timeout, &mut task).await {
+            Ok(Ok(())) => None,
+            Ok(Err(panic)) => {
+                error!(%panic, "{what} panicked; the served models are unchanged");
+                self.metrics.reloaded(Err(()));
+                None
+            }
+            Err(_) => {
+                error!(
+                    timeout = ?self.timeout,
+                    "{what} takes longer than --reload-timeout; it continues in the background, the served models are \
+                     unchanged until then"
+                );
+                self.metrics.reloaded(Err(()));
+                Some(task)
+            }
+        }
+    }
+
     /// Loads and warms up new models while the old ones are served, then replaces them. If a file cannot be loaded, the
-    /// model that was loaded from it before remains served.
-    fn reload(&self) {
-        let files = match ModelFiles::read(&self.directory) {
+    /// model that was loaded from it before remains served. Changes nothing if a later reload than `number` has begun.
+    fn reload(&self, number: u64) {
+        let files = match ModelFiles::read(&self.directory, self.max_bytes) {
             Ok(files) => files,
             Err(error) => {
                 error!(%error, "cannot read the model folder; the served models are unchanged");
@@ -122,6 +182,10 @@ impl ModelFolder {
                 }
             }
         }
+        if number != self.latest.load(Ordering::Relaxed) {
+            warn!("a reload ended after a later one had begun; it changes nothing");
+            return self.metrics.superseded();
+        }
         let is_rejected = |path: &Path| rejected.iter().any(|rejected| rejected == path);
         let kept = served.iter().filter(|engine| engine.source.path().is_some_and(is_rejected));
         for kept in kept.cloned().collect::<Vec<_>>() {
@@ -145,9 +209,10 @@ impl ModelFolder {
     fn replace(&self, engines: Vec<Arc<Engine>>) {
         let before = self.models.now();
         let default = self.default_model.clone().or_else(|| default_of(&self.directory));
-        if let Some(name) = default.as_deref().filter(|name| engines.iter().all(|engine| engine.source.name() != *name))
-        {
-            warn!(name, "the default model is not served; the first network by name is the default instead");
+        if default.as_deref().is_some_and(|name| engines.iter().all(|engine| engine.source.name() != name)) {
+            // The name is not logged: if the file `default` is a link to another file, it is that file's content.
+            let setting = if self.default_model.is_some() { "--default-model" } else { "the file `default`" };
+            warn!("the model named by {setting} is not served; the first network by name is the default instead");
         }
         self.models.replace(engines, default.as_deref());
         let now = self.models.now();
@@ -161,6 +226,12 @@ impl ModelFolder {
 
 /// The name in the file [`DEFAULT`], if there is one.
 fn default_of(directory: &Path) -> Option<String> {
-    let name = fs::read_to_string(directory.join(DEFAULT)).ok()?;
+    let path = directory.join(DEFAULT);
+    if !path.exists() {
+        return None;
+    }
+    let name = read_regular_file(&path, MAX_DEFAULT);
+    let name = name.inspect_err(|error| warn!(%error, "cannot read the file `default` in the model folder")).ok()?;
+    let name = String::from_utf8(name).ok()?;
     Some(name.trim().to_owned()).filter(|name| !name.is_empty())
 }

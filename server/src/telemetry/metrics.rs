@@ -106,7 +106,7 @@ impl Metrics {
             ),
             reloads: counters(
                 "graspd_reloads_total",
-                "Reloads of the model folder: ok, or failed if any file could not be loaded.",
+                "Reloads of the model folder: ok; failed if any file could not be loaded, or in time; superseded by a later one.",
                 &["outcome"],
             ),
             rejected: gauge("graspd_rejected_files", "Model files that could not be loaded at the last reload."),
@@ -128,7 +128,7 @@ impl Metrics {
             registry,
         };
         // Series start at 0, so that `increase()` includes the first event.
-        for outcome in ["ok", "failed"] {
+        for outcome in ["ok", "failed", "superseded"] {
             metrics.reloads.with_label_values(&[outcome]);
         }
         metrics
@@ -172,6 +172,11 @@ impl Metrics {
         if let Ok(rejected) = outcome {
             self.rejected.set(rejected as i64);
         }
+    }
+
+    /// Records a reload that changed nothing, because a later one had begun.
+    pub fn superseded(&self) {
+        self.reloads.with_label_values(&["superseded"]).inc();
     }
 
     /// The metrics of a model's queue.
