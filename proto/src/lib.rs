@@ -34,6 +34,7 @@ pub use bounded::{BoundedCodec, BoundedDecoder};
 pub use error::{FieldError, on_a_line};
 pub use grasps::{Candidate, candidates};
 pub use options::{Collision, DetectParams, TABLE_HEIGHT};
+pub use pb::Priority;
 pub use png::grey_png;
 pub use pose::pose;
 pub use views::{MAX_VIEWS, Points, check_count, cloud_view, depth_view};

@@ -7,7 +7,7 @@ use grasp::{
 use nalgebra::{Isometry3, Unit, Vector3};
 
 use crate::pose::{self, PoseFields};
-use crate::{FieldError, pb};
+use crate::{FieldError, Priority, pb};
 
 /// Height of the table in training, metres above the volume's bottom.
 pub const TABLE_HEIGHT: f64 = 0.05;
@@ -54,6 +54,8 @@ pub struct DetectParams {
     pub objects: BTreeSet<u16>,
     /// Smallest distance of the fingertips from the sides of the cube, metres.
     pub margin: f64,
+    /// The place in the queue.
+    pub priority: Priority,
     /// Whether to report the dropped grasps.
     pub explain: bool,
     /// Region, approach and height.
@@ -173,6 +175,7 @@ impl TryFrom<&pb::Options> for DetectParams {
             max_grasps_per_object: limit(options.max_grasps_per_object),
             objects: objects(&options.objects)?,
             margin: margin("options.margin", options.margin)?,
+            priority: priority(options.priority)?,
             explain: options.explain,
             constraints: Constraints {
                 workspace: None,
@@ -195,6 +198,11 @@ impl TryFrom<&pb::Options> for DetectParams {
                 .unwrap_or(Retreat { distance: RETREAT, direction: None }),
         })
     }
+}
+
+fn priority(number: i32) -> Result<Priority, FieldError> {
+    Priority::try_from(number)
+        .map_err(|_| FieldError::new("options.priority", number, "must be PRIORITY_NORMAL or PRIORITY_BATCH"))
 }
 
 fn probability(field: &'static str, value: Option<f32>) -> Result<Option<f32>, FieldError> {

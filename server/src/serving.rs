@@ -9,6 +9,7 @@ pub(crate) mod observation;
 pub(crate) mod queue;
 pub(crate) mod registry;
 pub(crate) mod reload;
+mod retries;
 mod scene;
 pub(crate) mod session;
 pub(crate) mod stamps;

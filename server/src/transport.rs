@@ -1,5 +1,6 @@
 //! Connections, TLS, tokens, deadlines, and limits on messages and buffered responses.
 
+pub(crate) mod caller;
 pub(crate) mod connections;
 pub(crate) mod deadline;
 pub(crate) mod listener;

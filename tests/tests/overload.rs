@@ -1,16 +1,21 @@
 //! More requests than the server can answer.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use grasp::Volume;
-use grasp_client::{DetectOptions, Error, Options, Workspace};
+use grasp_client::{Access, Client, DetectOptions, Error, Options, Retry, Workspace};
+use grasp_proto::Priority;
+use grasp_proto::pb::grasp_service_client::GraspServiceClient;
 use grasp_proto::pb::{CollisionCheck, DetectGraspsRequest, collision_check};
 use grasp_tests::scene::{camera, view};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
 use nalgebra::Isometry3;
 use tokio::task::JoinSet;
 use tokio_stream::StreamExt;
-use tonic::Code;
+use tonic::transport::Endpoint;
+use tonic::{Code, Request, Status};
+use tonic_types::StatusExt;
 
 fn volume() -> Volume {
     blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]])
@@ -147,28 +152,147 @@ async fn every_worker_runs_its_own_session() {
     }
 }
 
+/// Sends a volume with a deadline.
+async fn detect_within(server: &Server, timeout: Duration) -> Result<(), Status> {
+    let volume = grasp_proto::encode(&volume(), grasp_client::DataType::F32, "");
+    let mut request = Request::new(DetectGraspsRequest { volume: Some(volume), ..Default::default() });
+    request.set_timeout(timeout);
+    server.raw().await.detect_grasps(request).await.map(|_| ())
+}
+
 #[tokio::test]
-async fn a_request_whose_deadline_passes_is_dropped_from_the_queue() {
+async fn a_request_that_cannot_be_answered_in_its_time_is_refused_at_once() {
     let server = Server::run(&[slow()], &["--queue", "8"]);
     let client = server.client().await;
-    // With these ahead, the wait is far longer than the timeout below.
     let mut ahead = JoinSet::new();
     for _ in 0..8 {
         let client = client.clone();
         ahead.spawn(async move { client.detect(&volume(), Options::default()).await });
     }
     server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 7.0).await;
-    let volume = grasp_proto::encode(&volume(), grasp_client::DataType::F32, "");
-    let mut request = tonic::Request::new(DetectGraspsRequest { volume: Some(volume), ..Default::default() });
-    // Long enough for the request to be sent.
-    request.set_timeout(Duration::from_millis(50));
-    let status = server.raw().await.detect_grasps(request).await.unwrap_err();
+    let status = detect_within(&server, Duration::from_millis(100)).await.unwrap_err();
+    assert_eq!(status.code(), Code::ResourceExhausted, "{status}");
+    assert!(status.message().starts_with("the deadline is earlier than the reply: 7 requests wait"), "{status}");
+    assert!(status.get_details_retry_info().is_some());
+    assert_eq!(server.metric("graspd_refusals_total{model=\"slow 1\",reason=\"deadline\"}"), 1.0);
+    // With enough time it is accepted.
+    detect_within(&server, Duration::from_secs(600)).await.unwrap();
+    ahead.join_all().await.into_iter().for_each(|answered| assert!(answered.is_ok(), "{answered:?}"));
+    assert_eq!(server.metric("graspd_stage_duration_seconds_count{model=\"slow 1\",stage=\"total\"}"), 9.0);
+}
+
+#[tokio::test]
+async fn a_request_whose_deadline_passes_during_its_inference_ends_then() {
+    let server = Server::run(&[slow()], &[]);
+    // An idle server tries it, whatever it expects.
+    let status = detect_within(&server, Duration::from_millis(5)).await.unwrap_err();
     assert!(matches!(status.code(), Code::Cancelled | Code::DeadlineExceeded), "{status}");
     server.wait_for("graspd_requests_total{code=\"DEADLINE_EXCEEDED\",model=\"slow 1\"}", 1.0).await;
-    server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 0.0).await;
-    ahead.join_all().await.into_iter().for_each(|answered| assert!(answered.is_ok(), "{answered:?}"));
-    assert_eq!(server.metric("graspd_stage_duration_seconds_count{model=\"slow 1\",stage=\"total\"}"), 8.0);
     assert_eq!(server.metric("graspd_requests_total{code=\"CANCELLED\",model=\"slow 1\"}"), 0.0);
+}
+
+#[tokio::test]
+async fn under_overload_with_deadlines_the_inferences_are_not_in_vain() {
+    let server = Server::run(&[slow()], &["--queue", "32"]);
+    let client = server.client().await;
+    let time = client.detect(&volume(), Options::default()).await.unwrap().latency.total;
+    // Each of twelve callers waits for at most five inferences.
+    let timeout = Duration::from_secs_f64(5.0 * time);
+    let server = Arc::new(server);
+    let mut callers = JoinSet::new();
+    for _ in 0..12 {
+        let server = Arc::clone(&server);
+        callers.spawn(async move {
+            let mut codes = Vec::new();
+            while codes.iter().filter(|code| **code == Code::Ok).count() < 3 {
+                let code = detect_within(&server, timeout).await.err().map_or(Code::Ok, |status| status.code());
+                codes.push(code);
+                if code != Code::Ok {
+                    tokio::time::sleep(timeout / 20).await;
+                }
+            }
+            codes
+        });
+    }
+    let codes: Vec<Code> = callers.join_all().await.into_iter().flatten().collect();
+    let count = |wanted: Code| codes.iter().filter(|code| **code == wanted).count();
+    let late = codes.len() - count(Code::Ok) - count(Code::ResourceExhausted);
+    println!("{} answered, {} refused, {late} late", count(Code::Ok), count(Code::ResourceExhausted));
+    assert_eq!(count(Code::Ok), 36);
+    assert!(count(Code::ResourceExhausted) > 0, "it was not overloaded");
+    assert!(late <= 12, "{late} of {} requests were accepted and answered too late", codes.len());
+}
+
+#[tokio::test]
+async fn refused_callers_that_follow_the_hint_are_answered() {
+    let server = Server::run(&[TestModel::new("mirror").convolutions(2)], &["--queue", "32"]);
+    let access = Access { retry: Retry::RECOMMENDED, ..Access::default() };
+    let client = Client::connect_with(server.grpc().to_string(), access).await.unwrap();
+    let mut calls = JoinSet::new();
+    for _ in 0..100 {
+        let client = client.clone();
+        calls.spawn(async move { client.detect(&volume(), Options::default()).await });
+    }
+    let answered = calls.join_all().await.iter().filter(|outcome| outcome.is_ok()).count();
+    assert!(answered >= 95, "{answered} of 100");
+    assert!(server.metric("graspd_refusals_total{model=\"mirror 1\",reason=\"full\"}") > 0.0);
+}
+
+#[tokio::test]
+async fn one_caller_with_many_calls_leaves_room_for_another() {
+    let server = Server::run(&[slow()], &["--queue", "8"]);
+    let other = Endpoint::from_shared(format!("http://{}", server.grpc())).unwrap();
+    let other = other.local_address(Some([127, 0, 0, 2].into())).connect().await.unwrap();
+    let request = || DetectGraspsRequest {
+        volume: Some(grasp_proto::encode(&volume(), grasp_client::DataType::F32, "")),
+        ..Default::default()
+    };
+    let mut many = JoinSet::new();
+    for _ in 0..64 {
+        let (mut client, request) = (GraspServiceClient::new(other.clone()), request());
+        // Calls again whenever it is refused.
+        many.spawn(async move {
+            loop {
+                match client.detect_grasps(request.clone()).await {
+                    Err(status) if status.code() == Code::ResourceExhausted => {
+                        tokio::time::sleep(Duration::from_millis(10)).await;
+                    }
+                    outcome => outcome.map(|_| ()).unwrap(),
+                }
+            }
+        });
+    }
+    server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 8.0).await;
+    let client = server.client().await;
+    for _ in 0..10 {
+        let latency = client.detect(&volume(), Options::default()).await.unwrap().latency;
+        // One inference is running, and at most one of the other caller's is taken first.
+        assert!(latency.queue < 6.0 * latency.inference, "{latency:?}");
+    }
+    assert!(server.metric("graspd_refusals_total{model=\"slow 1\",reason=\"displaced\"}") > 0.0);
+    many.shutdown().await;
+}
+
+#[tokio::test]
+async fn batch_requests_wait_for_normal_ones() {
+    let server = Server::run(&[slow()], &["--queue", "8"]);
+    let client = server.client().await;
+    let options = |priority: Priority| {
+        let detect = DetectOptions { priority: priority.into(), ..DetectOptions::default() };
+        Options { detect, ..Options::default() }
+    };
+    let mut batch = JoinSet::new();
+    for _ in 0..9 {
+        let client = client.clone();
+        batch.spawn(async move { client.detect(&volume(), options(Priority::Batch)).await });
+    }
+    server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 8.0).await;
+    let latency = client.detect(&volume(), options(Priority::Normal)).await.unwrap().latency;
+    assert!(latency.queue < 4.0 * latency.inference, "{latency:?}");
+    let outcomes = batch.join_all().await;
+    let refused: Vec<_> = outcomes.iter().filter_map(|outcome| outcome.as_ref().err()).collect();
+    assert_eq!(refused.len(), 1, "the normal request took the place of one: {refused:?}");
+    assert!(refused[0].to_string().contains("has taken this one's place"), "{refused:?}");
 }
 
 #[tokio::test]

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use grasp::Warning;
-use grasp_proto::{Candidate, DetectParams, FieldError, pb};
+use grasp_proto::{Candidate, DetectParams, FieldError, Priority, pb};
 use opentelemetry::Context;
 use tokio::sync::watch;
 use tonic::{Code, Request, Status};
@@ -18,10 +18,12 @@ use crate::serving::cubes::CubeScene;
 use crate::serving::detection::{Detection, Score};
 use crate::serving::engine::Engine;
 use crate::serving::job::{EngineError, Reply, SessionOutput, Tensors};
+use crate::serving::queue::Ticket;
 use crate::telemetry::metrics::Metrics;
 use crate::telemetry::recent::{Outcome, RecentRequests, Shown};
 use crate::telemetry::subscriber::{self, REQUEST};
 use crate::telemetry::timings::StageTimings;
+use crate::transport::caller::Caller;
 use crate::transport::deadline::{self, Deadline};
 use crate::transport::request_body::unreadable_message;
 
@@ -45,6 +47,7 @@ pub(crate) struct Calls {
 pub(crate) struct Call {
     pub id: String,
     pub deadline: Option<Deadline>,
+    caller: Caller,
     started: Instant,
     span: Span,
     metrics: Arc<Metrics>,
@@ -56,16 +59,21 @@ pub(crate) struct Call {
     ended: bool,
 }
 
-/// Deadline and trace context from a request's headers.
-#[derive(Clone, Default)]
+/// What is known of a request besides its message.
+#[derive(Clone)]
 pub(crate) struct CallContext {
+    caller: Caller,
     deadline: Option<Deadline>,
     parent: Option<Context>,
 }
 
 impl CallContext {
     pub fn of<T>(request: &Request<T>) -> Self {
-        Self { deadline: deadline::of(request.extensions()), parent: subscriber::parent(request.metadata()) }
+        Self {
+            caller: Caller::of(request.extensions()),
+            deadline: deadline::of(request.extensions()),
+            parent: subscriber::parent(request.metadata()),
+        }
     }
 }
 
@@ -124,7 +132,7 @@ impl Calls {
         if checked.is_ok() && *self.state.borrow() == State::Starting {
             checked = Err(Refusal::Starting(WARM_UP));
         }
-        let CallContext { deadline, parent } = context;
+        let CallContext { caller, deadline, parent } = context;
         let span = info_span!(
             REQUEST,
             otel.kind = "server",
@@ -142,6 +150,7 @@ impl Calls {
         let call = Call {
             id,
             deadline,
+            caller,
             started,
             span,
             metrics: Arc::clone(&self.metrics),
@@ -174,6 +183,11 @@ fn check_id(field: &'static str, id: &str) -> Result<(), FieldError> {
 }
 
 impl Call {
+    /// The request's place in a queue.
+    pub fn ticket(&self, priority: Priority) -> Ticket {
+        Ticket { caller: self.caller, priority, deadline: self.deadline.map(|Deadline(deadline)| deadline) }
+    }
+
     /// Records the model that processes the request.
     pub fn set_model(&mut self, engine: &Engine) {
         self.label.clone_from(&engine.label);
@@ -192,8 +206,9 @@ impl Call {
         observed: Observed,
     ) -> Result<PendingReply, Refusal> {
         engine.check_cubes(scenes.len())?;
+        let ticket = self.ticket(params.priority);
         self.queue(engine, scenes, params, origin, observed, |scene| {
-            engine.detect(scene, self.deadline, self.span.clone()).map_err(Refusal::from)
+            engine.detect(scene, ticket, self.span.clone()).map_err(Refusal::from)
         })
     }
 
@@ -207,8 +222,9 @@ impl Call {
         observed: Observed,
     ) -> Result<PendingReply<Vec<Score>>, Refusal> {
         let params = scene.params.clone();
+        let ticket = self.ticket(params.priority);
         self.queue(engine, vec![scene], params, origin, observed, |scene| {
-            engine.score(scene, candidates.to_vec(), self.deadline, self.span.clone()).map_err(Refusal::from)
+            engine.score(scene, candidates.to_vec(), ticket, self.span.clone()).map_err(Refusal::from)
         })
     }
 

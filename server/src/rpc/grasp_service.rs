@@ -8,8 +8,8 @@ use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::find_table_request::Observation as Seen;
 use grasp_proto::pb::grasp_service_server::GraspService;
 use grasp_proto::{
-    Candidate, DetectParams, FieldError, TABLE_HEIGHT, Workspace, candidates, check_count, cloud_view, depth_view, pb,
-    resolution,
+    Candidate, DetectParams, FieldError, Priority, TABLE_HEIGHT, Workspace, candidates, check_count, cloud_view,
+    depth_view, pb, resolution,
 };
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::time::timeout_at;
@@ -26,6 +26,7 @@ use crate::serving::detection::Score;
 use crate::serving::engine::Engine;
 use crate::serving::job::EngineError;
 use crate::serving::observation::Observation;
+use crate::serving::queue::Ticket;
 use crate::serving::registry::{ModelRegistry, check_voxel_size};
 use crate::serving::tracking::{Start, Track, TrackedVolumes};
 use crate::transport::deadline::Deadline;
@@ -122,8 +123,9 @@ impl GraspRpc {
         let checked = if volume.data.len() <= INLINE_BYTES {
             Volume::try_from(&volume)?
         } else {
-            let permits = (self.conversion_permit(&engine)?, self.fusion_permit(call).await?);
-            engine.check_capacity()?;
+            let ticket = call.ticket(params.priority);
+            let permits = (self.conversion_permit(&engine, ticket)?, self.fusion_permit(call).await?);
+            engine.check_capacity(ticket)?;
             blocking(permits, move || Ok(Volume::try_from(&volume)?)).await?
         };
         check_voxel_size(&checked, &engine)?;
@@ -182,8 +184,9 @@ impl GraspRpc {
             FrameStamp::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
         let engine = self.models.select(&params.model, &params.version, None)?;
         call.set_model(&engine);
-        let permits = (self.conversion_permit(&engine)?, self.fusion_permit(call).await?);
-        engine.check_capacity()?;
+        let ticket = call.ticket(params.priority);
+        let permits = (self.conversion_permit(&engine, ticket)?, self.fusion_permit(call).await?);
+        engine.check_capacity(ticket)?;
         let (selected, params) = (Arc::clone(&engine), params.clone());
         let fused = blocking(permits, move || {
             let (observation, table) = place(&mut workspace, params.table.unwrap_or(TABLE_HEIGHT))?;
@@ -252,7 +255,8 @@ impl GraspRpc {
         let origin = FrameStamp::checked("workspace.frame_id", frame_id, workspace.stamp)?;
         // The retry hint of a refusal is that of the default model.
         let engine = self.models.select("", "", None)?;
-        let permits = (self.conversion_permit(&engine)?, self.fusion_permit(call).await?);
+        let ticket = call.ticket(Priority::Normal);
+        let permits = (self.conversion_permit(&engine, ticket)?, self.fusion_permit(call).await?);
         let find = move || {
             let found = match observation {
                 Seen::View(mut view) => {
@@ -277,8 +281,8 @@ impl GraspRpc {
     }
 
     /// Takes a conversion permit. Refuses immediately if none is left or the model's queue is full.
-    fn conversion_permit(&self, engine: &Engine) -> Result<OwnedSemaphorePermit, Refusal> {
-        engine.check_capacity()?;
+    fn conversion_permit(&self, engine: &Engine, ticket: Ticket) -> Result<OwnedSemaphorePermit, Refusal> {
+        engine.check_capacity(ticket)?;
         let permit = Arc::clone(&self.conversion_permits).try_acquire_owned();
         Ok(permit.map_err(|_| engine.overloaded("too many requests are waiting for fusion".to_owned()))?)
     }

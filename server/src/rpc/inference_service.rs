@@ -7,7 +7,7 @@ use grasp_proto::oip::model_infer_request::InferInputTensor;
 use grasp_proto::oip::model_infer_response::InferOutputTensor;
 use grasp_proto::oip::model_metadata_response::TensorMetadata;
 use grasp_proto::oip::{self, infer_parameter::ParameterChoice};
-use grasp_proto::{FieldError, on_a_line};
+use grasp_proto::{FieldError, Priority, on_a_line};
 use nalgebra::Isometry3;
 use prost::bytes::Bytes;
 use tokio::task::spawn_blocking;
@@ -89,7 +89,8 @@ impl InferenceRpc {
         };
         let volumes = batch.chunks_exact(n.pow(3)).map(volume).collect::<Result<Vec<_>, _>>()?;
         // If the queue is full for one volume, the volumes before it leave the queue when their replies are dropped.
-        let replies = volumes.into_iter().map(|volume| engine.maps(volume, call.deadline, call.span()));
+        let ticket = call.ticket(Priority::Normal);
+        let replies = volumes.into_iter().map(|volume| engine.maps(volume, ticket, call.span()));
         let replies = replies.collect::<Result<Vec<_>, _>>()?;
         Ok(Queued { engine, replies, permit })
     }

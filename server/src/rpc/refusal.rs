@@ -27,7 +27,16 @@ pub(crate) enum Refusal {
     #[error("no request for {0:?} (--track-timeout), the volume was dropped; open a new stream")]
     TrackExpired(Duration),
     #[error(transparent)]
-    Failed(#[from] EngineError),
+    Failed(EngineError),
+}
+
+impl From<EngineError> for Refusal {
+    fn from(error: EngineError) -> Self {
+        match error {
+            EngineError::Displaced(overloaded) => Self::Overloaded(overloaded),
+            error => Self::Failed(error),
+        }
+    }
 }
 
 /// The trailer with the server's retry hint (gRPC proposal A6).

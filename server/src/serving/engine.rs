@@ -14,10 +14,11 @@ use tracing::{Span, info, warn};
 
 use super::cubes::CubeScene;
 use super::detection::{Detection, Score};
-use super::job::{Job, Reply, Task, Tensors};
-use super::queue::{Batching, Full, Queue, QueueSlot};
+use super::job::{EngineError, Job, Reply, Task, Tensors};
+use super::queue::{Batching, Queue, QueueSlot, Refused, Ticket};
+use super::retries::Retries;
 use super::session::{ServiceTime, Session, warm_up};
-use crate::telemetry::metrics::{Metrics, ModelLabels, QueueMetrics};
+use crate::telemetry::metrics::{Metrics, ModelLabels, QueueMetrics, RefusalCounters};
 use crate::transport::deadline::Deadline;
 
 /// One model with its queue. Its session threads end when the engine is dropped.
@@ -29,6 +30,8 @@ pub(crate) struct Engine {
     workers: usize,
     queue: Arc<Queue<Job>>,
     service_time: Arc<ServiceTime>,
+    retries: Retries,
+    refused: RefusalCounters,
 }
 
 /// Settings that all engines share.
@@ -46,8 +49,8 @@ pub(crate) struct Serving {
 #[derive(Default)]
 pub(crate) struct SessionThreads(Mutex<Vec<JoinHandle<()>>>);
 
-/// A request was refused because a queue or buffer is full.
-#[derive(Debug, Error)]
+/// A request was refused because the server has too many.
+#[derive(Clone, Debug, Error)]
 #[error("{reason}; retry after {retry_after:?}")]
 pub(crate) struct Overloaded {
     reason: String,
@@ -74,12 +77,13 @@ impl Engine {
                     .with_context(|| format!("the warm-up inference of the model {label} failed"))?;
             }
         }
-        let QueueMetrics { waiting, batch } = metrics.queue(&label);
+        let QueueMetrics { waiting, batch, refused } = metrics.queue(&label);
         let queue = Arc::new(Queue::new(workers, capacity, waiting));
         // Created before the threads, so that an early return drops it, which closes the queue and ends started
         // threads.
         let service_time = Arc::new(ServiceTime::new(service_time));
-        let engine = Self { source, label, backend, workers, queue, service_time };
+        let retries = Retries::default();
+        let engine = Self { source, label, backend, workers, queue, service_time, retries, refused };
         for (worker, planner) in planners.into_iter().enumerate() {
             let (queue, service_time) = (Arc::clone(&engine.queue), Arc::clone(&engine.service_time));
             let defaults = engine.source.decode_params();
@@ -106,11 +110,11 @@ impl Engine {
     pub fn detect(
         &self,
         CubeScene { scene, params }: CubeScene,
-        deadline: Option<Deadline>,
+        ticket: Ticket,
         span: Span,
     ) -> Result<Reply<Detection>, Overloaded> {
         let (sender, receiver) = oneshot::channel();
-        let slot = self.push(scene, Task::Grasps(Box::new(params), sender), deadline, span)?;
+        let slot = self.push(scene, Task::Grasps(Box::new(params), sender), ticket, span)?;
         Ok(Reply::new(receiver, slot))
     }
 
@@ -119,18 +123,18 @@ impl Engine {
         &self,
         CubeScene { scene, params }: CubeScene,
         candidates: Vec<Candidate>,
-        deadline: Option<Deadline>,
+        ticket: Ticket,
         span: Span,
     ) -> Result<Reply<Vec<Score>>, Overloaded> {
         let (sender, receiver) = oneshot::channel();
-        let slot = self.push(scene, Task::Scores(Box::new(params), candidates, sender), deadline, span)?;
+        let slot = self.push(scene, Task::Scores(Box::new(params), candidates, sender), ticket, span)?;
         Ok(Reply::new(receiver, slot))
     }
 
     /// Queues a volume for the network's raw output. Refuses immediately if the queue is full.
-    pub fn maps(&self, volume: Volume, deadline: Option<Deadline>, span: Span) -> Result<Reply<Tensors>, Overloaded> {
+    pub fn maps(&self, volume: Volume, ticket: Ticket, span: Span) -> Result<Reply<Tensors>, Overloaded> {
         let (sender, receiver) = oneshot::channel();
-        let slot = self.push(Scene { volume, points: None }, Task::Maps(sender), deadline, span)?;
+        let slot = self.push(Scene { volume, points: None }, Task::Maps(sender), ticket, span)?;
         Ok(Reply::new(receiver, slot))
     }
 
@@ -157,23 +161,27 @@ impl Engine {
     }
 
     /// Refuses if the queue is full now, before the caller converts and fuses data.
-    pub fn check_capacity(&self) -> Result<(), Overloaded> {
-        if self.queue.is_full() { Err(self.full()) } else { Ok(()) }
+    pub fn check_capacity(&self, ticket: Ticket) -> Result<(), Overloaded> {
+        if self.queue.is_full_for(ticket) { Err(self.full()) } else { Ok(()) }
     }
 
-    fn push(
-        &self,
-        scene: Scene,
-        task: Task,
-        deadline: Option<Deadline>,
-        span: Span,
-    ) -> Result<QueueSlot<Job>, Overloaded> {
+    fn push(&self, scene: Scene, task: Task, ticket: Ticket, span: Span) -> Result<QueueSlot<Job>, Overloaded> {
+        let job = Job { scene, task, deadline: ticket.deadline.map(Deadline), span, submitted: Instant::now() };
         // The queue is open: only dropping the engine closes it.
-        let job = Job { scene, task, deadline, span, submitted: Instant::now() };
-        self.queue.push(job).map_err(|Full| self.full())
+        match self.queue.push(job, ticket, self.service_time.get()) {
+            Ok((slot, displaced)) => {
+                if let Some(job) = displaced {
+                    job.task.fail(EngineError::Displaced(self.displaced()));
+                }
+                Ok(slot)
+            }
+            Err(Refused::Full) => Err(self.full()),
+            Err(Refused::TooLate(estimate)) => Err(self.too_late(estimate)),
+        }
     }
 
     fn full(&self) -> Overloaded {
+        self.refused.full.inc();
         self.overloaded(format!(
             "the queue of the model `{}` is full ({} requests)",
             self.source.name(),
@@ -181,9 +189,29 @@ impl Engine {
         ))
     }
 
-    /// A refusal with a retry hint from the current service time.
+    fn too_late(&self, estimate: Duration) -> Overloaded {
+        self.refused.too_late.inc();
+        let (name, waiting) = (self.source.name(), self.queue.waiting());
+        self.overloaded(format!(
+            "the deadline is earlier than the reply: {waiting} requests wait for the model `{name}`, the reply would \
+             take about {estimate:.0?}"
+        ))
+    }
+
+    fn displaced(&self) -> Overloaded {
+        self.refused.displaced.inc();
+        self.overloaded(format!(
+            "the queue of the model `{}` is full, and a request of a caller with fewer requests in it, or with a higher \
+             priority, has taken this one's place",
+            self.source.name()
+        ))
+    }
+
+    /// A refusal with a hint when to retry.
     pub fn overloaded(&self, reason: String) -> Overloaded {
-        Overloaded { reason, retry_after: self.service_time.get() }
+        let pace = self.service_time.get() / u32::try_from(self.workers).unwrap_or(u32::MAX);
+        let places = u32::try_from(self.capacity() + self.workers).unwrap_or(u32::MAX);
+        Overloaded { reason, retry_after: self.retries.next(pace, places, Instant::now()) }
     }
 }
 

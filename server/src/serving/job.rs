@@ -11,6 +11,7 @@ use tokio::sync::oneshot;
 use tracing::Span;
 
 use super::detection::{Detection, Score};
+use super::engine::Overloaded;
 use super::queue::QueueSlot;
 use crate::transport::deadline::Deadline;
 
@@ -40,6 +41,8 @@ pub(crate) enum EngineError {
     SessionEnded,
     #[error("the deadline passed before the request was finished")]
     Expired,
+    #[error(transparent)]
+    Displaced(Overloaded),
 }
 
 impl From<PlanError> for EngineError {

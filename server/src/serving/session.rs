@@ -1,8 +1,7 @@
 //! Session threads: each owns a planner, takes jobs from its model's queue, and sends the results.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use grasp::{DecodeParams, Volume};
@@ -28,8 +27,18 @@ pub(super) struct Session {
     pub service_time: Arc<ServiceTime>,
 }
 
-/// Time per scene of the last batch: the estimated time until a queue slot is free.
-pub(super) struct ServiceTime(AtomicU64);
+/// Mean time per scene, in which the latest batches count most.
+pub(super) struct ServiceTime(Mutex<Mean>);
+
+/// A mean and the number of its values.
+#[derive(Clone, Copy)]
+struct Mean {
+    seconds: f64,
+    values: f64,
+}
+
+/// Number of values that the mean of the service time remembers.
+const MEMORY: f64 = 8.0;
 
 /// The times of a batch.
 #[derive(Clone, Copy)]
@@ -45,18 +54,23 @@ struct BatchTimes<'a> {
 
 impl ServiceTime {
     pub fn new(duration: Duration) -> Self {
-        let service_time = Self(AtomicU64::new(0));
-        service_time.set(duration);
-        service_time
+        Self(Mutex::new(Mean { seconds: duration.as_secs_f64(), values: 0.0 }))
     }
 
-    pub fn set(&self, duration: Duration) {
-        self.0.store(duration.as_micros().try_into().unwrap_or(u64::MAX), Ordering::Relaxed);
+    /// Adds the time of a scene. The first replaces the initial time.
+    pub fn add(&self, duration: Duration) {
+        let mut mean = self.mean();
+        mean.values = (mean.values + 1.0).min(MEMORY);
+        mean.seconds += (duration.as_secs_f64() - mean.seconds) / mean.values;
     }
 
     /// At least one millisecond, the unit of the retry hint.
     pub fn get(&self) -> Duration {
-        Duration::from_micros(self.0.load(Ordering::Relaxed)).max(Duration::from_millis(1))
+        Duration::from_secs_f64(self.mean().seconds).max(Duration::from_millis(1))
+    }
+
+    fn mean(&self) -> MutexGuard<'_, Mean> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -66,7 +80,9 @@ impl Session {
         let batching = if matches!(self.planner, Loaded::Single(_)) { single } else { self.batching };
         while let Some(mut jobs) = self.queue.take(batching) {
             let now = Instant::now();
-            let expired = |job: &mut Job| job.deadline.is_some_and(|Deadline(deadline)| deadline <= now);
+            // While others wait, a job that would end after its deadline is dropped before its inference.
+            let until = if self.queue.waiting() > 0 { now + self.service_time.get() } else { now };
+            let expired = |job: &mut Job| job.deadline.is_some_and(|Deadline(deadline)| deadline <= until);
             for job in jobs.extract_if(.., expired) {
                 job.task.fail(EngineError::Expired);
             }
@@ -188,7 +204,7 @@ fn send_result<T>(
     }
     let BatchTimes { taken, inference, scenes, service_time } = times;
     // The time per scene, including decoding. Set before the reply, so that the next refusal already has it.
-    service_time.set(taken.elapsed() / scenes);
+    service_time.add(taken.elapsed() / scenes);
     let (queue, postprocessing) = (taken.duration_since(submitted), started.elapsed());
     // Fails if the client has cancelled, which the call counts.
     let _ = reply.send(result.map(|value| SessionOutput { value, queue, inference, postprocessing }));

@@ -37,6 +37,7 @@ pub(crate) struct Metrics {
     requests: IntCounterVec,
     grasps: IntCounterVec,
     warnings: IntCounterVec,
+    refused: IntCounterVec,
     waiting: IntGaugeVec,
     batches: HistogramVec,
     models: IntGaugeVec,
@@ -60,6 +61,17 @@ pub(crate) struct QueueMetrics {
     pub waiting: IntGauge,
     /// Volumes per batch.
     pub batch: Histogram,
+    pub refused: RefusalCounters,
+}
+
+/// Counters of the requests that a queue refuses.
+pub(crate) struct RefusalCounters {
+    /// The queue was full.
+    pub full: IntCounter,
+    /// The reply would have been too late.
+    pub too_late: IntCounter,
+    /// Another request took their place.
+    pub displaced: IntCounter,
 }
 
 /// The labels of `graspd_model_info`: model, provider, precision and file hash.
@@ -96,6 +108,12 @@ impl Metrics {
                 "graspd_warnings_total",
                 "Signs that the geometry of a request is wrong, by the code of the warning.",
                 &["model", "code"],
+            ),
+            refused: counters(
+                "graspd_refusals_total",
+                "Requests refused by a queue: it was full, the reply would have been too late, or another caller's \
+                 request displaced it.",
+                &["model", "reason"],
             ),
             waiting: gauges("graspd_queue_requests", "Queued requests.", &["model"]),
             batches: histograms("graspd_batch_size", "Volumes per batch.", &["model"], &BATCHES),
@@ -191,7 +209,13 @@ impl Metrics {
             let Ok(code) = WarningCode::try_from(code) else { break };
             self.warnings.with_label_values(&[model, warning_name(code)]);
         }
+        let refused = |reason| self.refused.with_label_values(&[model, reason]);
         QueueMetrics {
+            refused: RefusalCounters {
+                full: refused("full"),
+                too_late: refused("deadline"),
+                displaced: refused("displaced"),
+            },
             waiting: self.waiting.with_label_values(&[model]),
             batch: self.batches.with_label_values(&[model]),
         }

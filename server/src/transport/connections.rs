@@ -1,4 +1,5 @@
 use std::io;
+use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
@@ -74,6 +75,8 @@ pub(crate) struct Connection {
 /// The client of a connection.
 #[derive(Clone)]
 pub(crate) struct Peer {
+    /// None if the connection has ended already.
+    pub address: Option<SocketAddr>,
     pub share: ConnectionShare,
 }
 
@@ -87,7 +90,7 @@ impl Peer {
 impl Connection {
     fn new(stream: TcpStream, timeout: Duration, open: &IntGauge, budget: &Arc<ReceiveBudget>) -> Self {
         open.inc();
-        let peer = Peer { share: budget.connection() };
+        let peer = Peer { address: stream.peer_addr().ok(), share: budget.connection() };
         Self { stream, preface: Some((PREFACE, Box::pin(sleep(timeout)))), open: open.clone(), peer }
     }
 }

@@ -13,6 +13,7 @@ use tonic::{Code, Request, Status};
 use tracing::{error, info};
 
 use crate::telemetry::metrics::Metrics;
+use crate::transport::caller::Caller;
 
 /// Scheme of the header `authorization` (RFC 6750, section 2.1), case-insensitive.
 const SCHEME: &str = "bearer ";
@@ -49,8 +50,8 @@ impl Tokens {
         }
     }
 
-    /// Checks the token of a request. Errors never contain the received token.
-    pub fn check(&self, metadata: &MetadataMap) -> Result<(), Status> {
+    /// Checks the token of a request, which identifies the caller. Errors never contain the received token.
+    pub fn check(&self, metadata: &MetadataMap) -> Result<Caller, Status> {
         let header = metadata.get("authorization");
         let header = header.ok_or_else(|| Status::unauthenticated(format!("no token; {NEEDED}")))?;
         let token = header
@@ -64,7 +65,7 @@ impl Tokens {
         let hashes = self.hashes.read().unwrap_or_else(PoisonError::into_inner);
         let known = hashes.iter().fold(Choice::from(0), |known, accepted| known | accepted.ct_eq(&hash));
         if bool::from(known) {
-            Ok(())
+            Ok(Caller::Token(hash))
         } else {
             Err(Status::unauthenticated("invalid token; send one of the server's --token-file"))
         }
@@ -84,12 +85,11 @@ pub(crate) fn guard(
     tokens: Option<Arc<Tokens>>,
     metrics: Arc<Metrics>,
 ) -> impl Fn(Request<()>) -> Result<Request<()>, Status> + Clone {
-    move |request| {
-        if let Some(tokens) = &tokens
-            && let Err(status) = tokens.check(request.metadata())
-        {
-            metrics.ended("", Code::Unauthenticated);
-            return Err(status);
+    move |mut request| {
+        if let Some(tokens) = &tokens {
+            let checked = tokens.check(request.metadata());
+            let caller = checked.inspect_err(|_| metrics.ended("", Code::Unauthenticated))?;
+            request.extensions_mut().insert(caller);
         }
         Ok(request)
     }
@@ -114,7 +114,7 @@ mod tests {
             if let Some(header) = header {
                 metadata.insert("authorization", header.parse().unwrap());
             }
-            tokens.check(&metadata).map_err(|status| status.message().to_owned())
+            tokens.check(&metadata).map(|_| ()).map_err(|status| status.message().to_owned())
         };
         for valid in ["Bearer old", "bearer new", "BEARER  old "] {
             assert_eq!(check(Some(valid)), Ok(()), "{valid}");

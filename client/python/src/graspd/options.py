@@ -126,3 +126,5 @@ class Options:
     """Return at most this many grasps on one object, for views with `labels`. 0: no limit."""
     margin: float | None = None
     """Smallest distance of the point between the fingertips from the sides of the cube, metres; None: 0."""
+    priority: Literal["normal", "batch"] = "normal"
+    """``batch``: for scenes whose grasps nobody waits for; normal requests go first."""

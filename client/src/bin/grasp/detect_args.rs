@@ -41,6 +41,10 @@ pub(crate) struct DetectArgs {
     #[arg(long, value_name = "METRES")]
     margin: Option<f64>,
 
+    /// Let requests that are not batch requests go first: for scenes whose grasps nobody waits for.
+    #[arg(long)]
+    batch: bool,
+
     /// Also report how many voxels were dropped, by reason.
     #[arg(long)]
     explain: bool,
@@ -161,6 +165,7 @@ impl DetectArgs {
             objects,
             max_grasps_per_object,
             margin,
+            priority: if self.batch { pb::Priority::Batch } else { pb::Priority::Normal }.into(),
             region: self.region.map(corners),
             region_pose: region_pose.as_ref().map(Into::into),
             approach: self
