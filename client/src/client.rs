@@ -43,7 +43,7 @@ pub enum Health {
 }
 
 impl Client {
-    /// Connects to `address`, such as `127.0.0.1:50051` or `http://robot:50051`.
+    /// Connects to `address`, such as `127.0.0.1:50051`, `http://robot:50051` or `unix:/run/graspd.sock`.
     ///
     /// # Errors
     /// [`Error::Connect`] when the server cannot be reached.
@@ -59,7 +59,11 @@ impl Client {
         let address = address.into();
         let tls = access.tls(&address);
         let scheme = if tls.is_some() { "https" } else { "http" };
-        let uri = if address.contains("://") { address.clone() } else { format!("{scheme}://{address}") };
+        let uri = if address.contains("://") || address.starts_with("unix:") {
+            address.clone()
+        } else {
+            format!("{scheme}://{address}")
+        };
         let connect = async || {
             let mut endpoint = Endpoint::from_shared(uri)?;
             if let Some(tls) = tls {

@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use grasp::{Maps, Volume};
+use ort::LoadDynamicError;
 use ort::environment::Environment;
 use ort::logging::LogLevel;
 use ort::session::Session;
@@ -191,12 +192,21 @@ fn load_library() -> Result<Runtime, RuntimeError> {
     let library = std::env::var_os("ORT_DYLIB_PATH").filter(|path| !path.is_empty());
     let library = library.map_or_else(|| PathBuf::from(format!("{DLL_PREFIX}onnxruntime{DLL_SUFFIX}")), PathBuf::from);
     let library_error = |error: &dyn std::fmt::Display| RuntimeError::Library { reason: error.to_string() };
-    let builder = ort::init_from(&library).map_err(|error| library_error(&error))?;
+    let builder = ort::init_from(&library).map_err(|error| library_error(&with_reason(&error)))?;
     let environment =
         builder.with_name("graspd").with_telemetry(false).build().map_err(|error| library_error(&error))?;
     environment.set_log_level(LogLevel::Warning);
     let info = RuntimeInfo { version: version(ort::info(), &library), library };
     Ok(Runtime { info, environment })
+}
+
+/// The error of a library that could not be loaded, with the words of the dynamic linker, which ort leaves out.
+fn with_reason(error: &LoadDynamicError) -> String {
+    let reason = match error {
+        LoadDynamicError::Dlopen { error, .. } => std::error::Error::source(error),
+        _ => None,
+    };
+    reason.map_or_else(|| error.to_string(), |reason| format!("{error}: {reason}"))
 }
 
 /// The version, parsed from the release branch in the build info. Other builds are identified by the file name of the

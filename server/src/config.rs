@@ -1,18 +1,21 @@
 mod errors;
 mod flags;
 
+use std::ffi::OsStr;
 use std::net::SocketAddr;
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 use std::thread::available_parallelism;
 use std::time::Duration;
 
+use clap::CommandFactory;
 use grasp_models::{Choice, Precision, Provider, Store};
-use tonic::transport::{Certificate, Identity, ServerTlsConfig};
 
 use crate::serving::queue::Batching;
 use crate::serving::stamps::{Stamps, stamps};
+use crate::transport::address::Address;
 use crate::transport::request_body::Limits;
+use crate::transport::tls::Tls;
 use crate::transport::tokens::Tokens;
 use errors::ConfigErrors;
 use flags::Flags;
@@ -28,7 +31,7 @@ pub(crate) struct Config {
     /// Time after which a reload no longer delays the next one.
     pub reload_timeout: Duration,
     pub default_model: Option<String>,
-    pub listen: SocketAddr,
+    pub listen: Address,
     pub http: SocketAddr,
     /// Further names of the HTTP listener.
     pub http_hosts: Vec<String>,
@@ -48,7 +51,7 @@ pub(crate) struct Config {
     /// Interval at which the model folder is polled; None disables polling.
     pub watch: Option<Duration>,
     /// The server's certificate, and the CA of client certificates.
-    pub tls: Option<ServerTlsConfig>,
+    pub tls: Option<Tls>,
     pub tokens: Option<Arc<Tokens>>,
     pub max_connections: usize,
     pub limits: Limits,
@@ -71,6 +74,20 @@ pub(crate) struct Config {
 const RECENT: usize = 20;
 
 impl Config {
+    /// Environment variables that are named like flags and are not. Those that Kubernetes sets for a service named
+    /// `graspd` are left out.
+    pub fn unknown_variables() -> Vec<String> {
+        let known: Vec<_> =
+            Flags::command().get_arguments().filter_map(|flag| flag.get_env()).map(OsStr::to_owned).collect();
+        let names = std::env::vars_os().map(|(name, _)| name).filter(|name| !known.contains(name));
+        let mut unknown: Vec<String> = names.filter_map(|name| name.into_string().ok()).collect();
+        unknown.retain(|name| {
+            name.strip_prefix("GRASPD_").is_some_and(|rest| !rest.starts_with("SERVICE_") && !rest.starts_with("PORT"))
+        });
+        unknown.sort();
+        unknown
+    }
+
     /// Reads the command line and the environment. The process ends on `--help` and on unknown flags.
     pub fn from_args() -> Result<Self, ConfigErrors> {
         let flags: Flags = ConfigErrors::parse()?;
@@ -93,25 +110,25 @@ impl Config {
         {
             errors.add::<Flags>("default_model", format_args!("is `{name}`: {error}"));
         }
-        match store {
-            Ok(store) if errors.is_empty() => Ok(Self::new(flags, store, stamps)),
+        // clap requires the certificate and the key to be given together.
+        let tls = flags.tls_cert.as_ref().zip(flags.tls_key.as_ref()).map(|(cert, key)| {
+            let ca = flags.tls_client_ca.as_ref().map(|ca| &*ca.0);
+            Tls::new(&cert.0, &key.0, ca).map_err(|error| {
+                let files = "--tls-cert, --tls-key and --tls-client-ca";
+                errors.add::<Flags>("tls_cert", format_args!("cannot be used with {files}: {error:#}"));
+            })
+        });
+        match (store, tls.transpose()) {
+            (Ok(store), Ok(tls)) if errors.is_empty() => Ok(Self::new(flags, store, stamps, tls)),
             _ => Err(errors),
         }
     }
 
-    fn new(flags: Flags, store: Store, stamps: Stamps) -> Self {
+    fn new(flags: Flags, store: Store, stamps: Stamps, tls: Option<Tls>) -> Self {
         let cpus = available_parallelism().map_or(1, NonZeroUsize::get);
         let workers = usize::from(flags.workers);
         let Choice(provider) = flags.provider;
         let Choice(precision) = flags.precision;
-        // clap requires the certificate and the key to be given together.
-        let tls = flags.tls_cert.zip(flags.tls_key).map(|(cert, key)| {
-            let tls = ServerTlsConfig::new().identity(Identity::from_pem(cert.0, key.0));
-            match flags.tls_client_ca {
-                Some(ca) => tls.client_ca_root(Certificate::from_pem(ca.0)),
-                None => tls,
-            }
-        });
         Self {
             store,
             stamps,

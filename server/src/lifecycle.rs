@@ -1,10 +1,9 @@
 //! Startup, serving and shutdown of the process.
 
 use std::io::Write;
-use std::net::SocketAddr;
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use anyhow::Context;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
@@ -68,10 +67,16 @@ fn runtime(config: &Config) -> anyhow::Result<Runtime> {
 /// Starts the runtime's tasks, serves, and joins the session threads.
 fn serve_until_stopped(config: &Config, runtime: Runtime, log: &Log, traces: &Traces) -> anyhow::Result<()> {
     let connections = allow_connections(config.max_connections);
+    for name in Config::unknown_variables() {
+        warn!(name, "unknown environment variable; see `graspd --help` for the known ones");
+    }
+    let metrics = Arc::new(Metrics::new(log.dropped.clone()));
+    if let Some(tls) = &config.tls {
+        tls.warn_of_expiry(SystemTime::now());
+        metrics.certificate(tls.expiry);
+    }
     let onnxruntime = grasp_models::init()?;
     info!(version = onnxruntime.version, library = %onnxruntime.library.display(), "ONNX Runtime loaded");
-
-    let metrics = Arc::new(Metrics::new(log.dropped.clone()));
     let sessions = Arc::new(SessionThreads::default());
     let served = runtime.block_on(serve(config, connections, &metrics, &sessions));
     traces.finish();
@@ -91,9 +96,10 @@ async fn serve(
 ) -> anyhow::Result<()> {
     let mut signals = Signals::new().context("cannot install a signal handler")?;
     let hangup = hangup().context("cannot install a signal handler")?;
-    let grpc = bind(config.listen, "--listen").await?;
-    let http = bind(config.http, "--http").await?;
-    announce(&format!("grpc listening on {}", grpc.local_addr()?));
+    let grpc = config.listen.bind().await.with_context(|| format!("cannot listen on --listen {}", config.listen))?;
+    let http =
+        TcpListener::bind(config.http).await.with_context(|| format!("cannot listen on --http {}", config.http))?;
+    announce(&format!("grpc listening on {}", grpc.address));
     announce(&format!("http listening on {}", http.local_addr()?));
 
     let readiness = Readiness::starting();
@@ -148,10 +154,6 @@ async fn serve(
     }
     http.abort();
     Ok(())
-}
-
-async fn bind(address: SocketAddr, flag: &str) -> anyhow::Result<TcpListener> {
-    TcpListener::bind(address).await.with_context(|| format!("cannot listen on {flag} {address}"))
 }
 
 /// Raises the soft limit of open files, often 1024, to the hard limit. Returns the connection limit: `connections`, or

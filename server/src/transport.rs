@@ -1,5 +1,6 @@
 //! Connections, TLS, tokens, deadlines, and limits on messages and buffered responses.
 
+pub(crate) mod address;
 pub(crate) mod caller;
 pub(crate) mod connections;
 pub(crate) mod deadline;
@@ -7,4 +8,5 @@ pub(crate) mod listener;
 pub(crate) mod receive_budget;
 pub(crate) mod request_body;
 pub(crate) mod response_buffer;
+pub(crate) mod tls;
 pub(crate) mod tokens;

@@ -7,12 +7,12 @@ from urllib.request import urlopen
 
 
 class Server:
-    """A server on free ports, or at `listen`. Its log goes to stderr."""
+    """A server on free ports, or at `listen`. Its log goes to stderr, or to the file `log`."""
 
-    def __init__(self, *flags, listen="127.0.0.1:0"):
+    def __init__(self, *flags, listen="127.0.0.1:0", log=None):
         models = ["--models", os.environ["GRASPD_MODELS"], "--provider", "cpu", "--threads", "1"]
         command = [os.environ["GRASPD"], *models, "--listen", listen, "--http", "127.0.0.1:0", *map(str, flags)]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
         # Both addresses, then `ready`.
         lines = "".join(self.process.stdout.readline() for _ in range(3))
         match = re.fullmatch(r"grpc listening on (\S+)\nhttp listening on (\S+)\nready\n", lines)

@@ -543,6 +543,38 @@ class RetryTest(unittest.TestCase):
         self.assertLessEqual(replace(retry, attempts=10**6).after(10**5, busy), 0.4)
 
 
+class ReplicasTest(unittest.TestCase):
+    def test_calls_are_distributed_to_all_replicas_of_a_target(self):
+        volume = scene.volume(*CAMERAS)
+        with Server() as first, Server() as second:
+            target = f"ipv4:{first.grpc},{second.grpc}"
+            with graspd.Client(target) as client:
+                for _ in range(10):
+                    self.assertTrue(client.detect(volume, LOW).grasps)
+
+            async def detect():
+                async with graspd.aio.Client(target) as client:
+                    for _ in range(10):
+                        self.assertTrue((await client.detect(volume, LOW)).grasps)
+
+            asyncio.run(detect())
+            model = graspd.Client(first.grpc).models()[0]
+            series = f'graspd_requests_total{{code="OK",model="{model.name} {model.version}"}}'
+            answered = [server.metric(series) for server in (first, second)]
+            self.assertTrue(sum(answered) == 20 and min(answered) >= 5, answered)
+
+    def test_a_malformed_authority_is_logged(self):
+        with tempfile.TemporaryFile() as log:
+            with Server(log=log) as server:
+                options = [("grpc.default_authority", "127.0.0.1:1,127.0.0.1:2")]
+                with grpc.insecure_channel(server.grpc, options) as channel:
+                    call = channel.unary_unary("/grasp.v1.GraspService/ListModels")
+                    with self.assertRaises(grpc.RpcError):
+                        call(b"", timeout=10)
+            log.seek(0)
+            self.assertIn(b"malformed authority", log.read())
+
+
 class SecurityTest(unittest.TestCase):
     def setUp(self):
         self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))

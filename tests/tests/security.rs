@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::PathBuf;
 use std::process::Command;
-use std::time::Duration;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use grasp::Volume;
 use grasp_client::{Access, Certificate, Client, Error, Health, Identity, Options};
@@ -11,6 +11,7 @@ use grasp_tests::{RESOLUTION, Server, TestModel, blobs, grasp, graspd};
 use nalgebra::Isometry3;
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
 use tempfile::TempDir;
+use time::OffsetDateTime;
 use tokio::time::timeout;
 use tonic::Code;
 
@@ -36,8 +37,14 @@ impl Authority {
 
     /// Writes `NAME.pem` and `NAME.key`.
     fn sign(&self, name: &str) -> Identity {
+        self.sign_until(name, 365)
+    }
+
+    /// The same, for a certificate that expires in this many days.
+    fn sign_until(&self, name: &str, days: i64) -> Identity {
         let key = KeyPair::generate().unwrap();
-        let params = CertificateParams::new(["localhost".to_owned(), "127.0.0.1".to_owned()]).unwrap();
+        let mut params = CertificateParams::new(["localhost".to_owned(), "127.0.0.1".to_owned()]).unwrap();
+        params.not_after = OffsetDateTime::now_utc() + time::Duration::days(days);
         let certificate = params.signed_by(&key, &self.issuer).unwrap().pem();
         fs::write(self.file(&format!("{name}.pem")), &certificate).unwrap();
         fs::write(self.file(&format!("{name}.key")), key.serialize_pem()).unwrap();
@@ -169,15 +176,67 @@ fn incomplete_or_invalid_settings_are_errors() {
         let text = String::from_utf8(output.stderr).unwrap();
         assert!(text.contains(error), "`{error}` is missing from:\n{text}");
     }
-    // A key in place of a certificate is found only when TLS is set up.
+    // These are found before the models are loaded.
     let folder = tempfile::tempdir().unwrap();
     TestModel::new("mirror").write(folder.path());
-    let output = Command::new(graspd())
-        .args(["--models".as_ref(), folder.path().as_os_str()])
-        .args(["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0", "--tls-cert", &key, "--tls-key", &key])
-        .output()
-        .unwrap();
+    let other = Authority::new();
+    other.sign("server");
+    let other_key = other.path("server.key");
+    for (cert, key, ca, error) in [
+        (&key, &key, None, "cannot read --tls-cert: it contains no certificate"),
+        (&cert, &other_key, None, "KeyMismatch"),
+        (&cert, &cert, None, "cannot use the files"),
+        (&cert, &key, Some(&key), "cannot read --tls-client-ca: it contains no certificate"),
+    ] {
+        let mut command = Command::new(graspd());
+        command.args(["--models".as_ref(), folder.path().as_os_str()]).env("ORT_DYLIB_PATH", "/no/such.so");
+        command.args(["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0", "--tls-cert", cert, "--tls-key", key]);
+        if let Some(ca) = ca {
+            command.args(["--tls-client-ca", ca]);
+        }
+        let output = command.output().unwrap();
+        let text = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{text}");
+        assert!(text.contains("--tls-cert (GRASPD_TLS_CERT) cannot be used") && text.contains(error), "{text}");
+    }
+}
+
+/// The log of a server with these flags and variables, which cannot load ONNX Runtime and so ends at once.
+fn log_of_start(flags: &[&str], variables: &[(&str, &str)]) -> String {
+    let folder = tempfile::tempdir().unwrap();
+    TestModel::new("mirror").write(folder.path());
+    let mut command = Command::new(graspd());
+    command.args(["--models".as_ref(), folder.path().as_os_str()]).args(flags);
+    command.envs(variables.iter().copied()).env("ORT_DYLIB_PATH", graspd());
+    let output = command.output().unwrap();
     assert_eq!(output.status.code(), Some(1));
-    let text = String::from_utf8(output.stderr).unwrap();
-    assert!(text.contains("cannot use the files of --tls-cert, --tls-key and --tls-client-ca"), "{text}");
+    String::from_utf8(output.stderr).unwrap()
+}
+
+#[test]
+fn unknown_variables_are_named_and_the_reason_why_a_library_cannot_be_loaded() {
+    let variables =
+        [("GRASPD_THREAD", "2"), ("GRASPD_SERVICE_HOST", "10.0.0.1"), ("GRASPD_PORT_50051_TCP", "tcp://10.0.0.1")];
+    let log = log_of_start(&[], &variables);
+    assert!(log.contains("unknown environment variable") && log.contains("GRASPD_THREAD"), "{log}");
+    assert!(!log.contains("GRASPD_SERVICE_HOST") && !log.contains("GRASPD_PORT"), "{log}");
+    // The dynamic linker's words.
+    assert!(log.contains("cannot dynamically load position-independent executable"), "{log}");
+}
+
+#[tokio::test]
+async fn the_end_of_a_certificate_is_a_metric_and_a_warning() {
+    let authority = Authority::new();
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs_f64();
+    for (name, days, warning) in [("old", -1, "has expired"), ("soon", 10, "expires soon"), ("new", 100, "")] {
+        authority.sign_until(name, days);
+        let (cert, key) = (authority.path(&format!("{name}.pem")), authority.path(&format!("{name}.key")));
+        let flags = ["--tls-cert", &cert, "--tls-key", &key];
+        let server = Server::run(&[TestModel::new("mirror")], &flags);
+        let left = server.metric("graspd_certificate_expiry_seconds") - now;
+        assert!((left - days as f64 * 86_400.0).abs() < 3600.0, "{name}: {left}");
+        let log = log_of_start(&flags, &[]);
+        assert_eq!(log.contains("the certificate of --tls-cert"), !warning.is_empty(), "{log}");
+        assert!(log.contains(warning), "{log}");
+    }
 }

@@ -11,13 +11,14 @@ use grasp_models::{Choice, MAX_MODEL_BYTES, Precision, Provider, StoreError};
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::ParseError;
 
+use crate::transport::address::Address;
 use crate::transport::tokens::Tokens;
 
 /// Detects 6-DoF grasps in depth images, point clouds and TSDF volumes, over gRPC.
 ///
 /// Each flag can also be set by an environment variable. ORT_DYLIB_PATH is the path of ONNX Runtime's shared library.
 #[derive(Parser)]
-#[command(name = "graspd", version, max_term_width = 100)]
+#[command(name = "graspd", version, max_term_width = 100, allow_negative_numbers = true)]
 pub(super) struct Flags {
     /// Model folder. All .onnx files in it are served.
     #[arg(
@@ -37,9 +38,10 @@ pub(super) struct Flags {
     #[arg(long, env = "GRASPD_DEFAULT_MODEL", value_name = "NAME")]
     pub default_model: Option<String>,
 
-    /// Address of the gRPC listener. Port 0 selects a free port, which is printed to stdout.
+    /// Address of the gRPC listener: an IP address with a port, or unix:PATH. Port 0 selects a free port, which is
+    /// printed to stdout.
     #[arg(long, env = "GRASPD_LISTEN", value_name = "ADDR", default_value = "127.0.0.1:50051")]
-    pub listen: SocketAddr,
+    pub listen: Address,
 
     /// Address of the HTTP listener: /metrics (Prometheus), /healthz, /readyz and the web page at /.
     #[arg(long, env = "GRASPD_HTTP", value_name = "ADDR", default_value = "127.0.0.1:9090")]
@@ -84,7 +86,6 @@ pub(super) struct Flags {
         env = "GRASPD_BATCH_DELAY",
         value_name = "MS",
         default_value = "0",
-        allow_negative_numbers = true,
         value_parser = milliseconds,
     )]
     pub batch_delay: Duration,
@@ -96,7 +97,6 @@ pub(super) struct Flags {
         env = "GRASPD_WATCH",
         value_name = "SECONDS",
         default_value = "2",
-        allow_negative_numbers = true,
         value_parser = seconds,
     )]
     pub watch: Duration,
@@ -107,7 +107,6 @@ pub(super) struct Flags {
         env = "GRASPD_RELOAD_TIMEOUT",
         value_name = "SECONDS",
         default_value = "60",
-        allow_negative_numbers = true,
         value_parser = positive_seconds,
     )]
     pub reload_timeout: Duration,
@@ -166,7 +165,6 @@ pub(super) struct Flags {
         env = "GRASPD_TRACK_TIMEOUT",
         value_name = "SECONDS",
         default_value = "60",
-        allow_negative_numbers = true,
         value_parser = seconds,
     )]
     pub track_timeout: Duration,
@@ -182,7 +180,6 @@ pub(super) struct Flags {
         env = "GRASPD_STALL_TIMEOUT",
         value_name = "SECONDS",
         default_value = "10",
-        allow_negative_numbers = true,
         value_parser = positive_seconds,
     )]
     pub stall_timeout: Duration,
@@ -202,7 +199,6 @@ pub(super) struct Flags {
         env = "GRASPD_DRAIN_TIMEOUT",
         value_name = "SECONDS",
         default_value = "20",
-        allow_negative_numbers = true,
         value_parser = seconds,
     )]
     pub drain_timeout: Duration,
@@ -214,13 +210,16 @@ pub(super) struct Flags {
     pub otlp: Option<String>,
 
     /// Log filter: a level, or directives of Rust's `tracing` such as `warn,graspd=debug`. The log goes to stderr.
-    #[arg(long, env = "GRASPD_LOG", value_name = "FILTER", default_value = "info", value_parser = log_filter)]
+    #[arg(long, env = "GRASPD_LOG", value_name = "FILTER", default_value = LOG, value_parser = log_filter)]
     pub log: String,
 
     /// Log format: text or json.
     #[arg(long, value_enum, env = "GRASPD_LOG_FORMAT", value_name = "FORMAT", default_value = "text")]
     pub log_format: LogFormat,
 }
+
+/// Default log filter. HTTP/2 reports malformed headers, which end a call before graspd sees it, at the level `debug`.
+const LOG: &str = "info,h2::server=debug";
 
 /// Format of the log.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

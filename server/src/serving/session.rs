@@ -9,7 +9,7 @@ use grasp_models::batch_sizes;
 use grasp_planner::{Inference, Loaded, NetworkPlanner, PlanParams, Planner};
 use nalgebra::Isometry3;
 use prometheus::Histogram;
-use tracing::error;
+use tracing::{Span, error};
 
 use super::detection::{Detection, Score};
 use super::job::{EngineError, Job, Sender, SessionOutput, Task, Tensors};
@@ -123,7 +123,6 @@ fn infer<'a>(
     let mut output = caught(|| Ok(network.infer(&volumes)?));
     let times = done(started.elapsed());
     for (index, Job { scene, task, deadline, span, submitted }) in jobs.into_iter().enumerate() {
-        let _entered = span.enter();
         if task.is_closed() || deadline.is_some_and(Deadline::has_passed) {
             // Skips the decoding, so that the other jobs of the batch finish earlier.
             task.fail(EngineError::Expired);
@@ -132,7 +131,8 @@ fn infer<'a>(
         let output = match &mut output {
             Ok(output) => output,
             Err(error) => {
-                error!(%error, "the session failed");
+                span.in_scope(|| error!(%error, "the session failed"));
+                drop(span);
                 task.fail(error.clone());
                 continue;
             }
@@ -140,21 +140,23 @@ fn infer<'a>(
         let started = Instant::now();
         match task {
             Task::Grasps(params, reply) => {
-                let decoded = caught(|| {
-                    let is_wanted = || !reply.is_closed() && !deadline.is_some_and(Deadline::has_passed);
-                    Ok(output.decode(index, &scene.volume, &params.decode_params(defaults), &is_wanted)?)
+                let decoded = span.in_scope(|| {
+                    caught(|| {
+                        let is_wanted = || !reply.is_closed() && !deadline.is_some_and(Deadline::has_passed);
+                        Ok(output.decode(index, &scene.volume, &params.decode_params(defaults), &is_wanted)?)
+                    })
                 });
                 let detection = || Ok(Detection::of(decoded?, scene.volume, &params));
-                send_result(reply, submitted, times, started, detection);
+                send_result(reply, span, submitted, times, started, detection);
             }
             Task::Scores(params, candidates, reply) => {
                 let decode = params.decode_params(defaults);
                 let poses: Vec<_> = candidates.iter().map(|candidate| candidate.pose).collect();
-                let qualities = caught(|| Ok(output.score(index, &scene.volume, &poses, &decode)?));
+                let qualities = span.in_scope(|| caught(|| Ok(output.score(index, &scene.volume, &poses, &decode)?)));
                 let scores = || Ok(Score::of(&candidates, qualities?, &scene.volume, &params, decode.threshold));
-                send_result(reply, submitted, times, started, scores);
+                send_result(reply, span, submitted, times, started, scores);
             }
-            Task::Maps(reply) => send_result(reply, submitted, times, started, || Ok(tensors(output, index))),
+            Task::Maps(reply) => send_result(reply, span, submitted, times, started, || Ok(tensors(output, index))),
         }
     }
 }
@@ -167,18 +169,19 @@ fn plan<'a>(
     done: impl FnOnce(Duration) -> BatchTimes<'a>,
 ) {
     let Job { scene, task, deadline, span, submitted } = job;
-    let _entered = span.enter();
     match task {
         Task::Grasps(params, reply) => {
             let started = Instant::now();
             let keep_going = || !reply.is_closed() && !deadline.is_some_and(Deadline::has_passed);
-            let decoded = caught(|| {
-                let params = PlanParams { decode: params.decode_params(defaults), table: params.table };
-                Ok(planner.plan(&scene, &params, &keep_going)?)
+            let decoded = span.in_scope(|| {
+                caught(|| {
+                    let params = PlanParams { decode: params.decode_params(defaults), table: params.table };
+                    Ok(planner.plan(&scene, &params, &keep_going)?)
+                })
             });
             let times = done(started.elapsed());
             let detection = || Ok(Detection::of(decoded?, scene.volume, &params));
-            send_result(reply, submitted, times, Instant::now(), detection);
+            send_result(reply, span, submitted, times, Instant::now(), detection);
         }
         Task::Maps(_) | Task::Scores(..) => {
             done(Duration::ZERO);
@@ -187,21 +190,25 @@ fn plan<'a>(
     }
 }
 
-/// Ends the post-processing, which began at `started`, and sends its result.
+/// Ends the post-processing, which began at `started`, and sends its result. The job's part of the span ends before:
+/// otherwise a server that stops after the reply could lose the span.
 fn send_result<T>(
     reply: Sender<T>,
+    span: Span,
     submitted: Instant,
     times: BatchTimes<'_>,
     started: Instant,
     postprocess: impl FnOnce() -> Result<T, EngineError>,
 ) {
-    let result = caught(postprocess);
-    // Expired requests are logged by their call.
-    if let Err(error) = &result
-        && !matches!(error, EngineError::Expired)
-    {
-        error!(%error, "the session failed");
-    }
+    let result = span.in_scope(|| {
+        caught(postprocess).inspect_err(|error| {
+            // Expired requests are logged by their call.
+            if !matches!(error, EngineError::Expired) {
+                error!(%error, "the session failed");
+            }
+        })
+    });
+    drop(span);
     let BatchTimes { taken, inference, scenes, service_time } = times;
     // The time per scene, including decoding. Set before the reply, so that the next refusal already has it.
     service_time.add(taken.elapsed() / scenes);

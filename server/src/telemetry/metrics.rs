@@ -48,6 +48,7 @@ pub(crate) struct Metrics {
     receiving_limit: IntGauge,
     connections_limit: IntGauge,
     connections_refused: IntCounter,
+    certificate: IntGauge,
     ready: IntGauge,
     tracked: IntGauge,
     dropped_lines: IntCounter,
@@ -135,6 +136,10 @@ impl Metrics {
             connections_refused: counter(
                 "graspd_connections_refused_total",
                 "Connections refused because the limit was reached.",
+            ),
+            certificate: gauge(
+                "graspd_certificate_expiry_seconds",
+                "When the certificate of --tls-cert expires, seconds since 1970; 0 without TLS.",
             ),
             ready: gauge("graspd_ready", "1 while the server accepts requests, 0 during startup and shutdown."),
             tracked: gauge("graspd_tracked_volumes", "Open TrackGrasps streams, each with one volume."),
@@ -231,6 +236,11 @@ impl Metrics {
     pub fn receiving(&self, capacity: usize) -> Arc<ReceiveBudget> {
         self.receiving_limit.set(i64::try_from(capacity).unwrap_or(i64::MAX));
         ReceiveBudget::new(capacity, self.receiving.clone())
+    }
+
+    /// Records when the server's certificate expires, seconds since 1970.
+    pub fn certificate(&self, expiry: i64) {
+        self.certificate.set(expiry);
     }
 
     /// The gauge of open TrackGrasps streams.

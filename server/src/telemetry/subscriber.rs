@@ -28,6 +28,9 @@ const NAME: &str = env!("CARGO_PKG_NAME");
 /// Name of the span of a request, the only span that is exported from `tracing`.
 pub(crate) const REQUEST: &str = "detect";
 
+/// Maximum time that the last export may delay the exit.
+const EXPORT: Duration = Duration::from_secs(1);
+
 /// Log lines that are buffered; further lines are dropped and counted.
 const LINES: usize = 8192;
 
@@ -83,7 +86,7 @@ impl Traces {
     /// Sends the remaining spans.
     pub fn finish(&self) {
         if let Some(provider) = &self.0
-            && let Err(error) = provider.shutdown()
+            && let Err(error) = provider.shutdown_with_timeout(EXPORT)
         {
             warn!(%error, "cannot send the last spans to the collector (--otlp)");
         }

@@ -8,12 +8,12 @@ use std::time::Duration;
 use http::Extensions;
 use prometheus::{IntCounter, IntGauge};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::net::{TcpListener, TcpStream};
 use tokio::time::{Sleep, sleep};
 use tokio_stream::{Stream, StreamExt};
-use tonic::transport::server::{Connected, TcpIncoming, TlsConnectInfo};
+use tonic::transport::server::{Connected, TlsConnectInfo};
 use tracing::warn;
 
+use crate::transport::address::{Listener, Socket, peer};
 use crate::transport::receive_budget::{ConnectionShare, ReceiveBudget};
 
 /// The limit on open connections, with its metrics.
@@ -28,14 +28,12 @@ pub(crate) struct ConnectionLimit {
 /// Accepts the connections of a listener. Connections beyond the limit are closed immediately, which clients report as
 /// UNAVAILABLE.
 pub(crate) fn accept(
-    listener: TcpListener,
+    listener: Listener,
     limit: ConnectionLimit,
     budget: Arc<ReceiveBudget>,
 ) -> impl Stream<Item = io::Result<Connection>> {
     let ConnectionLimit { limit, timeout, open, refused } = limit;
-    // `Server::tcp_nodelay` has no effect on a listener that is already bound. Without TCP_NODELAY, a response of
-    // several packets is delayed by 40 ms until the client acknowledges the first.
-    let accepted = TcpIncoming::from(listener).with_nodelay(Some(true)).then(async |accepted| {
+    let accepted = listener.sockets().then(async |accepted| {
         if let Err(error) = &accepted {
             // The most likely cause is the limit of open files. An immediate retry would fail again.
             warn!(%error, "cannot accept a connection");
@@ -65,7 +63,7 @@ const PREFACE: usize = 24;
 
 /// A connection, counted in `open` until it is dropped.
 pub(crate) struct Connection {
-    stream: TcpStream,
+    stream: Socket,
     /// Missing bytes of the preface and their timeout; None after the preface.
     preface: Option<(usize, Pin<Box<Sleep>>)>,
     open: IntGauge,
@@ -75,7 +73,7 @@ pub(crate) struct Connection {
 /// The client of a connection.
 #[derive(Clone)]
 pub(crate) struct Peer {
-    /// None if the connection has ended already.
+    /// None for UNIX sockets, or if the connection has ended already.
     pub address: Option<SocketAddr>,
     pub share: ConnectionShare,
 }
@@ -88,9 +86,9 @@ impl Peer {
 }
 
 impl Connection {
-    fn new(stream: TcpStream, timeout: Duration, open: &IntGauge, budget: &Arc<ReceiveBudget>) -> Self {
+    fn new(stream: Socket, timeout: Duration, open: &IntGauge, budget: &Arc<ReceiveBudget>) -> Self {
         open.inc();
-        let peer = Peer { address: stream.peer_addr().ok(), share: budget.connection() };
+        let peer = Peer { address: peer(&stream), share: budget.connection() };
         Self { stream, preface: Some((PREFACE, Box::pin(sleep(timeout)))), open: open.clone(), peer }
     }
 }
@@ -161,9 +159,18 @@ mod tests {
     use std::pin::pin;
 
     use tokio::io::AsyncReadExt;
+    use tokio::net::TcpStream;
     use tokio::time::Instant;
+    use tokio_util::either::Either;
 
     use super::*;
+    use crate::transport::address::Address;
+
+    async fn listener() -> (Listener, SocketAddr) {
+        let listener = Address::Tcp(([127, 0, 0, 1], 0).into()).bind().await.unwrap();
+        let Address::Tcp(address) = listener.address else { panic!("{}", listener.address) };
+        (listener, address)
+    }
 
     fn budget() -> Arc<ReceiveBudget> {
         ReceiveBudget::new(1, IntGauge::new("receiving", "Bytes.").unwrap())
@@ -171,8 +178,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn a_connection_without_a_preface_ends_after_the_timeout() {
-        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let address = listener.local_addr().unwrap();
+        let (listener, address) = listener().await;
         let open = IntGauge::new("open", "Open connections.").unwrap();
         let refused = IntCounter::new("refused", "Refused connections.").unwrap();
         let timeout = Duration::from_secs(10);
@@ -187,8 +193,7 @@ mod tests {
 
     #[tokio::test]
     async fn connections_are_counted_and_limited_and_have_tcp_nodelay() {
-        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let address = listener.local_addr().unwrap();
+        let (listener, address) = listener().await;
         let open = IntGauge::new("open", "Open connections.").unwrap();
         let refused = IntCounter::new("refused", "Refused connections.").unwrap();
         let limit = ConnectionLimit {
@@ -201,7 +206,8 @@ mod tests {
 
         let _first = TcpStream::connect(address).await.unwrap();
         let connection = incoming.next().await.unwrap().unwrap();
-        assert!(connection.stream.nodelay().unwrap());
+        let Either::Left(stream) = &connection.stream else { panic!("it is a TCP connection") };
+        assert!(stream.nodelay().unwrap());
         assert_eq!(open.get(), 1);
 
         let mut second = TcpStream::connect(address).await.unwrap();

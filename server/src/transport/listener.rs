@@ -5,12 +5,11 @@ use anyhow::Context;
 use grasp_proto::FILE_DESCRIPTOR_SET;
 use grasp_proto::oip::grpc_inference_service_server::GrpcInferenceServiceServer;
 use grasp_proto::pb::grasp_service_server::GraspServiceServer;
-use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tonic::body::Body;
 use tonic::codec::CompressionEncoding;
 use tonic::service::interceptor::InterceptedService;
-use tonic::transport::{Server, ServerTlsConfig};
+use tonic::transport::Server;
 use tonic_health::pb::health_server::HealthServer;
 use tower::util::{MapRequestLayer, MapResponseLayer};
 
@@ -18,9 +17,11 @@ use crate::readiness::{Health, State, draining};
 use crate::rpc::grasp_service::GraspRpc;
 use crate::rpc::inference_service::InferenceRpc;
 use crate::telemetry::metrics::Metrics;
+use crate::transport::address::Listener;
 use crate::transport::connections::Peer;
 use crate::transport::request_body::{Limits, RequestBody};
 use crate::transport::response_buffer::keep_permit;
+use crate::transport::tls::Tls;
 use crate::transport::tokens::Tokens;
 use crate::transport::{connections, deadline, request_body, tokens};
 
@@ -40,7 +41,7 @@ const MAX_STREAMS: u32 = 256;
 /// Settings of the gRPC listener.
 pub(crate) struct GrpcConfig {
     /// None for plaintext.
-    pub tls: Option<ServerTlsConfig>,
+    pub tls: Option<Tls>,
     /// None if requests need no token.
     pub tokens: Option<Arc<Tokens>>,
     /// Maximum number of open connections.
@@ -52,7 +53,7 @@ pub(crate) struct GrpcConfig {
 
 /// Serves until the state is draining and all accepted requests are finished.
 pub(crate) async fn serve(
-    listener: TcpListener,
+    listener: Listener,
     config: GrpcConfig,
     service: GraspRpc,
     inference: InferenceRpc,
@@ -89,8 +90,8 @@ pub(crate) async fn serve(
     let mut server = Server::builder();
     if let Some(tls) = tls {
         server = server
-            .tls_config(tls.timeout(limits.stall))
-            .context("cannot use the files of --tls-cert, --tls-key and --tls-client-ca; check their PEM content")?;
+            .tls_config(tls.config.timeout(limits.stall))
+            .context("cannot use the files of --tls-cert, --tls-key and --tls-client-ca")?;
     }
     server
         .layer(intake)

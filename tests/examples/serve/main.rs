@@ -11,6 +11,7 @@
 mod conditions;
 mod depth;
 mod findings;
+mod overload;
 mod peers;
 
 use std::path::{Path, PathBuf};
@@ -40,7 +41,7 @@ const CALLERS: [usize; 3] = [1, 8, 32];
 /// Batch sizes. The best throughput of these is the capacity of the machine.
 const BATCHES: [usize; 4] = [1, 2, 4, 8];
 /// Targets. Those with libtorch are shares of the latency of its eager mode in fp32.
-const AIMS: [(&str, Aim); 8] = [
+const AIMS: [(&str, Aim); 13] = [
     ("hop_p50_ms", Aim::AtMost(0.6)),
     ("hop_p99_ms", Aim::AtMost(1.5)),
     ("vgn_vs_torch", Aim::AtMost(1.0 / 12.0)),
@@ -49,6 +50,11 @@ const AIMS: [(&str, Aim); 8] = [
     ("throughput_ratio", Aim::AtLeast(0.95)),
     ("table_p50_ms", Aim::AtMost(100.0)),
     ("track_p99_ms", Aim::AtMost(33.0)),
+    ("vgn_overload_goodput", Aim::AtLeast(0.9)),
+    ("vgn_deadline_goodput", Aim::AtLeast(0.85)),
+    ("transformer_overload_goodput", Aim::AtLeast(0.9)),
+    ("transformer_deadline_goodput", Aim::AtLeast(0.85)),
+    ("burst_answered", Aim::AtLeast(95.0)),
 ];
 
 #[tokio::main(flavor = "current_thread")]
@@ -63,6 +69,7 @@ async fn main() -> anyhow::Result<()> {
     }
     bench.throughput(&mut findings).await?;
     bench.depth(&mut findings).await?;
+    bench.overload(&mut findings).await?;
     bench.start_up(&mut findings)?;
     findings.compare(&AIMS);
     let stolen = started.percent_until(Stolen::so_far());

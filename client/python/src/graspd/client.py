@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from graspd import grasp_pb2 as pb
 from graspd import methods, wire
-from graspd.connection import OPTIONS, Connection
+from graspd.connection import ChannelOptions, Connection
 from graspd.detection import Detection, FoundTable, Model, Scores
 from graspd.errors import Error, from_status
 from graspd.geometry import PoseLike
@@ -136,10 +136,12 @@ class Client(Connection[grpc.Channel]):
         """Whether the server is ready; False while it is warming up or shutting down."""
         return self._call(methods.CHECK, HealthCheckRequest())
 
-    def _open(self, target: str, credentials: grpc.ChannelCredentials | None) -> grpc.Channel:
+    def _open(
+        self, target: str, credentials: grpc.ChannelCredentials | None, options: ChannelOptions
+    ) -> grpc.Channel:
         if credentials is None:
-            return grpc.insecure_channel(target, OPTIONS)
-        return grpc.secure_channel(target, credentials, OPTIONS)
+            return grpc.insecure_channel(target, options)
+        return grpc.secure_channel(target, credentials, options)
 
     def _call(self, method: Method[Request, Response, Answer], request: Request) -> Answer:
         call = self._channel.unary_unary(method.path, method.serialize, method.parse)

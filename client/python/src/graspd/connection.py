@@ -12,8 +12,9 @@ from graspd.retry import Retry
 
 Channel = TypeVar("Channel")
 File: TypeAlias = "str | PathLike[str]"
+ChannelOptions: TypeAlias = "tuple[tuple[str, int | str], ...]"
 
-OPTIONS = (
+OPTIONS: ChannelOptions = (
     # A low threshold can return tens of thousands of grasps.
     ("grpc.max_receive_message_length", -1),
     # Reconnect within the pauses of `Retry`. By default gRPC waits for seconds.
@@ -39,8 +40,8 @@ class Connection(Generic[Channel]):
         timeout: float | None = 10.0,
         retry: Retry = Retry.RECOMMENDED,
     ) -> None:
-        """Creates a client of the graspd at `address`, such as ``127.0.0.1:50051`` or ``https://robot:50051``. The
-        first call connects.
+        """Creates a client of the graspd at `address`, such as ``127.0.0.1:50051``, ``https://robot:50051``,
+        ``unix:/run/graspd.sock``, or replicas such as ``ipv4:10.0.0.1:50051,10.0.0.2:50051``. The first call connects.
 
         TLS is used if the address begins with ``https://`` or a PEM file is given: `tls_ca`, the CA that signed the
         server's certificate (default: gRPC's root CAs), or `tls_cert` and `tls_key`, the client certificate for mutual
@@ -53,13 +54,23 @@ class Connection(Generic[Channel]):
         credentials = None
         if ca or cert or address.startswith("https://"):
             credentials = grpc.ssl_channel_credentials(ca, key, cert)
-        self._channel = self._open(address.removeprefix("http://").removeprefix("https://"), credentials)
+        target = address.removeprefix("http://").removeprefix("https://")
+        self._channel = self._open(target, credentials, OPTIONS + replicas(target))
         self._metadata = () if token is None else (("authorization", bearer(token)),)
         self._timeout = timeout
         self._retry = retry
 
-    def _open(self, target: str, credentials: grpc.ChannelCredentials | None) -> Channel:
+    def _open(self, target: str, credentials: grpc.ChannelCredentials | None, options: ChannelOptions) -> Channel:
         raise NotImplementedError
+
+
+def replicas(target: str) -> ChannelOptions:
+    """The options for a target with several addresses: calls are distributed to all of them."""
+    scheme, _, addresses = target.partition(":")
+    if scheme not in ("ipv4", "ipv6") or "," not in addresses:
+        return ()
+    # gRPC sends the whole list as the authority of a call, which is not valid in HTTP/2.
+    return (("grpc.lb_policy_name", "round_robin"), ("grpc.default_authority", addresses.split(",")[0]))
 
 
 def bearer(token: str) -> str:

@@ -270,7 +270,7 @@ def options_message(options: Options) -> pb.Options:
         objects=options.objects,
         max_grasps_per_object=options.max_grasps_per_object,
         margin=options.margin,
-        priority=pb.Priority.Value(f"PRIORITY_{options.priority.upper()}"),
+        priority=f"PRIORITY_{options.priority.upper()}",
     )
 
 

@@ -1,0 +1,57 @@
+//! The files of TLS, checked before the models are loaded.
+
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use anyhow::Context;
+use tonic::transport::{Certificate, Identity, Server, ServerTlsConfig};
+use tracing::warn;
+use x509_parser::pem::Pem;
+
+/// How long before its end a certificate is warned about.
+const SOON: Duration = Duration::from_secs(14 * 24 * 3600);
+
+/// A checked configuration of TLS.
+#[derive(Clone)]
+pub(crate) struct Tls {
+    pub config: ServerTlsConfig,
+    /// When the first certificate of the chain expires, seconds since 1970.
+    pub expiry: i64,
+}
+
+impl Tls {
+    /// Checks that the files are PEM, and that the key belongs to the certificate. `client_ca` signs the certificates
+    /// of clients.
+    pub fn new(certificate: &[u8], key: &[u8], client_ca: Option<&[u8]>) -> anyhow::Result<Self> {
+        let expiry = expiry(certificate).context("cannot read --tls-cert")?;
+        let mut config = ServerTlsConfig::new().identity(Identity::from_pem(certificate, key));
+        if let Some(ca) = client_ca {
+            self::expiry(ca).context("cannot read --tls-client-ca")?;
+            config = config.client_ca_root(Certificate::from_pem(ca));
+        }
+        Server::builder().tls_config(config.clone()).context("cannot use the files")?;
+        Ok(Self { config, expiry })
+    }
+
+    /// Logs a warning if a certificate has expired or expires soon.
+    pub fn warn_of_expiry(&self, now: SystemTime) {
+        let left = self.expiry - now.duration_since(UNIX_EPOCH).map_or(0, |time| time.as_secs()).cast_signed();
+        if left <= 0 {
+            warn!(seconds = -left, "the certificate of --tls-cert has expired: clients refuse it");
+        } else if left.cast_unsigned() < SOON.as_secs() {
+            warn!(days = left / (24 * 3600), "the certificate of --tls-cert expires soon");
+        }
+    }
+}
+
+/// When the first of some certificates expires, seconds since 1970.
+fn expiry(pem: &[u8]) -> anyhow::Result<i64> {
+    let mut first: Option<i64> = None;
+    for block in Pem::iter_from_buffer(pem) {
+        let block = block.context("it is not PEM")?;
+        if block.label == "CERTIFICATE" {
+            let end = block.parse_x509().context("a certificate is malformed")?.validity().not_after.timestamp();
+            first = Some(first.map_or(end, |first| first.min(end)));
+        }
+    }
+    first.context("it contains no certificate")
+}

@@ -1,0 +1,96 @@
+//! More requests than the server can answer: with deadlines, in a burst, and from unequal callers.
+
+use std::fs;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context;
+use grasp_client::{Access, Arrivals, Client, Options, Retry, Until};
+
+use crate::findings::{Findings, Table};
+use crate::{Bench, run_load};
+
+/// Arrivals relative to the capacity.
+const OVERLOAD: f64 = 3.0;
+
+/// Networks, and deadlines that are shorter than the wait in a full queue.
+const DEADLINES: [(&str, Duration); 2] =
+    [("vgn", Duration::from_millis(60)), ("transformer", Duration::from_millis(250))];
+
+/// Concurrent calls that are all retried as recommended.
+const BURST: usize = 100;
+
+impl Bench {
+    /// The share of the capacity that remains under overload, and how it is shared.
+    pub async fn overload(&self, findings: &mut Findings) -> anyhow::Result<()> {
+        let mut table = Table::new(
+            &format!("{OVERLOAD} times the capacity, {:?} each", 2 * self.seconds),
+            &["capacity /s", "arrivals /s", "answers /s", "of capacity", "refused"],
+        );
+        for (network, deadline) in DEADLINES {
+            let server = self.serve(network, &[])?;
+            let client = Client::connect(server.grpc().to_string()).await?;
+            let until = Until::Elapsed(2 * self.seconds);
+            let callers = Arrivals::Callers(8);
+            let capacity = run_load(&client, &self.scene, callers, until, Options::default()).await.throughput();
+            for timeout in [None, Some(deadline)] {
+                let options = Options { timeout, ..Options::default() };
+                let arrivals = Arrivals::Rate(OVERLOAD * capacity);
+                let report = run_load(&client, &self.scene, arrivals, until, options).await;
+                let goodput = report.throughput();
+                let kind =
+                    timeout.map_or("without deadlines".to_owned(), |timeout| format!("deadlines of {timeout:?}"));
+                table.row(
+                    &format!("{network}, {kind}"),
+                    [capacity, OVERLOAD * capacity, goodput, goodput / capacity, report.refusals() as f64],
+                );
+                let kind = if timeout.is_some() { "deadline" } else { "overload" };
+                findings.figure(&format!("{network}_{kind}_goodput"), goodput / capacity);
+            }
+        }
+        findings.table(table);
+        self.burst(findings).await?;
+        self.fairness(findings).await
+    }
+
+    /// Calls that start together and follow the hints of their refusals.
+    async fn burst(&self, findings: &mut Findings) -> anyhow::Result<()> {
+        let mut table = Table::new(&format!("vgn, a burst of {BURST} calls"), &["answered"]);
+        let server = self.serve("vgn", &[])?;
+        let access = Access { retry: Retry::RECOMMENDED, ..Access::default() };
+        let client = Client::connect_with(server.grpc().to_string(), access).await?;
+        let report =
+            run_load(&client, &self.scene, Arrivals::Callers(BURST), Until::Calls(BURST), Options::default()).await;
+        table.row("with recommended retries", [report.answered.len() as f64]);
+        findings.figure("burst_answered", report.answered.len() as f64);
+        findings.table(table);
+        Ok(())
+    }
+
+    /// A caller with 64 open calls beside one with a single call.
+    async fn fairness(&self, findings: &mut Findings) -> anyhow::Result<()> {
+        let tokens = self.models("vgn").join("tokens");
+        fs::write(&tokens, "many\nsingle\n")?;
+        let server = self.serve("vgn", &["--token-file", tokens.to_str().context("a temporary path is UTF-8")?])?;
+        let client = async |token: &str| -> anyhow::Result<Client> {
+            let access = Access { token: Some(token.parse().map_err(anyhow::Error::msg)?), ..Access::default() };
+            Ok(Client::connect_with(server.grpc().to_string(), access).await?)
+        };
+        let (many, single) = (client("many").await?, client("single").await?);
+        let scene = Arc::clone(&self.scene);
+        let until = Until::Elapsed(self.seconds);
+        let flood =
+            tokio::spawn(
+                async move { run_load(&many, &scene, Arrivals::Callers(64), until, Options::default()).await },
+            );
+        let report = run_load(&single, &self.scene, Arrivals::Callers(1), until, Options::default()).await;
+        let others = flood.await?;
+        let mut table = Table::new("vgn, two callers", &["calls", "answers/s", "refused"]);
+        table.row("64 open calls", [64.0, others.throughput(), others.refusals() as f64]);
+        table.row("one open call", [1.0, report.throughput(), report.refusals() as f64]);
+        findings.figure("single_caller_share", report.throughput() / (report.throughput() + others.throughput()));
+        findings.figure("single_caller_refused", report.refusals() as f64);
+        findings.table(table);
+        Ok(())
+    }
+}
