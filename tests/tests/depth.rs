@@ -295,7 +295,7 @@ async fn an_evaluator_scores_the_grasps_of_its_network() {
     server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
     assert_eq!(names().await, ["mirror", "vgn-packed", "graspd-packed", "shaf"]);
     let models = client.list_models().await.unwrap();
-    assert!(models[2].provenance["network"].starts_with("vgn-packed 3, sha256 "), "{:?}", models[2].provenance);
+    assert!(models[2].provenance["network"].starts_with("vgn-packed 4, sha256 "), "{:?}", models[2].provenance);
     assert_eq!((models[2].resolution, models[2].threshold), (40, 0.5));
 
     let views = [camera(30.0, -90.0), camera(40.0, 90.0)].map(|camera| view(&camera));
