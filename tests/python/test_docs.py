@@ -161,7 +161,7 @@ class DocsTest(unittest.TestCase):
 
         page = self.page("api.md")
         options = re.findall(r"^\| `(\w+=.*?)` \|", page.text, re.MULTILINE)
-        self.assertEqual(len(options), 18)
+        self.assertEqual(len(options), 19)
         for option in options:
             with self.subTest(option):
                 page.run("python", f"{call(option)}, graspd.Options({option}))", 1)

@@ -59,8 +59,10 @@ impl Received {
         let total = budget.used.fetch_add(bytes, Ordering::Relaxed) + bytes;
         let of_connection = used.fetch_add(bytes, Ordering::Relaxed) + bytes;
         self.bytes += bytes;
-        budget.gauge.set(total as i64);
-        if of_connection <= budget.capacity.saturating_sub(total - of_connection) / 2 {
+        budget.gauge.add(bytes as i64);
+        // Another thread may have changed the second sum after the first was read.
+        let of_others = total.saturating_sub(of_connection);
+        if of_connection <= budget.capacity.saturating_sub(of_others) / 2 {
             return Ok(());
         }
         self.clear();
@@ -77,8 +79,8 @@ impl Received {
     pub fn clear(&mut self) {
         let ConnectionShare { budget, used } = &self.share;
         used.fetch_sub(self.bytes, Ordering::Relaxed);
-        let before = budget.used.fetch_sub(self.bytes, Ordering::Relaxed);
-        budget.gauge.set((before - self.bytes) as i64);
+        budget.used.fetch_sub(self.bytes, Ordering::Relaxed);
+        budget.gauge.sub(self.bytes as i64);
         self.bytes = 0;
     }
 }
@@ -115,6 +117,25 @@ mod tests {
         assert_eq!(gauge.get(), 0);
         assert!(second.add(500).is_ok());
         second.clear();
+        assert_eq!((gauge.get(), budget.used.load(Ordering::Relaxed)), (0, 0));
+    }
+
+    #[test]
+    fn messages_of_a_connection_on_several_threads_are_all_counted() {
+        let gauge = IntGauge::new("receiving", "Bytes.").unwrap();
+        let budget = ReceiveBudget::new(1 << 20, gauge.clone());
+        let connection = budget.connection();
+        std::thread::scope(|scope| {
+            for _ in 0..4 {
+                let connection = connection.clone();
+                scope.spawn(move || {
+                    for _ in 0..20_000 {
+                        let mut message = connection.clone().message();
+                        assert!(message.add(100).is_ok() && message.add(7).is_ok());
+                    }
+                });
+            }
+        });
         assert_eq!((gauge.get(), budget.used.load(Ordering::Relaxed)), (0, 0));
     }
 }
