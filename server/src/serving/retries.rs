@@ -1,11 +1,10 @@
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// The times at which refused callers are told to retry. Each is told another time, so that they do not come back
-/// together.
+/// The retry hints of refused requests. Successive hints differ, so that the retries do not arrive together.
 #[derive(Default)]
 pub(crate) struct Retries {
-    /// The last time that a caller was told.
+    /// The latest time of a retry that was hinted.
     last: Mutex<Option<Instant>>,
 }
 
@@ -45,7 +44,7 @@ mod tests {
         let spread: Vec<u128> = (1..=40).map(|index| 10 * index).collect();
         assert_eq!(hints[..40], spread);
         assert_eq!(hints[40], 10, "after four lengths of the queue they start again");
-        // Once the told times have passed, the hint is short again.
+        // After the hinted times have passed, the hint is short again.
         assert_eq!(retries.next(pace, 10, now + Duration::from_secs(1)).as_millis(), 10);
         assert_eq!(Retries::default().next(Duration::ZERO, 1, now), SHORTEST);
     }

@@ -127,4 +127,4 @@ class Options:
     margin: float | None = None
     """Smallest distance of the point between the fingertips from the sides of the cube, metres; None: 0."""
     priority: Literal["normal", "batch"] = "normal"
-    """``batch``: for scenes whose grasps nobody waits for; normal requests go first."""
+    """``batch``: for offline processing; normal requests are processed first."""

@@ -41,7 +41,7 @@ pub(crate) struct DetectArgs {
     #[arg(long, value_name = "METRES")]
     margin: Option<f64>,
 
-    /// Let requests that are not batch requests go first: for scenes whose grasps nobody waits for.
+    /// Batch priority, for offline processing: requests with normal priority are processed first.
     #[arg(long)]
     batch: bool,
 
