@@ -4,6 +4,7 @@
 
 mod binaries;
 mod models;
+mod raw;
 pub mod scene;
 mod server;
 mod stolen;
@@ -11,6 +12,7 @@ mod volumes;
 
 pub use binaries::{example, grasp, grasp_sim, graspd};
 pub use models::{RESOLUTION, TestModel, WIDTH};
+pub use raw::Raw;
 pub use server::{Server, metric, peak_bytes, resident_bytes};
 pub use stolen::Stolen;
 pub use volumes::{blobs, expected};

@@ -91,7 +91,7 @@ async fn a_server_that_is_warming_up_exits_with_code_0() {
 #[test]
 fn all_configuration_errors_are_reported_in_one_run() {
     let output = Command::new(graspd())
-        .args(["--listen", "nowhere", "--workers", "0", "--drain-timeout", "-1", "--models", "/no/such/folder"])
+        .args(["--listen", "nowhere", "--workers", "-1", "--drain-timeout", "-1", "--models", "/no/such/folder"])
         .env("GRASPD_QUEUE", "many")
         .env("GRASPD_LOG", "a=b=c")
         .output()
@@ -100,7 +100,7 @@ fn all_configuration_errors_are_reported_in_one_run() {
     let text = String::from_utf8(output.stderr).unwrap();
     for error in [
         "--listen (GRASPD_LISTEN) is `nowhere`",
-        "--workers (GRASPD_WORKERS) is `0`",
+        "--workers (GRASPD_WORKERS) is `-1`",
         "--drain-timeout (GRASPD_DRAIN_TIMEOUT) is `-1`",
         "--models (GRASPD_MODELS) is `/no/such/folder`: /no/such/folder: No such file",
         "--queue (GRASPD_QUEUE) is `many`",

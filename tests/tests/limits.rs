@@ -3,16 +3,16 @@
 use std::collections::BTreeMap;
 
 use grasp_proto::{FILE_DESCRIPTOR_SET, encode, pb};
-use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
+use grasp_tests::{RESOLUTION, Raw, Server, TestModel, blobs};
 use nalgebra::Isometry3;
 use prost::Message;
-use prost::bytes::{Buf, BufMut, Bytes};
+use prost::bytes::Bytes;
 use prost::encoding::WireType;
 use prost_types::field_descriptor_proto::{Label, Type};
 use prost_types::{DescriptorProto, FileDescriptorSet};
 use tokio_stream::StreamExt;
-use tonic::codec::{Codec, CompressionEncoding, DecodeBuf, Decoder, EncodeBuf, Encoder};
-use tonic::{Code, Request, Status};
+use tonic::codec::CompressionEncoding;
+use tonic::{Code, Request};
 
 fn request(padding: usize) -> pb::DetectGraspsRequest {
     let volume = encode(&blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]]), pb::DataType::F32, "");
@@ -57,44 +57,6 @@ async fn compressed_messages_are_accepted_up_to_the_limit_of_their_content() {
     }
     assert_eq!(server.metric("graspd_requests_total{code=\"INVALID_ARGUMENT\",model=\"\"}"), 6.0);
     assert!(grasp_tests::peak_bytes(server.id()) < 200 << 20, "the bombs were not decompressed");
-}
-
-/// Passes encoded messages on.
-#[derive(Default)]
-struct Encoded;
-
-impl Codec for Encoded {
-    type Encode = Bytes;
-    type Decode = Bytes;
-    type Encoder = Self;
-    type Decoder = Self;
-
-    fn encoder(&mut self) -> Self {
-        Self
-    }
-
-    fn decoder(&mut self) -> Self {
-        Self
-    }
-}
-
-impl Encoder for Encoded {
-    type Item = Bytes;
-    type Error = Status;
-
-    fn encode(&mut self, message: Bytes, buffer: &mut EncodeBuf<'_>) -> Result<(), Status> {
-        buffer.put(message);
-        Ok(())
-    }
-}
-
-impl Decoder for Encoded {
-    type Item = Bytes;
-    type Error = Status;
-
-    fn decode(&mut self, buffer: &mut DecodeBuf<'_>) -> Result<Option<Bytes>, Status> {
-        Ok(Some(buffer.copy_to_bytes(buffer.remaining())))
-    }
 }
 
 /// Adds a message and the messages declared in it, by their full names.
@@ -150,7 +112,7 @@ async fn a_message_of_many_small_elements_is_refused_before_it_is_decoded() {
                     let mut client = tonic::client::Grpc::new(channel.clone());
                     client.ready().await.unwrap();
                     let request = Request::new(tokio_stream::once(Bytes::from(message)));
-                    let replies = client.streaming(request, path.parse().unwrap(), Encoded).await;
+                    let replies = client.streaming(request, path.parse().unwrap(), Raw).await;
                     let status = match replies {
                         Ok(replies) => replies.into_inner().next().await.and_then(Result::err),
                         Err(status) => Some(status),

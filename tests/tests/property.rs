@@ -7,15 +7,13 @@ use std::net::TcpStream;
 use grasp_proto::pb;
 use grasp_proto::pb::grasp_service_client::GraspServiceClient;
 use grasp_tests::scene::{CAMERA, camera, view};
-use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
+use grasp_tests::{RESOLUTION, Raw, Server, TestModel, blobs};
 use nalgebra::Isometry3;
 use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
 use prost::Message;
-use prost::bytes::{Buf, BufMut};
 use tokio::runtime::Runtime;
-use tonic::codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder};
 use tonic::codegen::http::uri::PathAndQuery;
 use tonic::transport::Channel;
 use tonic::{Code, Request, Status};
@@ -306,42 +304,5 @@ async fn send(channel: Channel, bytes: Vec<u8>) -> Result<(), Status> {
     let mut grpc = tonic::client::Grpc::new(channel);
     grpc.ready().await.map_err(|error| Status::unavailable(error.to_string()))?;
     let path = PathAndQuery::from_static("/grasp.v1.GraspService/DetectGrasps");
-    grpc.unary(Request::new(bytes), path, Raw).await.map(drop)
-}
-
-/// A codec that does not change the bytes.
-struct Raw;
-
-impl Codec for Raw {
-    type Encode = Vec<u8>;
-    type Decode = Vec<u8>;
-    type Encoder = Self;
-    type Decoder = Self;
-
-    fn encoder(&mut self) -> Self {
-        Self
-    }
-
-    fn decoder(&mut self) -> Self {
-        Self
-    }
-}
-
-impl Encoder for Raw {
-    type Item = Vec<u8>;
-    type Error = Status;
-
-    fn encode(&mut self, bytes: Vec<u8>, buffer: &mut EncodeBuf) -> Result<(), Status> {
-        buffer.put_slice(&bytes);
-        Ok(())
-    }
-}
-
-impl Decoder for Raw {
-    type Item = Vec<u8>;
-    type Error = Status;
-
-    fn decode(&mut self, buffer: &mut DecodeBuf) -> Result<Option<Vec<u8>>, Status> {
-        Ok(Some(buffer.copy_to_bytes(buffer.remaining()).to_vec()))
-    }
+    grpc.unary(Request::new(bytes.into()), path, Raw).await.map(drop)
 }
