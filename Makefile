@@ -21,7 +21,8 @@ with_python = GRASPD_PYTHON="$$($(PYTHON) tests/tools.py python)" && export GRAS
 with_programs = GRASPD_PROMETHEUS="$$($(PYTHON) tests/tools.py prometheus)" && export GRASPD_PROMETHEUS && \
 	GRASPD_PROMTOOL="$$($(PYTHON) tests/tools.py promtool)" && export GRASPD_PROMTOOL && \
 	GRASPD_CPP="$$($(PYTHON) tests/tools.py cpp)" && export GRASPD_CPP && \
-	GRASPD_CHROMIUM="$$($(PYTHON) tests/tools.py chromium)" && export GRASPD_CHROMIUM &&
+	GRASPD_CHROMIUM="$$($(PYTHON) tests/tools.py chromium)" && export GRASPD_CHROMIUM && \
+	GRASPD_PERF_ANALYZER="$$($(PYTHON) tests/tools.py perf-analyzer)" && export GRASPD_PERF_ANALYZER &&
 with_libtorch = LIBTORCH="$$($(PYTHON) deploy/native.py libtorch)" && export LIBTORCH && \
 	LD_LIBRARY_PATH="$$LIBTORCH/lib$${LD_LIBRARY_PATH:+:$$LD_LIBRARY_PATH}" && export LD_LIBRARY_PATH &&
 

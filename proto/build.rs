@@ -17,7 +17,8 @@ const MODULES: [(&str, &str); 2] = [(".grasp.v1.", "crate::pb"), (".inference.",
 
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo:rerun-if-changed=proto");
-    let descriptors = protox::compile(["grasp/v1/grasp.proto", "inference/inference.proto"], ["proto"])?;
+    let descriptors =
+        protox::compile(["grasp/v1/grasp.proto", "grasp/v1/recording.proto", "inference/inference.proto"], ["proto"])?;
     let out = PathBuf::from(env::var("OUT_DIR")?);
     fs::write(out.join("descriptors.bin"), descriptors.encode_to_vec())?;
     fs::write(out.join("request_types.rs"), request_types(&descriptors)?)?;

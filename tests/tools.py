@@ -8,6 +8,7 @@
     tools.py promtool    checks the rules of Prometheus, for GRASPD_PROMTOOL
     tools.py cpp         a prefix with CMake, protoc and gRPC for C++, for GRASPD_CPP
     tools.py chromium    the browser of the page's tests, for GRASPD_CHROMIUM
+    tools.py perf-analyzer  NVIDIA's load generator for inference servers, for GRASPD_PERF_ANALYZER
 
 Variables and downloads are handled as in deploy/native.py.
 """
@@ -58,6 +59,46 @@ def promtool() -> Path:
 def chromium() -> Path:
     # The shell without a window: the same engine, and none of GTK.
     return from_debian("chromium-headless-shell", "chromium-headless-shell", "GRASPD_CHROMIUM")
+
+
+def perf_analyzer() -> Path:
+    if os.environ.get("GRASPD_PERF_ANALYZER"):
+        return given("GRASPD_PERF_ANALYZER")
+    import shutil
+    import subprocess
+    from zipfile import ZipFile
+
+    title, otherwise = "NVIDIA's perf_analyzer 2.41.0", "set GRASPD_PERF_ANALYZER to its path"
+    if PLATFORM != "Linux-x86_64" or not shutil.which("apt-get"):
+        raise Unavailable(f"{title} is downloaded for Debian on x86-64 only; {otherwise}.")
+    # The last wheel with the program, and what it is linked with.
+    wheels = [
+        native.Wheel("tritonclient==2.41.0", 13, "cf4ed5df836fa99937678a9fd852f86ba05c7b83656dd0a540e20afdb9ab4629"),
+        native.Wheel("nvidia-cuda-runtime-cu12==12.9.79", 4, "25bba2dfb01d48a9b59ca474a1ac43c6ebf7011f1b0b8cc44f54eb6ac48a96c3"),
+    ]
+    artefact = native.Artefact(title, "perf-analyzer-2.41.0", "perf_analyzer", wheels)
+    folder = CACHE / f"{artefact.folder}-{PLATFORM}"
+
+    def build(part: Path) -> None:
+        native.fetch(artefact, part / "wheels", folder, otherwise)
+        for wheel in (part / "wheels").glob("*.whl"):
+            with ZipFile(wheel) as archive:
+                for name in archive.namelist():
+                    if name.endswith(("/bin/perf_analyzer", "/libcudart.so.12")):
+                        archive.extract(name, part)
+        if subprocess.run(["apt-get", "download", "libb64-0d"], cwd=part, stdout=sys.stderr).returncode:
+            raise Unavailable(f"libb64-0d could not be downloaded; run `apt-get update` as root or {otherwise}.")
+        for archive in part.glob("*.deb"):
+            subprocess.run(["dpkg-deb", "--extract", archive, part], check=True)
+        (program,) = part.rglob("bin/perf_analyzer")
+        program.chmod(0o755)
+        holding = {path.parent for pattern in ["libb64.so*", "libcudart.so*"] for path in part.rglob(pattern)}
+        libraries = os.pathsep.join(str(folder / path.relative_to(part)) for path in sorted(holding))
+        script = part / artefact.result
+        script.write_text(f'#!/bin/sh\nLD_LIBRARY_PATH="{libraries}" exec "{folder / program.relative_to(part)}" "$@"\n')
+        script.chmod(0o755)
+
+    return built_once(folder, build) / artefact.result
 
 
 def cpp() -> Path:
@@ -150,4 +191,4 @@ or set {variable} to an interpreter that has these packages.""")
 
 
 if __name__ == "__main__":
-    native.main("tools.py", __doc__, [python, peers, haproxy, prometheus, promtool, cpp, chromium])
+    native.main("tools.py", __doc__, [python, peers, haproxy, prometheus, promtool, cpp, chromium, perf_analyzer])

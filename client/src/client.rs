@@ -4,6 +4,7 @@ use grasp::Volume;
 use grasp_proto::pb;
 use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::grasp_service_client::GraspServiceClient;
+use grasp_proto::pb::recording::{Answer, Request};
 use nalgebra::Isometry3;
 use tokio::sync::mpsc;
 use tokio::time::{Instant, sleep, timeout_at};
@@ -181,6 +182,53 @@ impl Client {
         Ok(response.await?.into())
     }
 
+    /// Sends a recorded request again. `model` replaces its model; the version is dropped with it.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] with the status of the last attempt.
+    pub async fn replay(&self, mut request: Request, model: Option<&str>) -> Result<Answer, Error> {
+        if let Some(model) = model {
+            let options = options_of(&mut request);
+            model.clone_into(&mut options.model);
+            options.version.clear();
+        }
+        let service = || self.grasps();
+        Ok(match request {
+            Request::Volume(message) => Answer::Grasps(
+                self.call(
+                    None,
+                    || (service(), message.clone()),
+                    async |(mut grasps, request)| grasps.detect_grasps(request).await,
+                )
+                .await?,
+            ),
+            Request::Depth(message) => Answer::Grasps(
+                self.call(
+                    None,
+                    || (service(), message.clone()),
+                    async |(mut grasps, request)| grasps.detect_grasps_from_depth(request).await,
+                )
+                .await?,
+            ),
+            Request::Cloud(message) => Answer::Grasps(
+                self.call(
+                    None,
+                    || (service(), message.clone()),
+                    async |(mut grasps, request)| grasps.detect_grasps_from_cloud(request).await,
+                )
+                .await?,
+            ),
+            Request::Score(message) => Answer::Scores(
+                self.call(
+                    None,
+                    || (service(), message.clone()),
+                    async |(mut grasps, request)| grasps.score_grasps(request).await,
+                )
+                .await?,
+            ),
+        })
+    }
+
     /// Opens a tracked volume: the server keeps it and adds the views of a moving camera to it.
     ///
     /// # Errors
@@ -305,6 +353,17 @@ impl Tracking {
         }
         detection
     }
+}
+
+/// The options of a request, which are created if they are absent.
+fn options_of(request: &mut Request) -> &mut pb::Options {
+    let options = match request {
+        Request::Volume(request) => &mut request.options,
+        Request::Depth(request) => &mut request.options,
+        Request::Cloud(request) => &mut request.options,
+        Request::Score(request) => &mut request.options,
+    };
+    options.get_or_insert_default()
 }
 
 fn outcome(response: pb::DetectGraspsStreamResponse) -> Result<Detection, Error> {

@@ -15,6 +15,7 @@ pub struct LocalServer {
     stdout: BufReader<ChildStdout>,
     grpc: SocketAddr,
     http: SocketAddr,
+    rest: Option<SocketAddr>,
 }
 
 /// Why a local server could not be started.
@@ -64,7 +65,7 @@ impl LocalServer {
             .map_err(|source| LocalServerError::Spawn { binary: binary.to_owned(), source })?;
         let stdout = process.stdout.take().expect("stdout is piped, see above");
         let unset = SocketAddr::from(([0, 0, 0, 0], 0));
-        let mut server = Self { process, stdout: BufReader::new(stdout), grpc: unset, http: unset };
+        let mut server = Self { process, stdout: BufReader::new(stdout), grpc: unset, http: unset, rest: None };
         server.grpc = server.read_address("grpc listening on ")?;
         server.http = server.read_address("http listening on ")?;
         Ok(server)
@@ -75,9 +76,13 @@ impl LocalServer {
     /// # Errors
     /// [`LocalServerError`] when the process exits before.
     pub fn wait_ready(&mut self) -> Result<(), LocalServerError> {
-        match self.read_line()? {
-            line if line == "ready" => Ok(()),
-            line => Err(LocalServerError::Unexpected(line)),
+        loop {
+            let line = self.read_line()?;
+            if line == "ready" {
+                return Ok(());
+            }
+            let address = line.strip_prefix("rest listening on ").and_then(|address| address.parse().ok());
+            self.rest = Some(address.ok_or(LocalServerError::Unexpected(line))?);
         }
     }
 
@@ -91,6 +96,12 @@ impl LocalServer {
     #[must_use]
     pub fn http(&self) -> SocketAddr {
         self.http
+    }
+
+    /// Address of the REST listener, if the server is ready and has one (`--rest`).
+    #[must_use]
+    pub fn rest(&self) -> Option<SocketAddr> {
+        self.rest
     }
 
     /// Process id.

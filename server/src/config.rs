@@ -4,6 +4,7 @@ mod flags;
 use std::ffi::OsStr;
 use std::net::SocketAddr;
 use std::num::NonZeroUsize;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::thread::available_parallelism;
 use std::time::Duration;
@@ -33,6 +34,10 @@ pub(crate) struct Config {
     pub default_model: Option<String>,
     pub listen: Address,
     pub http: SocketAddr,
+    /// Address of the REST listener; None without one.
+    pub rest: Option<SocketAddr>,
+    /// Whether clients may load and unload models.
+    pub allow_model_control: bool,
     /// Further names of the HTTP listener.
     pub http_hosts: Vec<String>,
     /// Sessions per model.
@@ -43,11 +48,11 @@ pub(crate) struct Config {
     pub provider: Option<Provider>,
     /// Numeric precision; None selects the fastest.
     pub precision: Option<Precision>,
-    /// Threads of the async runtime.
-    pub io_threads: usize,
     /// Queued requests per model.
     pub queue: usize,
     pub batching: Batching,
+    /// Time after which an inference counts as hanging; None disables the check.
+    pub inference_timeout: Option<Duration>,
     /// Interval at which the model folder is polled; None disables polling.
     pub watch: Option<Duration>,
     /// The server's certificate, and the CA of client certificates.
@@ -63,6 +68,8 @@ pub(crate) struct Config {
     pub track_timeout: Duration,
     /// Requests that the page shows; 0 disables the page.
     pub recent: usize,
+    /// Folder of the recordings, and their maximum size, bytes; None without recording.
+    pub record: Option<(PathBuf, u64)>,
     pub drain_timeout: Duration,
     /// URL of the OpenTelemetry collector.
     pub otlp: Option<String>,
@@ -137,15 +144,16 @@ impl Config {
             default_model: flags.default_model,
             listen: flags.listen,
             http: flags.http,
+            rest: flags.rest,
+            allow_model_control: flags.allow_model_control,
             http_hosts: flags.http_host,
             workers,
             threads: flags.threads.map_or((cpus / workers).max(1), usize::from),
             provider,
             precision,
-            // A request takes 0.1 ms of their time. More than four would only take CPUs from the networks.
-            io_threads: cpus.min(4),
             queue: flags.queue.into(),
             batching: Batching { max: flags.max_batch.into(), delay: flags.batch_delay },
+            inference_timeout: Some(flags.inference_timeout).filter(|timeout| !timeout.is_zero()),
             watch: Some(flags.watch).filter(|interval| !interval.is_zero()),
             tls,
             max_connections: flags.max_connections.get(),
@@ -155,6 +163,7 @@ impl Config {
             track_timeout: flags.track_timeout,
             recent: flags.recent.unwrap_or(if flags.token_file.is_some() { 0 } else { RECENT }),
             tokens: flags.token_file,
+            record: flags.record.map(|folder| (folder, flags.record_bytes)),
             drain_timeout: flags.drain_timeout,
             otlp: flags.otlp,
             log: flags.log,

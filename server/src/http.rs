@@ -1,5 +1,3 @@
-mod connections;
-
 use std::convert::Infallible;
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -23,8 +21,10 @@ use crate::serving::engine::Engine;
 use crate::serving::registry::ModelRegistry;
 use crate::telemetry::metrics::Metrics;
 use crate::telemetry::recent::RecentRequests;
+use crate::transport::http_connections::{self, HttpConfig};
 
-pub(crate) use connections::CONNECTIONS;
+/// Maximum number of open connections.
+pub(crate) const CONNECTIONS: usize = 128;
 
 /// State shared by the HTTP handlers.
 #[derive(Clone)]
@@ -40,12 +40,13 @@ pub(crate) async fn serve(
     listener: TcpListener,
     hosts: Vec<String>,
     pages: HttpState,
+    config: HttpConfig,
     state: watch::Receiver<State>,
-) -> Infallible {
-    let (metrics, now) = (Arc::clone(&pages.metrics), state.clone());
+) {
+    let (metrics, now, health) = (Arc::clone(&pages.metrics), state.clone(), state.clone());
     let mut app = Router::new()
         .route("/metrics", get(async move || ([(CONTENT_TYPE, Metrics::CONTENT_TYPE)], metrics.render(*now.borrow()))))
-        .route("/healthz", get("ok\n"))
+        .route("/healthz", get(async move || liveness(*health.borrow())))
         .route("/readyz", get(async move || readiness(*state.borrow())));
     if pages.recent.is_enabled() {
         let page = Router::new()
@@ -56,7 +57,10 @@ pub(crate) async fn serve(
             .route("/api/events", get(events));
         app = app.merge(page.with_state(pages));
     }
-    connections::serve(listener, app.layer(from_fn_with_state(Arc::new(hosts), check_host))).await
+    let app = app.layer(from_fn_with_state(Arc::new(hosts), check_host));
+    // Probes and Prometheus are answered during the drain, too.
+    let (_serving, for_ever) = watch::channel(State::Ready);
+    http_connections::serve(listener, config, app, for_ever).await;
 }
 
 /// Refuses requests to names that are not this server's. Otherwise a page of another site could read the responses in
@@ -83,10 +87,20 @@ fn is_own(host: &str, hosts: &[String]) -> bool {
         || hosts.iter().any(|own| own.eq_ignore_ascii_case(name))
 }
 
+const HANGING: (StatusCode, &str) = (
+    StatusCode::SERVICE_UNAVAILABLE,
+    "all sessions of a model hang in an inference, see the log; restart the server\n",
+);
+
+fn liveness(state: State) -> impl IntoResponse {
+    if state == State::Hanging { HANGING } else { (StatusCode::OK, "ok\n") }
+}
+
 fn readiness(state: State) -> impl IntoResponse {
     match state {
         State::Starting => (StatusCode::SERVICE_UNAVAILABLE, "warming up\n"),
         State::Ready => (StatusCode::OK, "ready\n"),
+        State::Hanging => HANGING,
         State::Draining => (StatusCode::SERVICE_UNAVAILABLE, "draining\n"),
     }
 }

@@ -16,6 +16,8 @@ pub(crate) enum State {
     Starting,
     /// Every session has completed an inference.
     Ready,
+    /// All sessions of a model hang in an inference; the other models are served. Only a restart helps.
+    Hanging,
     /// Shutting down: accepted requests are finished, new connections and messages are not accepted.
     Draining,
 }
@@ -32,8 +34,9 @@ impl Readiness {
         self.0.subscribe()
     }
 
-    pub fn ready(&self) {
-        self.0.send_replace(State::Ready);
+    /// Sets the state while serving: whether every model has a session that does not hang.
+    pub fn serving(&self, is_able: bool) {
+        self.0.send_replace(if is_able { State::Ready } else { State::Hanging });
     }
 
     /// Sets the last state and drops the sender, which ends all streams of [`Health::watch`].
@@ -80,7 +83,7 @@ fn is_known(service: &str) -> bool {
 fn serving_status(state: State) -> ServingStatus {
     match state {
         State::Ready => ServingStatus::Serving,
-        State::Starting | State::Draining => ServingStatus::NotServing,
+        State::Starting | State::Hanging | State::Draining => ServingStatus::NotServing,
     }
 }
 

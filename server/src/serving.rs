@@ -1,5 +1,6 @@
 //! The served models: registry, queues, session threads, hot reload, and the fusion of views into scenes.
 
+pub(crate) mod control;
 pub(crate) mod cubes;
 pub(crate) mod detection;
 pub(crate) mod engine;
@@ -12,5 +13,6 @@ pub(crate) mod reload;
 mod retries;
 mod scene;
 pub(crate) mod session;
+pub(crate) mod session_threads;
 pub(crate) mod stamps;
 pub(crate) mod tracking;

@@ -13,10 +13,10 @@ class Server:
         models = ["--models", os.environ["GRASPD_MODELS"], "--provider", "cpu", "--threads", "1"]
         command = [os.environ["GRASPD"], *models, "--listen", listen, "--http", "127.0.0.1:0", *map(str, flags)]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
-        # Both addresses, then `ready`.
-        lines = "".join(self.process.stdout.readline() for _ in range(3))
-        match = re.fullmatch(r"grpc listening on (\S+)\nhttp listening on (\S+)\nready\n", lines)
-        self.grpc, self.http = match.groups()
+        # The addresses, then `ready`.
+        lines = "".join(iter(self.process.stdout.readline, "ready\n"))
+        match = re.fullmatch(r"grpc listening on (\S+)\nhttp listening on (\S+)\n(?:rest listening on (\S+)\n)?", lines)
+        self.grpc, self.http, self.rest = match.groups()
 
     def __enter__(self):
         return self

@@ -1,11 +1,17 @@
-"""Tests graspd's Open Inference Protocol with NVIDIA's unmodified Triton client.
+"""Tests graspd's Open Inference Protocol with NVIDIA's unmodified Triton client and load generator, and over HTTP.
 
     GRASPD=target/release/graspd GRASPD_MODELS=models/zoo ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
-    $(python3 tests/tools.py python) -m unittest discover --start-directory tests/python --pattern test_inference.py
+    GRASPD_PERF_ANALYZER=$(python3 tests/tools.py perf-analyzer) $(python3 tests/tools.py python) -m unittest discover --start-directory tests/python --pattern test_inference.py
 """
 
+import json
+import os
+import re
+import subprocess
 import unittest
 from queue import SimpleQueue
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
 
 import numpy as np
 import scene
@@ -16,13 +22,15 @@ from tritonclient.utils import InferenceServerException
 MODEL = "vgn-packed"
 EDGE = [scene.RESOLUTION] * 3
 CHANNELS = {"quality": 1, "rotation": 4, "width": 1}
+EXTENSIONS = ["binary_tensor_data", "model_configuration", "model_repository", "statistics"]
 VOLUMES = np.stack([[scene.volume(scene.camera(30, -90))], [scene.volume(scene.camera(40, 90))]])
 
 
 class InferenceTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        server = cls.enterClassContext(Server())
+        server = cls.enterClassContext(Server("--rest", "127.0.0.1:0"))
+        cls.server = server
         cls.client = cls.enterClassContext(InferenceServerClient(server.grpc))
 
     def tensor(self, values, name="tsdf", datatype="FP32"):
@@ -53,7 +61,7 @@ class InferenceTest(unittest.TestCase):
 
     def test_server_and_model_metadata(self):
         server = self.client.get_server_metadata()
-        self.assertEqual((server.name, list(server.extensions)), ("graspd", ["model_configuration"]))
+        self.assertEqual((server.name, list(server.extensions)), ("graspd", EXTENSIONS))
         model = self.client.get_model_metadata(MODEL)
         (version,) = model.versions
         self.assertRegex(version, r"^[0-9.]+$")
@@ -136,6 +144,103 @@ class InferenceTest(unittest.TestCase):
                 call()
             self.assertEqual(caught.exception.status(), f"StatusCode.{status}")
             self.assertIn(message, caught.exception.message())
+
+    def rest(self, path, body=None, **headers):
+        """Status, headers and body of a response of the REST listener."""
+        body = json.dumps(body).encode() if isinstance(body, dict) else body
+        request = Request(f"http://{self.server.rest}/v2{path}", body, {k.replace("_", "-"): v for k, v in headers.items()})
+        try:
+            with urlopen(request) as response:
+                return response.status, response.headers, response.read()
+        except HTTPError as error:
+            with error:
+                return error.code, error.headers, error.read()
+
+    def json(self, path, body=None):
+        status, _, text = self.rest(path, body)
+        self.assertEqual(status, 200, text)
+        return json.loads(text)
+
+    def test_rest_has_the_same_metadata(self):
+        self.assertEqual(self.rest("/health/live")[0], 200)
+        self.assertEqual(self.rest("/health/ready")[0], 200)
+        self.assertEqual(self.rest(f"/models/{MODEL}/ready")[0], 200)
+        self.assertEqual(self.rest(f"/models/{MODEL}/versions/{self.version()}/ready")[0], 200)
+        self.assertEqual(self.rest(f"/models/{MODEL}/versions/0/ready")[0], 503)
+        self.assertEqual(self.json("")["extensions"], EXTENSIONS)
+        model = self.json(f"/models/{MODEL}")
+        self.assertEqual((model["name"], model["versions"]), (MODEL, [self.version()]))
+        self.assertEqual(model["inputs"], [{"name": "tsdf", "datatype": "FP32", "shape": [-1, 1, *EDGE]}])
+        self.assertEqual(self.json(f"/models/{MODEL}/config")["max_batch_size"], 32)
+        (statistics,) = self.json(f"/models/{MODEL}/stats")["model_stats"]
+        self.assertEqual((statistics["name"], statistics["version"]), (MODEL, self.version()))
+        self.assertEqual(self.json("/models/stats")["model_stats"][0]["name"], MODEL)
+        index = self.json("/repository/index", {"ready": True})
+        self.assertIn({"name": MODEL, "version": self.version(), "state": "READY", "reason": ""}, index)
+        for path in [f"/repository/models/{MODEL}/unload", f"/repository/models/{MODEL}/load"]:
+            status, _, text = self.rest(path, b"")
+            self.assertEqual((status, "--allow-model-control" in json.loads(text)["error"]), (403, True))
+
+    def test_rest_returns_the_same_maps_as_json_and_binary(self):
+        expected = self.maps(VOLUMES)
+        tensor = {"name": "tsdf", "datatype": "FP32", "shape": VOLUMES.shape}
+        nested = {"id": "json", "inputs": [{**tensor, "data": VOLUMES.tolist()}], "outputs": [{"name": "quality"}]}
+        reply = self.json(f"/models/{MODEL}/infer", nested)
+        self.assertEqual((reply["id"], reply["model_name"], reply["model_version"]), ("json", MODEL, self.version()))
+        self.assertLess(0, reply["parameters"]["inference_seconds"])
+        (output,) = reply["outputs"]
+        values = np.array(output["data"], np.float32).reshape(output["shape"])
+        np.testing.assert_array_equal(values, expected["quality"])
+
+        header = {
+            "parameters": {"binary_data_output": True},
+            "inputs": [{**tensor, "parameters": {"binary_data_size": VOLUMES.nbytes}}],
+        }
+        header = json.dumps(header).encode()
+        status, headers, body = self.rest(
+            f"/models/{MODEL}/infer", header + VOLUMES.tobytes(), Inference_Header_Content_Length=str(len(header))
+        )
+        self.assertEqual(status, 200, body[:200])
+        length = int(headers["Inference-Header-Content-Length"])
+        reply, at = json.loads(body[:length]), length
+        self.assertEqual([output["name"] for output in reply["outputs"]], list(CHANNELS))
+        for output in reply["outputs"]:
+            size = output["parameters"]["binary_data_size"]
+            values = np.frombuffer(body[at : at + size], np.float32).reshape(output["shape"])
+            np.testing.assert_array_equal(values, expected[output["name"]])
+            at += size
+        self.assertEqual(at, len(body))
+
+    def test_rest_errors_say_what_is_wrong(self):
+        tensor = {"name": "tsdf", "datatype": "FP32", "shape": [1, 1, *EDGE], "data": [0.5]}
+        timeout = {"inputs": [tensor], "parameters": {"timeout": 5}}
+        infer = f"/models/{MODEL}/infer"
+        for path, body, status, message in [
+            ("/models/missing/infer", {"inputs": [tensor]}, 404, "model_name: `missing` not found"),
+            ("/models/missing", None, 404, "model_name: `missing` not found"),
+            (infer, {"inputs": [tensor]}, 400, "inputs[0] is 1 values, must be 64000 values"),
+            (infer, {"inputs": []}, 400, "inputs is a list of 0"),
+            (infer, timeout, 400, "parameters is `timeout`"),
+            (infer, b"text", 400, "the request is not valid"),
+            (infer, b"0" * (16 << 20) + b"0", 400, "--max-message-bytes"),
+        ]:
+            with self.subTest(message):
+                code, headers, text = self.rest(path, body)
+                self.assertEqual((code, headers["Content-Type"]), (status, "application/json"))
+                self.assertIn(message, json.loads(text)["error"])
+
+    def test_perf_analyzer_measures_the_server(self):
+        # NVIDIA's load generator reads the metadata, the configuration and the statistics of the model.
+        for protocol, address in [("grpc", self.server.grpc), ("http", self.server.rest)]:
+            with self.subTest(protocol):
+                command = [os.environ["GRASPD_PERF_ANALYZER"], "-m", MODEL, "-i", protocol, "-u", address]
+                # Until two windows of ten requests differ by less than this percentage, or after a minute.
+                command += ["--measurement-mode", "count_windows", "--measurement-request-count", "10", "-s", "999"]
+                done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+                self.assertEqual(done.returncode, 0, done.stdout + done.stderr)
+                throughput = re.search(r"throughput: ([\d.]+) infer/sec", done.stdout)
+                self.assertGreater(float(throughput[1]), 0)
+                self.assertRegex(done.stdout, r"Inference count: [1-9]")
 
 
 if __name__ == "__main__":

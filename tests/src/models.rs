@@ -3,7 +3,8 @@ use std::path::Path;
 
 use grasp_models::Metadata;
 use grasp_models::onnx::{
-    AttributeProto, Dimension, GraphProto, ModelProto, NodeProto, OperatorSetIdProto, TensorProto, ValueInfoProto,
+    AttributeProto, AttributeType, Dimension, GraphProto, ModelProto, NodeProto, OperatorSetIdProto, TensorProto,
+    TypeValue, ValueInfoProto,
 };
 
 /// Resolution of the test models' volumes.
@@ -15,6 +16,7 @@ pub const WIDTH: f32 = 5.0;
 /// Element types in ONNX.
 const FLOAT: i64 = 1;
 const INT64: i64 = 7;
+const BOOL: i64 = 9;
 
 /// Channels of the convolutions that make a model slow.
 const CHANNELS: i64 = 16;
@@ -33,6 +35,7 @@ pub struct TestModel {
     camera_azimuth: Option<f64>,
     breaks_at: Option<f32>,
     fails_at_zero: bool,
+    hangs_at: Option<f32>,
     needs_fp32: bool,
 }
 
@@ -49,6 +52,7 @@ impl TestModel {
             camera_azimuth: None,
             breaks_at: None,
             fails_at_zero: false,
+            hangs_at: None,
             needs_fp32: false,
         }
     }
@@ -93,6 +97,12 @@ impl TestModel {
     #[must_use]
     pub fn fails_at_zero(self) -> Self {
         Self { fails_at_zero: true, ..self }
+    }
+
+    /// The inference never ends if any voxel is greater than `value`.
+    #[must_use]
+    pub fn hangs_at(self, value: f32) -> Self {
+        Self { hangs_at: Some(value), ..self }
     }
 
     /// Adds a large number to the volume and subtracts it again, so that in bf16 the quality is inaccurate.
@@ -150,6 +160,9 @@ impl TestModel {
             node(&mut graph, "Add", &[&delay, "nothing"], "delay_or_failure", vec![]);
             delay = "delay_or_failure".to_owned();
         }
+        if let Some(value) = self.hangs_at {
+            delay = looping_above(&mut graph, &delay, value).to_owned();
+        }
         let volume = if self.needs_fp32 { offset_and_restored(&mut graph, "tsdf") } else { "tsdf" };
         node(&mut graph, "Add", &[volume, &delay], "quality", vec![]);
 
@@ -203,6 +216,38 @@ fn offset_and_restored(graph: &mut GraphProto, input: &str) -> &'static str {
     node(graph, "Relu", &["there"], "between", vec![]);
     node(graph, "Conv", &["between", "back.weight", "back.bias"], "back", vec![]);
     "back"
+}
+
+/// The input. The computation of it loops for ever if any voxel is greater than `value`.
+fn looping_above(graph: &mut GraphProto, input: &str, value: f32) -> &'static str {
+    constant(graph, "hangs_at", value);
+    node(graph, "ReduceMax", &["tsdf"], "greatest", vec![AttributeProto::int("keepdims", 0)]);
+    node(graph, "Less", &["hangs_at", "greatest"], "hangs", vec![]);
+    let named = |name: &str| ValueInfoProto { name: Some(name.to_owned()), ..ValueInfoProto::default() };
+    let scalar = |name: &str, element: i64| {
+        let mut value = ValueInfoProto::tensor(name, vec![]);
+        if let Some(TypeValue::TensorType(tensor)) = value.r#type.as_mut().and_then(|kind| kind.value.as_mut()) {
+            tensor.elem_type = i32::try_from(element).ok();
+        }
+        value
+    };
+    let mut body = GraphProto {
+        name: Some("body".to_owned()),
+        input: vec![scalar("iteration", INT64), scalar("continues", BOOL), named("before")],
+        output: vec![named("still_continues"), named("after")],
+        ..GraphProto::default()
+    };
+    node(&mut body, "Identity", &["continues"], "still_continues", vec![]);
+    node(&mut body, "Identity", &["before"], "after", vec![]);
+    let body = AttributeProto {
+        name: Some("body".to_owned()),
+        r#type: Some(AttributeType::Graph.into()),
+        g: Some(body),
+        ..AttributeProto::default()
+    };
+    // The first input, the number of iterations, is absent.
+    node(graph, "Loop", &["", "hangs", input], "delay_or_loop", vec![body]);
+    "delay_or_loop"
 }
 
 fn constant(graph: &mut GraphProto, name: &str, value: f32) {

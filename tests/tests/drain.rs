@@ -1,6 +1,7 @@
 //! Shutdown of the server, and errors at its start.
 
-use std::process::Command;
+use std::process::{Command, Stdio};
+use std::time::Duration;
 
 use grasp::Volume;
 use grasp_client::{Client, LocalServer, LocalServerError, Options};
@@ -86,6 +87,36 @@ async fn after_the_drain_timeout_requests_are_refused_and_the_exit_code_is_0() {
 async fn a_server_that_is_warming_up_exits_with_code_0() {
     let server = Server::start(&[slow()], &[]);
     assert_eq!(stop(server).await, Some(0));
+}
+
+#[test]
+fn sigterm_at_any_moment_of_the_start_ends_the_process_with_code_0() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["first", "second"] {
+        TestModel::new(name).convolutions(60).write(folder.path());
+    }
+    for milliseconds in [0, 3, 10, 20, 40, 80, 160, 320] {
+        let mut process = Command::new(graspd())
+            .args(["--models".as_ref(), folder.path().as_os_str()])
+            .args(["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0", "--provider", "cpu", "--threads", "1"])
+            .stdout(Stdio::null())
+            .spawn()
+            .unwrap();
+        // From the first instructions of the program, in which a signal ends any process.
+        while !handles_sigterm(process.id()) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        std::thread::sleep(Duration::from_millis(milliseconds));
+        assert!(Command::new("kill").arg(process.id().to_string()).status().unwrap().success());
+        assert_eq!(process.wait().unwrap().code(), Some(0), "after {milliseconds} ms");
+    }
+}
+
+/// Whether a process has a handler for SIGTERM (15).
+fn handles_sigterm(process: u32) -> bool {
+    let status = std::fs::read_to_string(format!("/proc/{process}/status")).unwrap();
+    let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:")).unwrap();
+    u64::from_str_radix(caught.trim(), 16).unwrap() >> 14 & 1 == 1
 }
 
 #[test]

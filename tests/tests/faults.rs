@@ -5,7 +5,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use grasp::Volume;
-use grasp_client::{Client, DataType, Error, LocalServer, Options};
+use grasp_client::{Client, DataType, DetectOptions, Error, LocalServer, Options};
 use grasp_proto::{encode, pb};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs, graspd, metric, resident_bytes};
 use h2::client::SendRequest;
@@ -64,8 +64,8 @@ async fn a_failed_batch_fails_only_its_requests_and_names_them() {
     assert_eq!(server.metric("graspd_requests_total{code=\"OK\",model=\"fragile 1\"}"), 2.0);
 }
 
-/// A graspd with log level `trace` and this redirection of stderr.
-fn log_to(redirection: &str) -> (LocalServer, TempDir) {
+/// A graspd with this log level and redirection of stderr.
+fn log_to(level: &str, redirection: &str) -> (LocalServer, TempDir) {
     let folder = tempfile::tempdir().unwrap();
     TestModel::new("mirror").write(folder.path());
     let models = folder.path().to_str().unwrap();
@@ -74,14 +74,14 @@ fn log_to(redirection: &str) -> (LocalServer, TempDir) {
     let (draft, script) = (folder.path().join("draft"), folder.path().join("graspd-with-a-log"));
     fs::write(&draft, format!("#!/bin/sh\nexec {} \"$@\" {redirection}\n", graspd().display())).unwrap();
     assert!(Command::new("install").arg("-m755").args([&draft, &script]).status().unwrap().success());
-    let args = ["--models", models, "--provider", "cpu", "--threads", "1", "--log", "trace"];
+    let args = ["--models", models, "--provider", "cpu", "--threads", "1", "--log", level];
     (LocalServer::spawn(&script, args).unwrap(), folder)
 }
 
 #[tokio::test]
 async fn requests_succeed_when_the_log_cannot_be_written() {
     // Every write to /dev/full fails, as on a full disk.
-    let (mut server, _folder) = log_to("2> /dev/full");
+    let (mut server, _folder) = log_to("trace", "2> /dev/full");
     let client = Client::connect(server.grpc().to_string()).await.unwrap();
     for _ in 0..100 {
         assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 1);
@@ -96,7 +96,7 @@ async fn requests_succeed_when_the_log_blocks_and_dropped_lines_are_counted() {
     let pipe = pipes.path().join("pipe");
     assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
     // `<>` also opens the pipe for reading, so that the shell does not block until there is a reader.
-    let (mut server, _folder) = log_to(&format!("2<> {}", pipe.display()));
+    let (mut server, _folder) = log_to("trace", &format!("2<> {}", pipe.display()));
     let client = Client::connect(server.grpc().to_string()).await.unwrap();
     let mut calls = 0;
     while metric(server.http(), "graspd_log_lines_dropped_total") == 0.0 {
@@ -310,6 +310,47 @@ async fn malformed_messages_are_invalid_arguments_and_counted() {
     assert_eq!(code, Code::InvalidArgument, "{message}");
     assert_eq!(server.metric("graspd_requests_total{code=\"INVALID_ARGUMENT\",model=\"\"}"), 2.0);
     assert_eq!(server.metric("graspd_requests_total{code=\"INTERNAL\",model=\"\"}"), 0.0);
+}
+
+#[tokio::test]
+async fn calls_that_are_reset_before_or_within_their_message_count_as_cancelled() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let h2 = connect(&server).await;
+    let pieces: [&[u8]; 2] = [&[], &[0, 0, 0, 0, 9, 1]];
+    for piece in pieces {
+        let request = http::Request::post("http://graspd/grasp.v1.GraspService/DetectGrasps");
+        let request = request.header("content-type", "application/grpc").header("te", "trailers").body(()).unwrap();
+        let (_response, mut body) = h2.clone().ready().await.unwrap().send_request(request, false).unwrap();
+        body.send_data(Bytes::from_static(piece), false).unwrap();
+        body.send_reset(h2::Reason::CANCEL);
+    }
+    server.wait_for("graspd_requests_total{code=\"CANCELLED\",model=\"\"}", 2.0).await;
+    assert_eq!(server.metric("graspd_requests_total{code=\"INVALID_ARGUMENT\",model=\"\"}"), 0.0);
+}
+
+#[tokio::test]
+async fn a_flood_of_refusals_does_not_flood_the_log() {
+    let logs = tempfile::tempdir().unwrap();
+    let log = logs.path().join("log");
+    let (mut server, _folder) = log_to("info", &format!("2> {}", log.display()));
+    let client = Client::connect(server.grpc().to_string()).await.unwrap();
+    let suppressed = || metric(server.http(), "graspd_log_lines_suppressed_total");
+    let detect = DetectOptions { model: "missing".to_owned(), ..DetectOptions::default() };
+    let options = Options { detect, ..Options::default() };
+    let mut refused = 0;
+    while suppressed() == 0.0 {
+        assert!(refused < 10_000, "no line was suppressed");
+        for _ in 0..100 {
+            client.detect(&volume(), options.clone()).await.unwrap_err();
+        }
+        refused += 100;
+    }
+    let suppressed = suppressed() as usize;
+    server.terminate().unwrap();
+    assert_eq!(server.wait().unwrap().code(), Some(0));
+    let text = std::fs::read_to_string(log).unwrap();
+    let lines = text.lines().filter(|line| line.contains("refused") && line.contains("missing")).count();
+    assert_eq!(lines + suppressed, refused, "{text}");
 }
 
 #[tokio::test]

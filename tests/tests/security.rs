@@ -1,8 +1,10 @@
 //! Authentication and encryption: TLS, client certificates and tokens.
 
 use std::fs;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::Command;
+use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use grasp::Volume;
@@ -12,7 +14,13 @@ use nalgebra::Isometry3;
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
 use tempfile::TempDir;
 use time::OffsetDateTime;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
 use tokio::time::timeout;
+use tokio_rustls::TlsConnector;
+use tokio_rustls::rustls::pki_types::pem::PemObject;
+use tokio_rustls::rustls::pki_types::{CertificateDer, ServerName};
+use tokio_rustls::rustls::{self, ClientConfig, RootCertStore};
 use tonic::Code;
 
 fn volume() -> Volume {
@@ -67,6 +75,53 @@ impl Authority {
 async fn detects(server: &Server, access: Access) -> Result<usize, Error> {
     let client = Client::connect_with(server.grpc().to_string(), access).await?;
     Ok(client.detect(&volume(), Options::default()).await?.grasps.len())
+}
+
+/// The status of an HTTP request over TLS, with these lines in its header.
+async fn https(authority: &Authority, address: SocketAddr, path: &str, header: &str) -> std::io::Result<u16> {
+    let mut roots = RootCertStore::empty();
+    roots.add(CertificateDer::from_pem_slice(authority.issuer.pem().as_bytes()).unwrap()).unwrap();
+    let config = ClientConfig::builder_with_provider(Arc::new(rustls::crypto::ring::default_provider()));
+    let config = config.with_safe_default_protocol_versions().unwrap();
+    let config = config.with_root_certificates(roots).with_no_client_auth();
+    let stream = TcpStream::connect(address).await?;
+    let name = ServerName::try_from("localhost").unwrap();
+    let mut stream = TlsConnector::from(Arc::new(config)).connect(name, stream).await?;
+    let request = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n{header}\r\n");
+    stream.write_all(request.as_bytes()).await?;
+    let mut response = String::new();
+    stream.read_to_string(&mut response).await?;
+    let status = response.split(' ').nth(1).and_then(|status| status.parse().ok());
+    Ok(status.expect("a response has a status line"))
+}
+
+#[tokio::test]
+async fn rest_has_the_tls_and_the_tokens_of_grpc() {
+    let authority = Authority::new();
+    authority.sign("server");
+    authority.sign("client");
+    fs::write(authority.file("tokens"), "secret\n").unwrap();
+    let (cert, key, tokens) = (authority.path("server.pem"), authority.path("server.key"), authority.path("tokens"));
+    let flags = ["--rest", "127.0.0.1:0", "--tls-cert", &cert, "--tls-key", &key, "--token-file", &tokens];
+    let server = Server::run(&[TestModel::new("mirror")], &flags);
+    let rest = server.rest().unwrap();
+    for (path, header, status) in [
+        ("/v2/health/ready", "", 200),
+        ("/v2/models/mirror", "", 401),
+        ("/v2/models/mirror", "Authorization: Bearer wrong\r\n", 401),
+        ("/v2/models/mirror", "Authorization: Bearer secret\r\n", 200),
+    ] {
+        assert_eq!(https(&authority, rest, path, header).await.unwrap(), status, "{path} {header}");
+    }
+    assert!(https(&Authority::new(), rest, "/v2/health/live", "").await.is_err(), "another CA");
+    assert_eq!(server.metric("graspd_requests_total{code=\"UNAUTHENTICATED\",model=\"\"}"), 2.0);
+    drop(server);
+
+    let ca = authority.path("ca.pem");
+    let flags = ["--rest", "127.0.0.1:0", "--tls-cert", &cert, "--tls-key", &key, "--tls-client-ca", &ca];
+    let server = Server::run(&[TestModel::new("mirror")], &flags);
+    let rest = server.rest().unwrap();
+    assert!(https(&authority, rest, "/v2/health/live", "").await.is_err(), "without a client certificate");
 }
 
 #[tokio::test]

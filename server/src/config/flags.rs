@@ -75,6 +75,17 @@ pub(super) struct Flags {
     #[arg(long, env = "GRASPD_QUEUE", value_name = "N", default_value = "32", value_parser = count())]
     pub queue: u16,
 
+    /// Time after which an inference counts as hanging, seconds: its requests fail, and its session is lost until it
+    /// ends. If all sessions of a model hang, the server is neither ready nor healthy. 0 disables the check.
+    #[arg(
+        long,
+        env = "GRASPD_INFERENCE_TIMEOUT",
+        value_name = "SECONDS",
+        default_value = "30",
+        value_parser = seconds,
+    )]
+    pub inference_timeout: Duration,
+
     /// Maximum batch size, volumes. Values above 1 raise the throughput on a GPU. On a CPU they only raise the latency.
     #[arg(long, env = "GRASPD_MAX_BATCH", value_name = "N", default_value = "1", value_parser = count())]
     pub max_batch: u16,
@@ -111,7 +122,17 @@ pub(super) struct Flags {
     )]
     pub reload_timeout: Duration,
 
-    /// Certificate chain of the gRPC listener, PEM. Enables TLS; plaintext connections are then refused.
+    /// Clients may load and unload models, with the requests RepositoryModelLoad and RepositoryModelUnload of the Open
+    /// Inference Protocol.
+    #[arg(long, env = "GRASPD_ALLOW_MODEL_CONTROL")]
+    pub allow_model_control: bool,
+
+    /// Address of the Open Inference Protocol's REST listener, for inference clients without gRPC, with the limits, the
+    /// tokens and the TLS files of the gRPC listener. If not set, there is none.
+    #[arg(long, env = "GRASPD_REST", value_name = "ADDR")]
+    pub rest: Option<SocketAddr>,
+
+    /// Certificate chain of the gRPC and REST listeners, PEM. Enables TLS; plaintext connections are then refused.
     #[arg(
         long,
         requires = "tls_key",
@@ -192,6 +213,15 @@ pub(super) struct Flags {
     /// beyond it are refused. A connection may use half of what the others leave.
     #[arg(long, env = "GRASPD_MAX_RECEIVING_BYTES", value_name = "N", default_value = "268435456")]
     pub max_receiving_bytes: NonZeroUsize,
+
+    /// Folder into which requests for grasps and scores are recorded with their answers, one file each, for `grasp
+    /// replay`. TrackGrasps is not recorded. If not set, nothing is recorded.
+    #[arg(long, env = "GRASPD_RECORD", value_name = "DIR")]
+    pub record: Option<PathBuf>,
+
+    /// Maximum size of all recordings, bytes. The oldest are deleted.
+    #[arg(long, env = "GRASPD_RECORD_BYTES", value_name = "N", default_value = "1073741824", requires = "record")]
+    pub record_bytes: u64,
 
     /// Time that accepted requests have to finish after SIGTERM, seconds.
     #[arg(

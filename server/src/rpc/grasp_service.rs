@@ -7,6 +7,7 @@ use grasp::{Volume, WORKSPACE_SIZE};
 use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::find_table_request::Observation as Seen;
 use grasp_proto::pb::grasp_service_server::GraspService;
+use grasp_proto::pb::recording::{Answer, Request as Recorded};
 use grasp_proto::{
     Candidate, DetectParams, FieldError, Priority, TABLE_HEIGHT, Workspace, candidates, check_count, cloud_view,
     depth_view, pb, resolution,
@@ -29,12 +30,9 @@ use crate::serving::observation::Observation;
 use crate::serving::queue::Ticket;
 use crate::serving::registry::{ModelRegistry, check_voxel_size};
 use crate::serving::tracking::{Start, Track, TrackedVolumes};
+use crate::telemetry::recorder::{Pending, Recorder};
 use crate::transport::deadline::Deadline;
 use grasp_planner::Scene;
-
-/// Requests of one stream that are queued behind the current one: enough to keep a session busy, and few enough that a
-/// single stream never fills a queue.
-const READ_AHEAD: usize = 1;
 
 /// Largest volume that is converted on the async runtime's thread, bytes. That takes tens of microseconds, as long as
 /// handing it to another thread.
@@ -46,6 +44,9 @@ pub(crate) struct GraspRpc {
     models: Arc<ModelRegistry>,
     calls: Calls,
     tracked_volumes: Arc<TrackedVolumes>,
+    recorder: Recorder,
+    /// Requests of one stream that are queued behind the current one.
+    read_ahead: usize,
     /// One permit per CPU. A request holds one while it is converted and fused.
     fusion_permits: Arc<Semaphore>,
     /// One permit per CPU and per place in a model's queue. A request holds one while it waits for a fusion permit and
@@ -63,11 +64,14 @@ type Fused = (Vec<CubeScene>, Observed);
 struct PendingCall {
     call: Call,
     reply: Result<PendingReply, Refusal>,
+    recording: Pending,
 }
 
 impl PendingCall {
     async fn finish(self) -> Result<pb::DetectGraspsResponse, Refusal> {
-        self.call.finish(self.reply).await
+        let outcome = self.call.finish(self.reply).await;
+        self.recording.answered(&outcome, |response| Answer::Grasps(response.clone()));
+        outcome
     }
 
     async fn respond(self) -> Result<Response<pb::DetectGraspsResponse>, Status> {
@@ -77,12 +81,22 @@ impl PendingCall {
 }
 
 impl GraspRpc {
-    /// `queue` is the number of requests that may wait for conversion and fusion.
-    pub fn new(models: Arc<ModelRegistry>, calls: Calls, tracked_volumes: TrackedVolumes, queue: usize) -> Self {
+    /// `queue` is the number of requests that may wait for conversion and fusion, `at_once` the number of volumes that a
+    /// model can compute at the same time. A stream keeps that many in work, but never fills a queue.
+    pub fn new(
+        models: Arc<ModelRegistry>,
+        calls: Calls,
+        tracked_volumes: TrackedVolumes,
+        recorder: Recorder,
+        queue: usize,
+        at_once: usize,
+    ) -> Self {
+        let read_ahead = at_once.min(queue / 2).max(1);
         let processors = thread::available_parallelism().map_or(1, NonZero::get);
         let semaphore = |permits: usize| Arc::new(Semaphore::new(permits.min(Semaphore::MAX_PERMITS)));
         let (fusion_permits, conversion_permits) = (semaphore(processors), semaphore(processors.saturating_add(queue)));
-        Self { models, calls, tracked_volumes: Arc::new(tracked_volumes), fusion_permits, conversion_permits }
+        let tracked_volumes = Arc::new(tracked_volumes);
+        Self { models, calls, tracked_volumes, recorder, read_ahead, fusion_permits, conversion_permits }
     }
 
     /// Opens a call and submits its request. [`PendingCall::finish`] returns both results and refusals.
@@ -90,6 +104,7 @@ impl GraspRpc {
         &self,
         request_id: String,
         context: CallContext,
+        recording: Pending,
         submit: impl AsyncFnOnce(&mut Call) -> Result<PendingReply, Refusal>,
     ) -> PendingCall {
         let (mut call, checked) = self.calls.open(request_id, context);
@@ -97,7 +112,7 @@ impl GraspRpc {
             Ok(()) => submit(&mut call).await,
             Err(refusal) => Err(refusal),
         };
-        PendingCall { call, reply }
+        PendingCall { call, reply, recording }
     }
 
     async fn submit(&self, request: pb::DetectGraspsRequest, call: &mut Call) -> Result<PendingReply, Refusal> {
@@ -394,8 +409,9 @@ impl GraspService for GraspRpc {
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
         let context = CallContext::of(&request);
         let mut request = request.into_inner();
+        let recording = self.recorder.request(|| Recorded::Volume(request.clone()));
         let id = std::mem::take(&mut request.request_id);
-        self.begin(id, context, async |call| self.submit(request, call).await).await.respond().await
+        self.begin(id, context, recording, async |call| self.submit(request, call).await).await.respond().await
     }
 
     async fn detect_grasps_from_depth(
@@ -404,8 +420,9 @@ impl GraspService for GraspRpc {
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
         let context = CallContext::of(&request);
         let mut request = request.into_inner();
+        let recording = self.recorder.request(|| Recorded::Depth(request.clone()));
         let id = std::mem::take(&mut request.request_id);
-        self.begin(id, context, async |call| self.submit_depth(request, call).await).await.respond().await
+        self.begin(id, context, recording, async |call| self.submit_depth(request, call).await).await.respond().await
     }
 
     async fn detect_grasps_from_cloud(
@@ -414,8 +431,9 @@ impl GraspService for GraspRpc {
     ) -> Result<Response<pb::DetectGraspsResponse>, Status> {
         let context = CallContext::of(&request);
         let mut request = request.into_inner();
+        let recording = self.recorder.request(|| Recorded::Cloud(request.clone()));
         let id = std::mem::take(&mut request.request_id);
-        self.begin(id, context, async |call| self.submit_cloud(request, call).await).await.respond().await
+        self.begin(id, context, recording, async |call| self.submit_cloud(request, call).await).await.respond().await
     }
 
     async fn score_grasps(
@@ -424,13 +442,16 @@ impl GraspService for GraspRpc {
     ) -> Result<Response<pb::ScoreGraspsResponse>, Status> {
         let context = CallContext::of(&request);
         let mut request = request.into_inner();
+        let recording = self.recorder.request(|| Recorded::Score(request.clone()));
         let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), context);
         let pending = match checked {
             Ok(()) => self.submit_candidates(request, &mut call).await,
             Err(refusal) => Err(refusal),
         };
         let id = call.id.clone();
-        call.finish_scores(pending).await.map(Response::new).map_err(|refusal| refusal.status(&id))
+        let outcome = call.finish_scores(pending).await;
+        recording.answered(&outcome, |response| Answer::Scores(response.clone()));
+        outcome.map(Response::new).map_err(|refusal| refusal.status(&id))
     }
 
     async fn find_table(
@@ -458,7 +479,7 @@ impl GraspService for GraspRpc {
         let context = CallContext::of(&request);
         let mut requests = request.into_inner();
         let service = self.clone();
-        let (pending, calls) = mpsc::channel(READ_AHEAD);
+        let (pending, calls) = mpsc::channel(self.read_ahead);
         tokio::spawn(async move {
             // Reserves a slot before it reads a message, so that flow control keeps further messages at the client.
             while let Ok(slot) = pending.reserve().await {
@@ -468,9 +489,10 @@ impl GraspService for GraspRpc {
                 };
                 match message {
                     Ok(Some(mut request)) => {
+                        let recording = service.recorder.request(|| Recorded::Volume(request.clone()));
                         let id = std::mem::take(&mut request.request_id);
                         let submit = async |call: &mut Call| service.submit(request, call).await;
-                        slot.send(Ok(service.begin(id, context.clone(), submit).await));
+                        slot.send(Ok(service.begin(id, context.clone(), recording, submit).await));
                     }
                     Ok(None) => return,
                     // Too large or malformed: the framing of messages is lost, so the stream ends with this status.
@@ -527,7 +549,8 @@ impl GraspService for GraspRpc {
                 let id = std::mem::take(&mut request.request_id);
                 let result = async {
                     let submit = async |call: &mut Call| service.submit_track(request, &mut track, call).await;
-                    let pending = service.begin(id, context.clone(), submit).await;
+                    // A request cannot be repeated without those before it.
+                    let pending = service.begin(id, context.clone(), Pending::none(), submit).await;
                     let id = pending.call.id.clone();
                     response(id, pending.finish().await)
                 };
@@ -553,7 +576,7 @@ impl GraspService for GraspRpc {
 fn response(request_id: String, outcome: Result<pb::DetectGraspsResponse, Refusal>) -> pb::DetectGraspsStreamResponse {
     let outcome = match outcome {
         Ok(response) => Outcome::Response(response),
-        Err(refusal) => Outcome::Error(refusal.into()),
+        Err(refusal) => Outcome::Error((&refusal).into()),
     };
     pb::DetectGraspsStreamResponse { request_id, outcome: Some(outcome) }
 }

@@ -1,4 +1,6 @@
+use std::collections::HashMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use grasp::Volume;
 use grasp_models::{INPUT, OUTPUTS};
@@ -6,6 +8,7 @@ use grasp_proto::oip::grpc_inference_service_server::GrpcInferenceService;
 use grasp_proto::oip::model_infer_request::InferInputTensor;
 use grasp_proto::oip::model_infer_response::InferOutputTensor;
 use grasp_proto::oip::model_metadata_response::TensorMetadata;
+use grasp_proto::oip::repository_index_response::ModelIndex;
 use grasp_proto::oip::{self, infer_parameter::ParameterChoice};
 use grasp_proto::{FieldError, Priority, on_a_line};
 use nalgebra::Isometry3;
@@ -16,9 +19,11 @@ use tonic::{Request, Response, Status};
 use crate::readiness::State;
 use crate::rpc::call::{Call, CallContext, Calls};
 use crate::rpc::refusal::Refusal;
+use crate::serving::control::{Change, ModelControl};
 use crate::serving::engine::Engine;
 use crate::serving::job::{EngineError, Reply, Tensors};
-use crate::serving::registry::ModelRegistry;
+use crate::serving::registry::{ModelRegistry, Unavailable};
+use crate::telemetry::metrics::Metrics;
 use crate::telemetry::timings::StageTimings;
 use crate::transport::response_buffer::{ResponseBuffer, ResponsePermit};
 
@@ -35,13 +40,15 @@ const MAPS_PER_VOXEL: usize = 24;
 pub(crate) struct InferenceRpc {
     models: Arc<ModelRegistry>,
     calls: Calls,
+    metrics: Arc<Metrics>,
+    control: ModelControl,
     /// Limits the memory of maps, which are a hundred times as large as the grasps in them.
     response_buffer: ResponseBuffer,
 }
 
 impl InferenceRpc {
-    pub fn new(models: Arc<ModelRegistry>, calls: Calls) -> Self {
-        Self { models, calls, response_buffer: ResponseBuffer::new() }
+    pub fn new(models: Arc<ModelRegistry>, calls: Calls, metrics: Arc<Metrics>, control: ModelControl) -> Self {
+        Self { models, calls, metrics, control, response_buffer: ResponseBuffer::new() }
     }
 
     fn is_ready(&self) -> bool {
@@ -64,8 +71,53 @@ impl InferenceRpc {
         if engine.source.network().is_some() { Ok(engine) } else { Err(unknown()) }
     }
 
+    /// Changes a model of the folder.
+    async fn change(
+        &self,
+        repository: &str,
+        parameters: &HashMap<String, oip::ModelRepositoryParameter>,
+        name: String,
+        change: Change,
+    ) -> Result<(), Refusal> {
+        one_repository(repository)?;
+        if let Some(parameter) = parameters.keys().min() {
+            let value = format_args!("`{}`", on_a_line(parameter));
+            return Err(FieldError::new("parameters", value, "must be empty").into());
+        }
+        self.control.change(name, change).await
+    }
+
+    /// Numbers and durations of a model's inferences.
+    fn statistics(&self, engine: &Engine) -> oip::ModelStatistics {
+        let duration = |count: u64, seconds: f64| {
+            let ns = u64::try_from(Duration::from_secs_f64(seconds).as_nanos()).unwrap_or(u64::MAX);
+            Some(oip::StatisticDuration { count, ns })
+        };
+        let stage = |name: &str| {
+            let (count, seconds) = self.metrics.stage(&engine.label, name);
+            duration(count, seconds)
+        };
+        let (batches, volumes) = self.metrics.batches(&engine.label);
+        oip::ModelStatistics {
+            name: engine.source.name().to_owned(),
+            version: engine.source.version().to_owned(),
+            last_inference: engine.latest_inference(),
+            inference_count: volumes,
+            execution_count: batches,
+            inference_stats: Some(oip::InferStatistics {
+                success: stage("total"),
+                fail: duration(self.metrics.failures(&engine.label), 0.0),
+                queue: stage("queue"),
+                compute_input: stage("preprocessing"),
+                compute_infer: stage("inference"),
+                compute_output: stage("postprocessing"),
+            }),
+        }
+    }
+
     /// Validates a request and queues each of its volumes.
     fn submit(&self, request: &oip::ModelInferRequest, call: &mut Call) -> Result<Queued, Refusal> {
+        check_parameters(request)?;
         let engine = self.network(&request.model_name, &request.model_version)?;
         call.set_model(&engine);
         let network = engine.source.network().map(|entry| &entry.metadata);
@@ -101,6 +153,28 @@ struct Queued {
     engine: Arc<Engine>,
     replies: Vec<Reply<Tensors>>,
     permit: ResponsePermit,
+}
+
+/// Refuses parameters: ignoring, for example, a time limit would surprise the client.
+fn check_parameters(request: &oip::ModelInferRequest) -> Result<(), FieldError> {
+    let of_inputs = request.inputs.iter().enumerate().map(|(i, input)| (format!("inputs[{i}]."), &input.parameters));
+    let of_outputs =
+        request.outputs.iter().enumerate().map(|(i, output)| (format!("outputs[{i}]."), &output.parameters));
+    let all = [(String::new(), &request.parameters)].into_iter().chain(of_inputs).chain(of_outputs);
+    for (of, parameters) in all {
+        if let Some(name) = parameters.keys().min() {
+            let value = format_args!("`{}`", on_a_line(name));
+            return Err(FieldError::new(format!("{of}parameters"), value, "which is not supported; remove it"));
+        }
+    }
+    Ok(())
+}
+
+fn one_repository(name: &str) -> Result<(), FieldError> {
+    if name.is_empty() {
+        return Ok(());
+    }
+    Err(FieldError::new("repository_name", format_args!("`{}`", on_a_line(name)), "must be empty"))
 }
 
 /// The validated values of the input `[batch, 1, n, n, n]`.
@@ -231,7 +305,7 @@ impl GrpcInferenceService for InferenceRpc {
         Ok(Response::new(oip::ServerMetadataResponse {
             name: env!("CARGO_PKG_NAME").to_owned(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
-            extensions: vec!["model_configuration".to_owned()],
+            extensions: EXTENSIONS.map(str::to_owned).into(),
         }))
     }
 
@@ -306,7 +380,75 @@ impl GrpcInferenceService for InferenceRpc {
             }),
         }))
     }
+
+    async fn model_statistics(
+        &self,
+        request: Request<oip::ModelStatisticsRequest>,
+    ) -> Result<Response<oip::ModelStatisticsResponse>, Status> {
+        let oip::ModelStatisticsRequest { name, version } = request.into_inner();
+        let served = self.models.now();
+        let is_asked = |engine: &&Arc<Engine>| {
+            engine.source.network().is_some()
+                && (name.is_empty() || engine.source.name() == name)
+                && (version.is_empty() || engine.source.version() == version)
+        };
+        if !name.is_empty() {
+            self.network(&name, &version).map_err(|refusal| refusal.status(""))?;
+        }
+        let model_stats = served.iter().filter(is_asked).map(|engine| self.statistics(engine)).collect();
+        Ok(Response::new(oip::ModelStatisticsResponse { model_stats }))
+    }
+
+    async fn repository_index(
+        &self,
+        request: Request<oip::RepositoryIndexRequest>,
+    ) -> Result<Response<oip::RepositoryIndexResponse>, Status> {
+        let oip::RepositoryIndexRequest { repository_name, ready } = request.into_inner();
+        one_repository(&repository_name).map_err(|error| Refusal::from(error).status(""))?;
+        let served = self.models.now();
+        let networks = served.iter().filter(|engine| engine.source.network().is_some());
+        let mut models: Vec<_> = networks
+            .map(|engine| ModelIndex {
+                name: engine.source.name().to_owned(),
+                version: engine.source.version().to_owned(),
+                state: "READY".to_owned(),
+                reason: String::new(),
+            })
+            .collect();
+        if !ready {
+            models.extend(self.models.unavailable().into_iter().map(|Unavailable { name, reason }| ModelIndex {
+                name,
+                version: String::new(),
+                state: "UNAVAILABLE".to_owned(),
+                reason,
+            }));
+        }
+        Ok(Response::new(oip::RepositoryIndexResponse { models }))
+    }
+
+    async fn repository_model_load(
+        &self,
+        request: Request<oip::RepositoryModelLoadRequest>,
+    ) -> Result<Response<oip::RepositoryModelLoadResponse>, Status> {
+        let oip::RepositoryModelLoadRequest { repository_name, model_name, parameters } = request.into_inner();
+        let changed = self.change(&repository_name, &parameters, model_name, Change::Load).await;
+        changed.map_err(|refusal| refusal.status(""))?;
+        Ok(Response::new(oip::RepositoryModelLoadResponse {}))
+    }
+
+    async fn repository_model_unload(
+        &self,
+        request: Request<oip::RepositoryModelUnloadRequest>,
+    ) -> Result<Response<oip::RepositoryModelUnloadResponse>, Status> {
+        let oip::RepositoryModelUnloadRequest { repository_name, model_name, parameters } = request.into_inner();
+        let changed = self.change(&repository_name, &parameters, model_name, Change::Unload).await;
+        changed.map_err(|refusal| refusal.status(""))?;
+        Ok(Response::new(oip::RepositoryModelUnloadResponse {}))
+    }
 }
+
+/// The extensions of the protocol, by Triton's names.
+const EXTENSIONS: [&str; 4] = ["binary_tensor_data", "model_configuration", "model_repository", "statistics"];
 
 /// Triton's platform name for ONNX Runtime.
 const PLATFORM: &str = "onnxruntime_onnx";

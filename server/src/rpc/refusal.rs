@@ -26,6 +26,10 @@ pub(crate) enum Refusal {
     TooManyTracked(usize),
     #[error("no request for {0:?} (--track-timeout), the volume was dropped; open a new stream")]
     TrackExpired(Duration),
+    #[error("loading and unloading of models is not allowed; start the server with --allow-model-control")]
+    NoModelControl,
+    #[error("{0}")]
+    NotChanged(String),
     #[error(transparent)]
     Failed(EngineError),
 }
@@ -33,7 +37,7 @@ pub(crate) enum Refusal {
 impl From<EngineError> for Refusal {
     fn from(error: EngineError) -> Self {
         match error {
-            EngineError::Displaced(overloaded) => Self::Overloaded(overloaded),
+            EngineError::Overloaded(overloaded) => Self::Overloaded(overloaded),
             error => Self::Failed(error),
         }
     }
@@ -53,7 +57,10 @@ impl Refusal {
             Self::Overloaded(_) | Self::TooManyTracked(_) => Code::ResourceExhausted,
             Self::Starting(_) | Self::Draining => Code::Unavailable,
             Self::TrackExpired(_) => Code::Aborted,
+            Self::NoModelControl => Code::PermissionDenied,
+            Self::NotChanged(_) => Code::FailedPrecondition,
             Self::Failed(EngineError::Expired) => Code::DeadlineExceeded,
+            Self::Failed(EngineError::NoSession) => Code::Unavailable,
             Self::Failed(_) => Code::Internal,
         }
     }
@@ -73,9 +80,13 @@ impl Refusal {
             Self::Overloaded(overloaded) => Some(overloaded.retry_after),
             Self::Starting(retry_after) => Some(*retry_after),
             Self::TooManyTracked(_) => Some(STREAMS_IN_USE),
-            Self::Field(_) | Self::UnknownModel { .. } | Self::Draining | Self::TrackExpired(_) | Self::Failed(_) => {
-                None
-            }
+            Self::Field(_)
+            | Self::UnknownModel { .. }
+            | Self::Draining
+            | Self::TrackExpired(_)
+            | Self::NoModelControl
+            | Self::NotChanged(_)
+            | Self::Failed(_) => None,
         }
     }
 }
@@ -104,8 +115,8 @@ impl Refusal {
     }
 }
 
-impl From<Refusal> for pb::Error {
-    fn from(refusal: Refusal) -> Self {
+impl From<&Refusal> for pb::Error {
+    fn from(refusal: &Refusal) -> Self {
         Self {
             code: refusal.code().into(),
             retry_after: refusal.retry_after().map(|after| after.as_secs_f64()),

@@ -1,6 +1,4 @@
-use std::io;
-use std::sync::{Arc, Mutex, PoisonError};
-use std::thread::{self, JoinHandle};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
@@ -9,15 +7,15 @@ use grasp_models::{Backend, Options};
 use grasp_planner::{Loaded, Scene, Source};
 use grasp_proto::{Candidate, FieldError};
 use thiserror::Error;
-use tokio::sync::oneshot;
-use tracing::{Span, info, warn};
+use tracing::{Span, info};
 
 use super::cubes::CubeScene;
 use super::detection::{Detection, Score};
-use super::job::{EngineError, Job, Reply, Task, Tensors};
+use super::job::{EngineError, Job, Reply, Sender, Task, Tensors};
 use super::queue::{Batching, Queue, QueueSlot, Refused, Ticket};
 use super::retries::Retries;
 use super::session::{ServiceTime, Session, warm_up};
+use super::session_threads::{Running, SessionThreads};
 use crate::telemetry::metrics::{Metrics, ModelLabels, QueueMetrics, RefusalCounters};
 use crate::transport::deadline::Deadline;
 
@@ -29,6 +27,8 @@ pub(crate) struct Engine {
     pub backend: Backend,
     workers: usize,
     queue: Arc<Queue<Job>>,
+    /// One per session.
+    running: Vec<Arc<Running>>,
     service_time: Arc<ServiceTime>,
     retries: Retries,
     refused: RefusalCounters,
@@ -44,10 +44,6 @@ pub(crate) struct Serving {
     pub capacity: usize,
     pub batching: Batching,
 }
-
-/// The session threads of all engines.
-#[derive(Default)]
-pub(crate) struct SessionThreads(Mutex<Vec<JoinHandle<()>>>);
 
 /// A request was refused because the server has too many.
 #[derive(Clone, Debug, Error)]
@@ -77,18 +73,21 @@ impl Engine {
                     .with_context(|| format!("the warm-up inference of the model {label} failed"))?;
             }
         }
-        let QueueMetrics { waiting, batch, refused } = metrics.queue(&label);
+        let QueueMetrics { waiting, batch, refused, hanging } = metrics.queue(&label);
         let queue = Arc::new(Queue::new(workers, capacity, waiting));
         // Created before the threads, so that an early return drops it, which closes the queue and ends started
         // threads.
         let service_time = Arc::new(ServiceTime::new(service_time));
         let retries = Retries::default();
-        let engine = Self { source, label, backend, workers, queue, service_time, retries, refused };
+        let running: Vec<_> = planners.iter().map(|_| Arc::new(Running::new(hanging.clone()))).collect();
+        let engine = Self { source, label, backend, workers, queue, running, service_time, retries, refused };
         for (worker, planner) in planners.into_iter().enumerate() {
             let (queue, service_time) = (Arc::clone(&engine.queue), Arc::clone(&engine.service_time));
             let defaults = engine.source.decode_params();
-            let session = Session { planner, defaults, queue, batching, batch: batch.clone(), service_time };
-            sessions.spawn(format!("{} {worker}", engine.source.name()), session).with_context(|| {
+            let (running, batch) = (Arc::clone(&engine.running[worker]), batch.clone());
+            let session = Session { planner, defaults, queue, batching, batch, running, service_time };
+            let name = format!("{} {worker}", engine.source.name());
+            sessions.spawn(name, session, &engine.running, worker).with_context(|| {
                 format!("cannot start thread {worker} of {workers} for the model {}; lower --workers", engine.label)
             })?;
         }
@@ -112,8 +111,8 @@ impl Engine {
         CubeScene { scene, params }: CubeScene,
         ticket: Ticket,
         span: Span,
-    ) -> Result<Reply<Detection>, Overloaded> {
-        let (sender, receiver) = oneshot::channel();
+    ) -> Result<Reply<Detection>, EngineError> {
+        let (sender, receiver) = Sender::new();
         let slot = self.push(scene, Task::Grasps(Box::new(params), sender), ticket, span)?;
         Ok(Reply::new(receiver, slot))
     }
@@ -125,15 +124,15 @@ impl Engine {
         candidates: Vec<Candidate>,
         ticket: Ticket,
         span: Span,
-    ) -> Result<Reply<Vec<Score>>, Overloaded> {
-        let (sender, receiver) = oneshot::channel();
+    ) -> Result<Reply<Vec<Score>>, EngineError> {
+        let (sender, receiver) = Sender::new();
         let slot = self.push(scene, Task::Scores(Box::new(params), candidates, sender), ticket, span)?;
         Ok(Reply::new(receiver, slot))
     }
 
     /// Queues a volume for the network's raw output. Refuses immediately if the queue is full.
-    pub fn maps(&self, volume: Volume, ticket: Ticket, span: Span) -> Result<Reply<Tensors>, Overloaded> {
-        let (sender, receiver) = oneshot::channel();
+    pub fn maps(&self, volume: Volume, ticket: Ticket, span: Span) -> Result<Reply<Tensors>, EngineError> {
+        let (sender, receiver) = Sender::new();
         let slot = self.push(Scene { volume, points: None }, Task::Maps(sender), ticket, span)?;
         Ok(Reply::new(receiver, slot))
     }
@@ -142,6 +141,16 @@ impl Engine {
     pub fn labels(&self) -> ModelLabels {
         let Backend { provider, precision } = self.backend;
         ModelLabels([self.label.clone(), provider.to_string(), precision.to_string(), self.source.sha256().to_owned()])
+    }
+
+    /// Whether every session hangs in an inference.
+    pub fn is_hanging(&self) -> bool {
+        self.running.iter().all(|session| session.is_hanging())
+    }
+
+    /// When the latest inference ended, milliseconds since 1970; 0 if there was none.
+    pub fn latest_inference(&self) -> u64 {
+        self.running.iter().map(|session| session.latest()).max().unwrap_or(0)
     }
 
     /// Queue length, requests.
@@ -161,22 +170,28 @@ impl Engine {
     }
 
     /// Refuses if the queue is full now, before the caller converts and fuses data.
-    pub fn check_capacity(&self, ticket: Ticket) -> Result<(), Overloaded> {
-        if self.queue.is_full_for(ticket) { Err(self.full()) } else { Ok(()) }
+    pub fn check_capacity(&self, ticket: Ticket) -> Result<(), EngineError> {
+        if self.is_hanging() {
+            return Err(EngineError::NoSession);
+        }
+        if self.queue.is_full_for(ticket) { Err(self.full().into()) } else { Ok(()) }
     }
 
-    fn push(&self, scene: Scene, task: Task, ticket: Ticket, span: Span) -> Result<QueueSlot<Job>, Overloaded> {
+    fn push(&self, scene: Scene, task: Task, ticket: Ticket, span: Span) -> Result<QueueSlot<Job>, EngineError> {
+        if self.is_hanging() {
+            return Err(EngineError::NoSession);
+        }
         let job = Job { scene, task, deadline: ticket.deadline.map(Deadline), span, submitted: Instant::now() };
         // The queue is open: only dropping the engine closes it.
         match self.queue.push(job, ticket, self.service_time.get()) {
             Ok((slot, displaced)) => {
                 if let Some(job) = displaced {
-                    job.task.fail(EngineError::Displaced(self.displaced()));
+                    job.task.fail(self.displaced().into());
                 }
                 Ok(slot)
             }
-            Err(Refused::Full) => Err(self.full()),
-            Err(Refused::TooLate(estimate)) => Err(self.too_late(estimate)),
+            Err(Refused::Full) => Err(self.full().into()),
+            Err(Refused::TooLate(estimate)) => Err(self.too_late(estimate).into()),
         }
     }
 
@@ -218,33 +233,5 @@ impl Engine {
 impl Drop for Engine {
     fn drop(&mut self) {
         self.queue.close();
-    }
-}
-
-impl SessionThreads {
-    fn spawn(&self, name: String, session: Session) -> io::Result<()> {
-        let thread = thread::Builder::new().name(name).spawn(move || session.run())?;
-        let mut threads = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        threads.retain(|thread| !thread.is_finished());
-        threads.push(thread);
-        Ok(())
-    }
-
-    /// Waits until the session threads end, at most `timeout`. A session ends when its engine is dropped and its queue
-    /// is empty.
-    pub fn join(&self, timeout: Duration) {
-        let until = Instant::now() + timeout;
-        let threads = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
-        for thread in threads {
-            while !thread.is_finished() && Instant::now() < until {
-                thread::sleep(Duration::from_millis(1));
-            }
-            if !thread.is_finished() {
-                warn!(session = thread.thread().name(), "session thread still running at shutdown");
-                continue;
-            }
-            // Fails only after a panic, which ended the thread.
-            let _ = thread.join();
-        }
     }
 }

@@ -1,5 +1,6 @@
 //! A job: one scene on its way through the queue and a session, and its result.
 
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use grasp::DecodeError;
@@ -41,8 +42,12 @@ pub(crate) enum EngineError {
     SessionEnded,
     #[error("the deadline passed before the request was finished")]
     Expired,
+    #[error("the inference takes longer than {0:?} (--inference-timeout)")]
+    Hanging(Duration),
+    #[error("all sessions of the model hang in an inference; retry on another replica")]
+    NoSession,
     #[error(transparent)]
-    Displaced(Overloaded),
+    Overloaded(#[from] Overloaded),
 }
 
 impl From<PlanError> for EngineError {
@@ -62,8 +67,49 @@ pub(crate) struct Reply<T> {
     _slot: QueueSlot<Job>,
 }
 
-pub(super) type Sender<T> = oneshot::Sender<Result<SessionOutput<T>, EngineError>>;
+/// Sends the result of a scene, once. It is shared with the watch for inferences that do not end.
+pub(super) struct Sender<T>(Arc<Mutex<Option<oneshot::Sender<Result<SessionOutput<T>, EngineError>>>>>);
+
 type Receiver<T> = oneshot::Receiver<Result<SessionOutput<T>, EngineError>>;
+
+/// A pending request that can be failed.
+pub(super) trait Fail: Send + Sync {
+    /// Sends an error, unless a result was sent.
+    fn fail(&self, error: EngineError);
+}
+
+impl<T: Send + 'static> Sender<T> {
+    pub fn new() -> (Self, Receiver<T>) {
+        let (sender, receiver) = oneshot::channel();
+        (Self(Arc::new(Mutex::new(Some(sender)))), receiver)
+    }
+
+    /// Whether the result is no longer needed.
+    pub fn is_closed(&self) -> bool {
+        self.sender().as_ref().is_none_or(oneshot::Sender::is_closed)
+    }
+
+    /// A failed send is ignored: the call counts as cancelled by the client.
+    pub fn send(&self, result: Result<SessionOutput<T>, EngineError>) {
+        if let Some(sender) = self.sender().take() {
+            let _ = sender.send(result);
+        }
+    }
+
+    fn sender(&self) -> MutexGuard<'_, Option<oneshot::Sender<Result<SessionOutput<T>, EngineError>>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn shared(&self) -> Arc<dyn Fail> {
+        Arc::new(Self(Arc::clone(&self.0)))
+    }
+}
+
+impl<T: Send + 'static> Fail for Sender<T> {
+    fn fail(&self, error: EngineError) {
+        self.send(Err(error));
+    }
+}
 
 impl<T> Reply<T> {
     pub(super) fn new(receiver: Receiver<T>, slot: QueueSlot<Job>) -> Self {
@@ -110,12 +156,17 @@ impl Task {
         }
     }
 
-    /// Sends an error. A failed send is ignored: the call counts as cancelled by the client.
+    /// Sends an error.
     pub fn fail(self, error: EngineError) {
+        self.reply().fail(error);
+    }
+
+    /// The pending request.
+    pub fn reply(&self) -> Arc<dyn Fail> {
         match self {
-            Self::Grasps(_, reply) => drop(reply.send(Err(error))),
-            Self::Scores(_, _, reply) => drop(reply.send(Err(error))),
-            Self::Maps(reply) => drop(reply.send(Err(error))),
+            Self::Grasps(_, reply) => reply.shared(),
+            Self::Scores(_, _, reply) => reply.shared(),
+            Self::Maps(reply) => reply.shared(),
         }
     }
 }

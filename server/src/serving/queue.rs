@@ -251,6 +251,14 @@ impl<T> Queue<T> {
         if ended { None } else { Some(jobs) }
     }
 
+    /// Takes all jobs, without a session for them.
+    pub fn take_all(&self) -> Vec<T> {
+        let mut state = self.lock();
+        let jobs: Vec<T> = std::iter::from_fn(|| state.take()).collect();
+        self.gauge.sub(jobs.len() as i64);
+        jobs
+    }
+
     /// Marks a session as idle. The session calls it before it sends its results, so that a client that has received
     /// one finds a slot for its next request.
     pub fn free(&self) {

@@ -7,9 +7,20 @@ use crate::rpc::refusal::Refusal;
 use crate::serving::engine::Engine;
 use grasp_planner::Source;
 
-/// The served models.
+/// The models of the model folder.
 #[derive(Default)]
-pub(crate) struct ModelRegistry(RwLock<Engines>);
+pub(crate) struct ModelRegistry {
+    served: RwLock<Engines>,
+    unavailable: RwLock<Vec<Unavailable>>,
+}
+
+/// A model of the folder that is not served.
+#[derive(Clone)]
+pub(crate) struct Unavailable {
+    /// The file's name, if the file cannot be read.
+    pub name: String,
+    pub reason: String,
+}
 
 /// The default network first, then the other networks by name, then those with an evaluator, then the planners without a
 /// network; per name the newest version first.
@@ -18,7 +29,7 @@ pub(crate) type Engines = Arc<[Arc<Engine>]>;
 impl ModelRegistry {
     /// The models served now. Engines in the returned list remain usable after they are replaced.
     pub fn now(&self) -> Engines {
-        Arc::clone(&self.0.read().unwrap_or_else(PoisonError::into_inner))
+        Arc::clone(&self.served.read().unwrap_or_else(PoisonError::into_inner))
     }
 
     pub fn replace(&self, mut engines: Vec<Arc<Engine>>, default: Option<&str>) {
@@ -29,7 +40,16 @@ impl ModelRegistry {
             let is_evaluated = matches!(engine.source, Source::Evaluated { .. });
             (engine.source.network().is_none(), default != Some(&name), is_evaluated, name)
         });
-        *self.0.write().unwrap_or_else(PoisonError::into_inner) = engines.into();
+        *self.served.write().unwrap_or_else(PoisonError::into_inner) = engines.into();
+    }
+
+    /// The models that are not served.
+    pub fn unavailable(&self) -> Vec<Unavailable> {
+        self.unavailable.read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    pub fn set_unavailable(&self, models: Vec<Unavailable>) {
+        *self.unavailable.write().unwrap_or_else(PoisonError::into_inner) = models;
     }
 
     /// Selects the model that a request names, or the default. `resolution` is that of the request's volume, if it has

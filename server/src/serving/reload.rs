@@ -1,20 +1,25 @@
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use grasp_models::{Entry, Options, read_regular_file};
+use grasp_proto::on_a_line;
 use tokio::signal::unix::Signal;
-use tokio::sync::watch;
+use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
 use tracing::{error, info, warn};
 
 use crate::config::Config;
 use crate::readiness::State;
-use crate::serving::engine::{Engine, Serving, SessionThreads};
+use crate::rpc::refusal::Refusal;
+use crate::serving::control::{Change, Command, ModelControl};
+use crate::serving::engine::{Engine, Serving};
 use crate::serving::model_files::ModelFiles;
-use crate::serving::registry::ModelRegistry;
+use crate::serving::registry::{ModelRegistry, Unavailable};
+use crate::serving::session_threads::SessionThreads;
 use crate::serving::stamps::{DEFAULT, Stamps, stamps};
 use crate::telemetry::metrics::Metrics;
 use grasp_planner::Source;
@@ -38,6 +43,9 @@ pub(crate) struct ModelFolder {
     timeout: Duration,
     /// Number of the latest reload. Earlier ones that are still running change nothing.
     latest: AtomicU64,
+    /// Names of the models that clients have unloaded.
+    unloaded: Mutex<BTreeSet<String>>,
+    commands: Option<mpsc::Receiver<Command>>,
     serving: Serving,
     models: Arc<ModelRegistry>,
     sessions: Arc<SessionThreads>,
@@ -45,29 +53,34 @@ pub(crate) struct ModelFolder {
 }
 
 impl ModelFolder {
+    /// The folder, and what clients change its models with.
     pub fn new(
         config: &Config,
         models: Arc<ModelRegistry>,
         sessions: Arc<SessionThreads>,
         metrics: Arc<Metrics>,
-    ) -> Self {
+    ) -> (Self, ModelControl) {
+        let (control, commands) = ModelControl::new(config.allow_model_control);
         let Config { workers, threads, provider, precision, queue, batching, .. } = *config;
         let options = Options { threads, provider, precision, max_batch: batching.max };
         let serving = Serving { workers, options, capacity: queue, batching };
         let (directory, default_model) = (config.store.directory().to_owned(), config.default_model.clone());
         let stamps = config.stamps.clone();
-        Self {
+        let folder = Self {
             directory,
             stamps,
             default_model,
             max_bytes: config.max_model_bytes,
             timeout: config.reload_timeout,
             latest: AtomicU64::new(0),
+            unloaded: Mutex::default(),
+            commands: Some(commands),
             serving,
             models,
             sessions,
             metrics,
-        }
+        };
+        (folder, control)
     }
 
     /// Loads the networks `entries` and the planners of the subfolders, and serves them. Returns early
@@ -88,24 +101,39 @@ impl ModelFolder {
         Ok(())
     }
 
-    /// Reloads the folder at SIGHUP, and when its files have changed and were then unchanged for one interval, so that
-    /// files that are still being written are not loaded. Without an interval, only SIGHUP reloads.
-    pub async fn watch(self, mut hangup: Signal, interval: Option<Duration>) {
+    /// Reloads the folder at SIGHUP, when a client loads or unloads a model, and when its files have changed and were
+    /// then unchanged for one interval, so that files that are still being written are not loaded. Without an interval
+    /// it is not polled.
+    pub async fn watch(mut self, mut hangup: Signal, interval: Option<Duration>) {
+        let mut commands = self.commands.take();
         let folder = Arc::new(self);
         let mut loaded = folder.stamps.clone();
         let mut last = loaded.clone();
         let mut hanging: Vec<JoinHandle<()>> = Vec::new();
+        let mut next_command = async || match &mut commands {
+            Some(commands) => commands.recv().await,
+            None => None,
+        };
         loop {
-            let is_requested = tokio::select! {
-                _ = hangup.recv() => true,
-                () = tokio::time::sleep(interval.unwrap_or_default()), if interval.is_some() => false,
+            let (is_requested, command) = tokio::select! {
+                _ = hangup.recv() => (true, None),
+                Some(command) = next_command() => (true, Some(command)),
+                () = tokio::time::sleep(interval.unwrap_or_default()), if interval.is_some() => (false, None),
             };
             hanging.retain(|task| !task.is_finished());
             if hanging.len() >= MAX_HANGING {
+                let reason = format!("{MAX_HANGING} reloads are still running; restart the server to load the models");
                 if is_requested {
-                    error!("{MAX_HANGING} reloads are still running; restart the server to load the models");
+                    error!("{reason}");
                     folder.metrics.reloaded(Err(()));
                 }
+                if let Some(Command { done, .. }) = command {
+                    let _ = done.send(Err(Refusal::NotChanged(reason)));
+                }
+                continue;
+            }
+            let begun = command.map(|command| folder.begin(command));
+            if let Some(None) = begun {
                 continue;
             }
             // On blocking threads, because network file systems may be slow, or hang.
@@ -124,7 +152,63 @@ impl ModelFolder {
                 loaded.clone_from(&now);
             }
             last = now;
+            if let Some(Some(command)) = begun {
+                folder.end(command);
+            }
         }
+    }
+
+    /// Notes which model a client has unloaded or loaded. Answers the command and returns None if it is refused.
+    fn begin(&self, command: Command) -> Option<Command> {
+        let Command { name, change, .. } = &command;
+        let served = self.models.now();
+        let refusal = match change {
+            Change::Load => {
+                self.unloaded().remove(name);
+                return Some(command);
+            }
+            Change::Unload if served.iter().all(|engine| engine.source.name() != name) => self.not_served(name),
+            Change::Unload => {
+                let is_other_network =
+                    |engine: &Arc<Engine>| engine.source.network().is_some() && engine.source.name() != name;
+                if served.iter().any(is_other_network) {
+                    self.unloaded().insert(name.clone());
+                    return Some(command);
+                }
+                Refusal::NotChanged(format!("`{name}` is the only network, and cannot be unloaded"))
+            }
+        };
+        let _ = command.done.send(Err(refusal));
+        None
+    }
+
+    /// Answers a command after the reload.
+    fn end(&self, Command { name, change, done }: Command) {
+        let is_served = self.models.now().iter().any(|engine| engine.source.name() == name);
+        let outcome = match change {
+            Change::Load if is_served => Ok(()),
+            Change::Load => Err(self.not_served(&name)),
+            Change::Unload if is_served => Err(Refusal::NotChanged(format!("`{name}` is still served; see the log"))),
+            Change::Unload => Ok(()),
+        };
+        let _ = done.send(outcome);
+    }
+
+    /// Why a model is not served.
+    fn not_served(&self, name: &str) -> Refusal {
+        let unavailable = self.models.unavailable();
+        match unavailable.iter().find(|model| model.name == name) {
+            Some(Unavailable { reason, .. }) => Refusal::NotChanged(format!("`{name}` is not served: {reason}")),
+            None => Refusal::UnknownModel {
+                field: "model_name",
+                requested: on_a_line(name),
+                available: self.models.now().iter().map(|engine| engine.label.clone()).collect::<Vec<_>>().join(", "),
+            },
+        }
+    }
+
+    fn unloaded(&self) -> MutexGuard<'_, BTreeSet<String>> {
+        self.unloaded.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Waits for a task, at most until the timeout. Returns it if it is still running.
@@ -159,13 +243,25 @@ impl ModelFolder {
             }
         };
         let served = self.models.now();
+        let unloaded = self.unloaded().clone();
+        let reason = "a client has unloaded it";
+        let mut unavailable: Vec<_> =
+            unloaded.iter().map(|name| Unavailable { name: name.clone(), reason: reason.to_owned() }).collect();
         let mut rejected: Vec<PathBuf> = Vec::new();
+        let mut reject = |path: &Path, error: String| {
+            error!(error, "cannot load a model file; a model that was loaded from it before remains served");
+            let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            unavailable.push(Unavailable { name, reason: error });
+            rejected.push(path.to_owned());
+        };
         for error in files.rejected {
-            error!(%error, "cannot load a model file; a model that was loaded from it before remains served");
-            rejected.push(error.path().to_owned());
+            reject(error.path(), error.to_string());
         }
         let mut engines = Vec::new();
         for source in files.sources {
+            if unloaded.contains(source.name()) {
+                continue;
+            }
             if let Some(engine) = served.iter().find(|engine| engine.source == source) {
                 engines.push(Arc::clone(engine));
                 continue;
@@ -173,13 +269,7 @@ impl ModelFolder {
             let path = source.path().map(Path::to_owned);
             match self.start(source) {
                 Ok(engine) => engines.push(engine),
-                Err(error) => {
-                    error!(
-                        error = format!("{error:#}"),
-                        "cannot load a model file; a model that was loaded from it before remains served"
-                    );
-                    rejected.extend(path);
-                }
+                Err(error) => reject(path.as_deref().unwrap_or(&self.directory), format!("{error:#}")),
             }
         }
         if number != self.latest.load(Ordering::Relaxed) {
@@ -189,7 +279,8 @@ impl ModelFolder {
         let is_rejected = |path: &Path| rejected.iter().any(|rejected| rejected == path);
         let kept = served.iter().filter(|engine| engine.source.path().is_some_and(is_rejected));
         for kept in kept.cloned().collect::<Vec<_>>() {
-            if !engines.iter().any(|engine| engine.label == kept.label) {
+            let is_unloaded = unloaded.contains(kept.source.name());
+            if !is_unloaded && !engines.iter().any(|engine| engine.label == kept.label) {
                 engines.push(kept);
             }
         }
@@ -198,6 +289,7 @@ impl ModelFolder {
         } else {
             self.replace(engines);
         }
+        self.models.set_unavailable(unavailable);
         // Last, so that the new models are served before the metric changes.
         self.metrics.reloaded(Ok(rejected.len()));
     }

@@ -14,6 +14,7 @@ use tracing::{Span, error};
 use super::detection::{Detection, Score};
 use super::job::{EngineError, Job, Sender, SessionOutput, Task, Tensors};
 use super::queue::{Batching, Queue};
+use super::session_threads::Running;
 use crate::transport::deadline::Deadline;
 
 /// The state of a session thread.
@@ -24,6 +25,7 @@ pub(super) struct Session {
     pub queue: Arc<Queue<Job>>,
     pub batching: Batching,
     pub batch: Histogram,
+    pub running: Arc<Running>,
     pub service_time: Arc<ServiceTime>,
 }
 
@@ -93,7 +95,8 @@ impl Session {
                 continue;
             }
             self.batch.observe(jobs.len() as f64);
-            let Self { planner, defaults, queue, service_time, .. } = &mut self;
+            let Self { planner, defaults, queue, running, service_time, .. } = &mut self;
+            running.begin(&jobs);
             let scenes = u32::try_from(jobs.len()).unwrap_or(u32::MAX);
             let done = |inference: Duration| {
                 queue.free();
@@ -107,6 +110,7 @@ impl Session {
                     }
                 }
             }
+            running.end();
         }
     }
 }
@@ -192,7 +196,7 @@ fn plan<'a>(
 
 /// Ends the post-processing, which began at `started`, and sends its result. The job's part of the span ends before:
 /// otherwise a server that stops after the reply could lose the span.
-fn send_result<T>(
+fn send_result<T: Send + 'static>(
     reply: Sender<T>,
     span: Span,
     submitted: Instant,
@@ -213,8 +217,7 @@ fn send_result<T>(
     // The time per scene, including decoding. Set before the reply, so that the next refusal already has it.
     service_time.add(taken.elapsed() / scenes);
     let (queue, postprocessing) = (taken.duration_since(submitted), started.elapsed());
-    // Fails if the client has cancelled, which the call counts.
-    let _ = reply.send(result.map(|value| SessionOutput { value, queue, inference, postprocessing }));
+    reply.send(result.map(|value| SessionOutput { value, queue, inference, postprocessing }));
 }
 
 fn tensors(output: &Inference, index: usize) -> Tensors {

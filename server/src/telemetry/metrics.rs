@@ -1,6 +1,7 @@
-use std::sync::Arc;
+use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Duration;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
 use grasp_proto::pb::geometry_warning::Code as WarningCode;
 use prometheus::core::Collector;
@@ -51,10 +52,18 @@ pub(crate) struct Metrics {
     certificate: IntGauge,
     ready: IntGauge,
     tracked: IntGauge,
+    hanging: IntGaugeVec,
+    recordings: IntCounterVec,
+    /// The models that are no longer served, and since when.
+    retired: Mutex<Vec<(String, Instant)>>,
     dropped_lines: IntCounter,
     /// The log's counter of dropped lines, and how many of them `dropped_lines` includes.
     dropped: (ErrorCounter, AtomicU64),
 }
+
+/// Time after which the series of a model that is no longer served are removed. Until then Prometheus reads their last
+/// values, also with a long scrape interval.
+const RETENTION: Duration = Duration::from_mins(10);
 
 /// The metrics of a model's queue.
 pub(crate) struct QueueMetrics {
@@ -63,6 +72,8 @@ pub(crate) struct QueueMetrics {
     /// Volumes per batch.
     pub batch: Histogram,
     pub refused: RefusalCounters,
+    /// Sessions whose inference does not end.
+    pub hanging: IntGauge,
 }
 
 /// Counters of the requests that a queue refuses.
@@ -83,8 +94,8 @@ impl Metrics {
     /// Content type of [`render`](Self::render).
     pub const CONTENT_TYPE: &str = TEXT_FORMAT;
 
-    /// `dropped` counts the lines that the log has lost.
-    pub fn new(dropped: ErrorCounter) -> Self {
+    /// `dropped` counts the lines that the log has lost, `suppressed` those beyond its rate.
+    pub fn new(dropped: ErrorCounter, suppressed: IntCounter) -> Self {
         let registry = Registry::new();
         let counter = |name, help| register(&registry, IntCounter::new(name, help));
         let gauge = |name, help| register(&registry, IntGauge::new(name, help));
@@ -96,6 +107,7 @@ impl Metrics {
         // CPU time, memory and open files of the process.
         #[cfg(target_os = "linux")]
         registry.register(Box::new(ProcessCollector::for_self())).expect(VALID);
+        registry.register(Box::new(suppressed)).expect(VALID);
         let metrics = Self {
             stages: histograms(
                 "graspd_stage_duration_seconds",
@@ -143,6 +155,17 @@ impl Metrics {
             ),
             ready: gauge("graspd_ready", "1 while the server accepts requests, 0 during startup and shutdown."),
             tracked: gauge("graspd_tracked_volumes", "Open TrackGrasps streams, each with one volume."),
+            hanging: gauges(
+                "graspd_hanging_sessions",
+                "Sessions whose inference takes longer than --inference-timeout.",
+                &["model"],
+            ),
+            recordings: counters(
+                "graspd_recordings_total",
+                "Recorded requests (--record): written; dropped because the disk is too slow; failed.",
+                &["outcome"],
+            ),
+            retired: Mutex::default(),
             dropped_lines: counter(
                 "graspd_log_lines_dropped_total",
                 "Log lines dropped because stderr was not read fast enough.",
@@ -171,6 +194,30 @@ impl Metrics {
         self.requests.with_label_values(&[model, code_name(code)]).inc();
     }
 
+    /// Number and sum, seconds, of the durations of a stage.
+    pub fn stage(&self, model: &str, stage: &str) -> (u64, f64) {
+        let durations = self.stages.with_label_values(&[model, stage]);
+        (durations.get_sample_count(), durations.get_sample_sum())
+    }
+
+    /// Number of the batches of a model, and of the volumes in them.
+    pub fn batches(&self, model: &str) -> (u64, u64) {
+        let sizes = self.batches.with_label_values(&[model]);
+        // Exact: a sum of whole numbers.
+        (sizes.get_sample_count(), sizes.get_sample_sum() as u64)
+    }
+
+    /// Number of the requests for a model that have ended without a result.
+    pub fn failures(&self, model: &str) -> u64 {
+        let families = self.requests.collect();
+        let series = families.iter().flat_map(|family| family.get_metric());
+        let has = |metric: &prometheus::proto::Metric, name: &str, value: &str| {
+            metric.get_label().iter().any(|label| label.name() == name && label.value() == value)
+        };
+        let failed = series.filter(|metric| has(metric, "model", model) && !has(metric, "code", code_name(Code::Ok)));
+        failed.map(|metric| metric.get_counter().get_value() as u64).sum()
+    }
+
     /// Counts a warning in a response.
     pub fn warned(&self, model: &str, code: WarningCode) {
         self.warnings.with_label_values(&[model, warning_name(code)]).inc();
@@ -181,10 +228,44 @@ impl Metrics {
         for ModelLabels(labels) in now {
             self.models.with_label_values(labels).set(1);
         }
+        let mut retired = self.retired();
         for ModelLabels(labels) in before.iter().filter(|labels| !now.contains(labels)) {
             // Fails only if the series does not exist.
             let _ = self.models.remove_label_values(&labels.each_ref().map(String::as_str));
+            let [model, ..] = labels;
+            // A file with the same name and version continues the series.
+            if !now.iter().any(|ModelLabels([other, ..])| other == model) {
+                retired.push((model.clone(), Instant::now()));
+            }
         }
+    }
+
+    /// Removes the series of the models that are no longer served for a while.
+    fn remove_retired(&self, now: Instant) {
+        let expired: Vec<String> = self
+            .retired()
+            .extract_if(.., |(_, since)| now.duration_since(*since) >= RETENTION)
+            .map(|(model, _)| model)
+            .collect();
+        if expired.is_empty() {
+            return;
+        }
+        let Self { stages, requests, grasps, warnings, refused, waiting, batches, hanging, .. } = self;
+        for model in &expired {
+            for counters in [requests, grasps, warnings, refused] {
+                remove(counters, model, |labels| counters.remove(labels));
+            }
+            for gauges in [waiting, hanging] {
+                remove(gauges, model, |labels| gauges.remove(labels));
+            }
+            for histograms in [stages, batches] {
+                remove(histograms, model, |labels| histograms.remove(labels));
+            }
+        }
+    }
+
+    fn retired(&self) -> MutexGuard<'_, Vec<(String, Instant)>> {
+        self.retired.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Records a reload of the model folder: the number of files that could not be loaded, or an error if the folder
@@ -204,6 +285,7 @@ impl Metrics {
 
     /// The metrics of a model's queue.
     pub fn queue(&self, model: &str) -> QueueMetrics {
+        self.retired().retain(|(retired, _)| retired != model);
         for (stage, _) in StageTimings::default().stages() {
             self.stages.with_label_values(&[model, stage]);
         }
@@ -223,6 +305,7 @@ impl Metrics {
             },
             waiting: self.waiting.with_label_values(&[model]),
             batch: self.batches.with_label_values(&[model]),
+            hanging: self.hanging.with_label_values(&[model]),
         }
     }
 
@@ -243,6 +326,11 @@ impl Metrics {
         self.certificate.set(expiry);
     }
 
+    /// The counter of recorded requests by outcome.
+    pub fn recordings(&self) -> IntCounterVec {
+        self.recordings.clone()
+    }
+
     /// The gauge of open TrackGrasps streams.
     pub fn tracked(&self) -> IntGauge {
         self.tracked.clone()
@@ -251,6 +339,7 @@ impl Metrics {
     /// The metrics in Prometheus' text format.
     pub fn render(&self, state: State) -> String {
         self.ready.set((state == State::Ready).into());
+        self.remove_retired(Instant::now());
         let (lines, counted) = &self.dropped;
         let lines = lines.dropped_lines() as u64;
         // `fetch_max` keeps concurrent scrapes from counting the same lines twice.
@@ -266,6 +355,19 @@ fn register<M: Collector + Clone + 'static>(registry: &Registry, metric: prometh
     metric
 }
 
+/// Removes the series of a model from a metric.
+fn remove(metric: &dyn Collector, model: &str, series: impl Fn(&HashMap<&str, &str>) -> prometheus::Result<()>) {
+    let families = metric.collect();
+    for series_of in families.iter().flat_map(|family| family.get_metric()) {
+        let labels: HashMap<&str, &str> =
+            series_of.get_label().iter().map(|label| (label.name(), label.value())).collect();
+        if labels.get("model") == Some(&model) {
+            // Fails only if another scrape has removed it.
+            let _ = series(&labels);
+        }
+    }
+}
+
 /// The name of a warning's code without its prefix, for example `TABLE_TILTED`.
 fn warning_name(code: WarningCode) -> &'static str {
     code.as_str_name().trim_start_matches("CODE_")
@@ -278,12 +380,55 @@ pub(crate) fn code_name(code: Code) -> &'static str {
         Code::Cancelled => "CANCELLED",
         Code::InvalidArgument => "INVALID_ARGUMENT",
         Code::NotFound => "NOT_FOUND",
+        Code::PermissionDenied => "PERMISSION_DENIED",
         Code::ResourceExhausted => "RESOURCE_EXHAUSTED",
+        Code::FailedPrecondition => "FAILED_PRECONDITION",
         Code::Aborted => "ABORTED",
         Code::Unauthenticated => "UNAUTHENTICATED",
         Code::Unavailable => "UNAVAILABLE",
         Code::DeadlineExceeded => "DEADLINE_EXCEEDED",
         Code::Internal => "INTERNAL",
         _ => "UNKNOWN",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io;
+
+    use super::*;
+
+    fn metrics() -> Metrics {
+        let (log, _guard) = tracing_appender::non_blocking(io::sink());
+        Metrics::new(log.error_counter(), IntCounter::new("suppressed", "Lines.").unwrap())
+    }
+
+    #[test]
+    fn the_series_of_a_model_that_is_no_longer_served_are_removed_after_a_while() {
+        let metrics = metrics();
+        let labels = |model: &str| ModelLabels([model, "cpu", "fp32", "0"].map(str::to_owned));
+        let served = [labels("a 1"), labels("b 1")];
+        for ModelLabels([model, ..]) in &served {
+            metrics.queue(model);
+            metrics.succeeded(model, &StageTimings::default(), 3);
+        }
+        metrics.replaced(&[], &served);
+        let mentions = |model: &str| {
+            metrics.render(State::Ready).lines().filter(|line| line.contains(&format!("model=\"{model}\""))).count()
+        };
+        let (a, b) = (mentions("a 1"), mentions("b 1"));
+        assert!(a > 30 && a == b, "{a} {b}");
+        metrics.replaced(&served, &served[1..]);
+        let soon = Instant::now() + RETENTION / 2;
+        metrics.remove_retired(soon);
+        assert_eq!(mentions("a 1"), a - 1, "only its graspd_model_info is gone");
+        metrics.remove_retired(soon + RETENTION);
+        assert_eq!((mentions("a 1"), mentions("b 1")), (0, b));
+
+        // A model that returns in time keeps its series.
+        metrics.replaced(&served[1..], &[]);
+        metrics.queue("b 1");
+        metrics.remove_retired(soon + RETENTION);
+        assert_eq!(mentions("b 1"), b - 1);
     }
 }

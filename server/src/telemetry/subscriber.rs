@@ -9,17 +9,19 @@ use opentelemetry_otlp::{SpanExporter, WithExportConfig};
 use opentelemetry_sdk::Resource;
 use opentelemetry_sdk::propagation::TraceContextPropagator;
 use opentelemetry_sdk::trace::SdkTracerProvider;
+use prometheus::IntCounter;
 use tokio::runtime::Runtime;
 use tonic::metadata::MetadataMap;
 use tracing::{Span, warn};
 use tracing_appender::non_blocking::{ErrorCounter, NonBlockingBuilder, WorkerGuard};
 use tracing_opentelemetry::OpenTelemetrySpanExt;
-use tracing_subscriber::filter::filter_fn;
+use tracing_subscriber::filter::{FilterExt, filter_fn};
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer};
 
 use crate::config::{Config, LogFormat};
+use crate::telemetry::log_rate::LogRate;
 use crate::telemetry::timings::StageTimings;
 
 /// Service name in traces.
@@ -39,6 +41,8 @@ pub(crate) struct Log {
     _writer: WorkerGuard,
     /// Lines dropped because the buffer was full.
     pub dropped: ErrorCounter,
+    /// Lines suppressed because one place in the code wrote too many.
+    pub suppressed: IntCounter,
 }
 
 /// The exporter of spans; None without a collector.
@@ -69,8 +73,15 @@ pub(crate) fn init(config: &Config, runtime: &Runtime) -> anyhow::Result<(Log, T
         let layer = tracing_opentelemetry::layer().with_tracer(provider.tracer(NAME));
         layer.with_filter(filter_fn(|metadata| metadata.is_span() && metadata.name() == REQUEST))
     });
-    tracing_subscriber::registry().with(log.with_filter(EnvFilter::new(&config.log))).with(traces).init();
-    Ok((Log { _writer: guard, dropped }, Traces(provider)))
+    let suppressed = IntCounter::new(
+        "graspd_log_lines_suppressed_total",
+        "Log lines suppressed because one place in the code wrote too many in a second.",
+    )?;
+    let rate = LogRate::new(suppressed.clone());
+    runtime.spawn(rate.clone().report());
+    let log = log.with_filter(EnvFilter::new(&config.log).and(rate));
+    tracing_subscriber::registry().with(log).with(traces).init();
+    Ok((Log { _writer: guard, dropped, suppressed }, Traces(provider)))
 }
 
 fn collector(url: &str, runtime: &Runtime) -> anyhow::Result<SdkTracerProvider> {

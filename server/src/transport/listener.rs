@@ -19,6 +19,7 @@ use crate::rpc::inference_service::InferenceRpc;
 use crate::telemetry::metrics::Metrics;
 use crate::transport::address::Listener;
 use crate::transport::connections::Peer;
+use crate::transport::receive_budget::ReceiveBudget;
 use crate::transport::request_body::{Limits, RequestBody};
 use crate::transport::response_buffer::keep_permit;
 use crate::transport::tls::Tls;
@@ -46,8 +47,8 @@ pub(crate) struct GrpcConfig {
     pub tokens: Option<Arc<Tokens>>,
     /// Maximum number of open connections.
     pub connections: usize,
-    /// Maximum number of bytes of messages that are being received.
-    pub receiving_bytes: usize,
+    /// The messages that are being received.
+    pub budget: Arc<ReceiveBudget>,
     pub limits: Limits,
 }
 
@@ -60,7 +61,7 @@ pub(crate) async fn serve(
     metrics: Arc<Metrics>,
     state: watch::Receiver<State>,
 ) -> anyhow::Result<()> {
-    let GrpcConfig { tls, tokens, connections, receiving_bytes, limits } = config;
+    let GrpcConfig { tls, tokens, connections, budget, limits } = config;
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
@@ -72,7 +73,6 @@ pub(crate) async fn serve(
     let grasps = grasps.accept_compressed(CompressionEncoding::Gzip).accept_compressed(CompressionEncoding::Zstd);
     let inference = inference.accept_compressed(CompressionEncoding::Gzip).accept_compressed(CompressionEncoding::Zstd);
     let guard = tokens::guard(tokens, Arc::clone(&metrics));
-    let budget = metrics.receiving(receiving_bytes);
     let incoming = connections::accept(listener, metrics.connections(connections, limits.stall), Arc::clone(&budget));
     let counted = Arc::clone(&metrics);
     let outgoing = MapResponseLayer::new(move |response| keep_permit(request_body::unreadable(response, &counted)));

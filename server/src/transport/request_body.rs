@@ -6,7 +6,7 @@ use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use http::HeaderValue;
-use http_body::{Frame, SizeHint};
+use http_body::{Body as _, Frame, SizeHint};
 use tokio::time::{Instant, Sleep, sleep};
 use tonic::body::Body;
 use tonic::codegen::Bytes;
@@ -53,6 +53,20 @@ pub(crate) struct RequestBody {
     waited: Duration,
     timeout: Pin<Box<Sleep>>,
     state: State,
+}
+
+impl Limits {
+    pub fn too_large(&self, bytes: usize) -> Status {
+        let longest = self.message_bytes;
+        Status::invalid_argument(format!(
+            "the message has {bytes} bytes, must have at most {longest} (--max-message-bytes)"
+        ))
+    }
+
+    /// Maximum time in which a message of this length is received.
+    pub fn longest(&self, length: usize) -> Duration {
+        2 * self.stall + Duration::from_secs_f64(length as f64 / MIN_RATE)
+    }
 }
 
 enum State {
@@ -108,15 +122,28 @@ impl RequestBody {
 
     /// Maximum time to wait for the next data.
     fn remaining(&self) -> Duration {
-        let Limits { stall, .. } = self.limits;
-        let longest = 2 * stall + Duration::from_secs_f64(self.message.length() as f64 / MIN_RATE);
-        stall.min(longest.saturating_sub(self.waited))
+        self.limits.stall.min(self.limits.longest(self.message.length()).saturating_sub(self.waited))
+    }
+
+    /// Whether a request ended without a message because the client has reset it.
+    fn is_reset(&self) -> bool {
+        !self.is_stream && self.message.number == 0 && !self.body.is_end_stream()
     }
 
     fn refuse(&mut self, status: Status) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        self.metrics.ended("", status.code());
+        self.end(status)
+    }
+
+    /// Ends a request that the client has cancelled within its message or before it.
+    fn cancelled(&mut self) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        self.metrics.ended("", Code::Cancelled);
+        self.end(gone())
+    }
+
+    fn end(&mut self, status: Status) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
         self.state = State::Refused;
         self.received.clear();
-        self.metrics.ended("", status.code());
         Poll::Ready(Some(Err(status)))
     }
 
@@ -134,13 +161,13 @@ impl RequestBody {
         };
         Status::deadline_exceeded(format!("the message {reason}, {missing} missing; send it again"))
     }
+}
 
-    fn too_large(&self, bytes: usize) -> Status {
-        let longest = self.limits.message_bytes;
-        Status::invalid_argument(format!(
-            "the message has {bytes} bytes, must have at most {longest} (--max-message-bytes)"
-        ))
-    }
+/// The status for a client that is gone. A client that cancels resets the stream, which hyper reports as the end of the
+/// body, and a lost connection as its error. tonic takes both, and the code CANCELLED, for the end of the request, and
+/// would report a malformed message.
+fn gone() -> Status {
+    Status::aborted("the client has cancelled the request or is gone")
 }
 
 fn late() -> Status {
@@ -254,18 +281,16 @@ impl http_body::Body for RequestBody {
         }
         let data = match &frame {
             Some(Ok(frame)) => frame.data_ref(),
-            // A client that cancels resets the stream, which hyper reports as its end. tonic would report a malformed
-            // message.
-            Some(Err(_)) | None if this.message.has_begun() => {
-                let status = Status::cancelled("cancelled by the client within a message");
-                return this.refuse(status);
-            }
-            Some(Err(_)) | None => None,
+            // Nothing is lost between the messages of a stream.
+            Some(Err(_)) if this.is_stream && !this.message.has_begun() => return this.end(gone()),
+            Some(Err(_)) => return this.cancelled(),
+            None if this.message.has_begun() || this.is_reset() => return this.cancelled(),
+            None => None,
         };
         let Some(data) = data else { return Poll::Ready(frame) };
         let before = this.message.number;
         if let Err(TooLarge { bytes, begins }) = this.message.advance(data, this.limits.message_bytes) {
-            let status = this.too_large(bytes);
+            let status = this.limits.too_large(bytes);
             if begins == 0 {
                 return this.refuse(status);
             }
@@ -325,7 +350,8 @@ mod tests {
     fn body(path: &str) -> (RequestBody, mpsc::Sender<Vec<u8>>) {
         let (sender, data) = mpsc::channel(1);
         let (log, _guard) = tracing_appender::non_blocking(io::sink());
-        let metrics = Arc::new(Metrics::new(log.error_counter()));
+        let suppressed = prometheus::IntCounter::new("suppressed", "Lines.").unwrap();
+        let metrics = Arc::new(Metrics::new(log.error_counter(), suppressed));
         let limits = Limits { message_bytes: 1 << 20, stall: STALL };
         let share = metrics.receiving(4 << 20).connection();
         (RequestBody::new(path, Body::new(Sent(data)), None, limits, share, metrics), sender)

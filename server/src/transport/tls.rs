@@ -1,8 +1,14 @@
 //! The files of TLS, checked before the models are loaded.
 
+use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::Context;
+use tokio_rustls::TlsAcceptor;
+use tokio_rustls::rustls::pki_types::pem::PemObject;
+use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use tokio_rustls::rustls::server::WebPkiClientVerifier;
+use tokio_rustls::rustls::{self, RootCertStore};
 use tonic::transport::{Certificate, Identity, Server, ServerTlsConfig};
 use tracing::warn;
 use x509_parser::pem::Pem;
@@ -14,6 +20,8 @@ const SOON: Duration = Duration::from_secs(14 * 24 * 3600);
 #[derive(Clone)]
 pub(crate) struct Tls {
     pub config: ServerTlsConfig,
+    /// The same for HTTP/1.1.
+    pub http: TlsAcceptor,
     /// When the first certificate of the chain expires, seconds since 1970.
     pub expiry: i64,
 }
@@ -29,7 +37,8 @@ impl Tls {
             config = config.client_ca_root(Certificate::from_pem(ca));
         }
         Server::builder().tls_config(config.clone()).context("cannot use the files")?;
-        Ok(Self { config, expiry })
+        let http = acceptor(certificate, key, client_ca).context("cannot use the files")?;
+        Ok(Self { config, http, expiry })
     }
 
     /// Logs a warning if a certificate has expired or expires soon.
@@ -41,6 +50,27 @@ impl Tls {
             warn!(days = left / (24 * 3600), "the certificate of --tls-cert expires soon");
         }
     }
+}
+
+fn acceptor(certificate: &[u8], key: &[u8], client_ca: Option<&[u8]>) -> anyhow::Result<TlsAcceptor> {
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let config = rustls::ServerConfig::builder_with_provider(Arc::clone(&provider));
+    let config = config.with_safe_default_protocol_versions()?;
+    let config = match client_ca {
+        None => config.with_no_client_auth(),
+        Some(ca) => {
+            let mut roots = RootCertStore::empty();
+            for certificate in CertificateDer::pem_slice_iter(ca) {
+                roots.add(certificate?)?;
+            }
+            let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build()?;
+            config.with_client_cert_verifier(verifier)
+        }
+    };
+    let chain = CertificateDer::pem_slice_iter(certificate).collect::<Result<Vec<_>, _>>()?;
+    let mut config = config.with_single_cert(chain, PrivateKeyDer::from_pem_slice(key)?)?;
+    config.alpn_protocols = vec![b"http/1.1".to_vec()];
+    Ok(TlsAcceptor::from(Arc::new(config)))
 }
 
 /// When the first of some certificates expires, seconds since 1970.

@@ -1,7 +1,9 @@
 //! Latency and throughput of the server, compared in one run with its parts and with other servers.
 //!
-//! `make bench-serve`, or `cargo run --release -p grasp-tests --example serve [SECONDS [FILE]]` with `ORT_DYLIB_PATH`
-//! set. `SECONDS` is the duration of each load, 5 by default. All results are also written to `FILE`, as JSON.
+//! `make bench-serve`, or `cargo run --release -p grasp-tests --example serve [SECONDS [FILE [PART…]]]` with
+//! `ORT_DYLIB_PATH` set. `SECONDS` is the duration of each load, 5 by default. All results are also written to `FILE`, as
+//! JSON. The parts are `hop`, `vgn`, `transformer`, `throughput`, `depth`, `overload`, `streams` and `start`; all by
+//! default.
 //! `GRASP_TRAIN` names grasp-train, for libtorch's eager mode; `GRASPD_PEERS` names a Python with the packages of
 //! tests/peers, for the other servers. Without a variable its part is left out.
 //!
@@ -13,6 +15,7 @@ mod depth;
 mod findings;
 mod overload;
 mod peers;
+mod streams;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -41,7 +44,7 @@ const CALLERS: [usize; 3] = [1, 8, 32];
 /// Batch sizes. The best throughput of these is the capacity of the machine.
 const BATCHES: [usize; 4] = [1, 2, 4, 8];
 /// Targets. Those with libtorch are shares of the latency of its eager mode in fp32.
-const AIMS: [(&str, Aim); 13] = [
+const AIMS: [(&str, Aim); 14] = [
     ("hop_p50_ms", Aim::AtMost(0.6)),
     ("hop_p99_ms", Aim::AtMost(1.5)),
     ("vgn_vs_torch", Aim::AtMost(1.0 / 12.0)),
@@ -55,6 +58,7 @@ const AIMS: [(&str, Aim); 13] = [
     ("transformer_overload_goodput", Aim::AtLeast(0.9)),
     ("transformer_deadline_goodput", Aim::AtLeast(0.85)),
     ("burst_answered", Aim::AtLeast(95.0)),
+    ("stream_ratio", Aim::AtLeast(0.95)),
 ];
 
 #[tokio::main(flavor = "current_thread")]
@@ -63,14 +67,31 @@ async fn main() -> anyhow::Result<()> {
     let bench = Bench::new(Duration::from_secs_f64(seconds))?;
     let mut findings = Findings::new(conditions::describe(bench.threads)?);
     let started = Stolen::so_far();
-    bench.hop(&mut findings).await?;
-    for network in ["vgn", "transformer"] {
-        bench.latency(network, &mut findings).await?;
+    let parts: Vec<String> = std::env::args().skip(3).collect();
+    let is_wanted = |part: &str| parts.is_empty() || parts.iter().any(|wanted| wanted == part);
+    if is_wanted("hop") {
+        bench.hop(&mut findings).await?;
     }
-    bench.throughput(&mut findings).await?;
-    bench.depth(&mut findings).await?;
-    bench.overload(&mut findings).await?;
-    bench.start_up(&mut findings)?;
+    for network in ["vgn", "transformer"] {
+        if is_wanted(network) {
+            bench.latency(network, &mut findings).await?;
+        }
+    }
+    if is_wanted("throughput") {
+        bench.throughput(&mut findings).await?;
+    }
+    if is_wanted("depth") {
+        bench.depth(&mut findings).await?;
+    }
+    if is_wanted("overload") {
+        bench.overload(&mut findings).await?;
+    }
+    if is_wanted("streams") {
+        bench.streams(&mut findings).await?;
+    }
+    if is_wanted("start") {
+        bench.start_up(&mut findings)?;
+    }
     findings.compare(&AIMS);
     let stolen = started.percent_until(Stolen::so_far());
     println!("\nOther machines on the host took {stolen:.1} % of the processors' time.");

@@ -2,12 +2,12 @@
 
 use std::fs;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use anyhow::Context;
-use grasp_client::{Access, Arrivals, Client, Options, Retry, Until};
+use anyhow::{Context, ensure};
+use grasp_client::{Access, Arrivals, Client, DetectOptions, Options, Report, Retry, Until};
 
-use crate::findings::{Findings, Table};
+use crate::findings::{Findings, Table, milliseconds};
 use crate::{Bench, run_load};
 
 /// Arrivals relative to the capacity.
@@ -19,6 +19,9 @@ const DEADLINES: [(&str, Duration); 2] =
 
 /// Concurrent calls that are all retried as recommended.
 const BURST: usize = 100;
+
+/// Pause between two refused requests.
+const PAUSE: Duration = Duration::from_millis(5);
 
 impl Bench {
     /// The share of the capacity that remains under overload, and how it is shared.
@@ -50,7 +53,40 @@ impl Bench {
         }
         findings.table(table);
         self.burst(findings).await?;
-        self.fairness(findings).await
+        self.fairness(findings).await?;
+        self.beside_inferences(findings).await
+    }
+
+    /// Requests that need no inference, while others keep all processors busy.
+    async fn beside_inferences(&self, findings: &mut Findings) -> anyhow::Result<()> {
+        let server = self.serve("vgn", &[])?;
+        let client = Client::connect(server.grpc().to_string()).await?;
+        let (scene, loaded) = (Arc::clone(&self.scene), client.clone());
+        let until = Until::Elapsed(2 * self.seconds);
+        let load = tokio::spawn(async move {
+            run_load(&loaded, &scene, Arrivals::Callers(8), until, Options::default()).await.throughput()
+        });
+        let detect = DetectOptions { model: "missing".to_owned(), ..DetectOptions::default() };
+        let options = Options { detect, ..Options::default() };
+        let mut times = Vec::new();
+        while !load.is_finished() {
+            let started = Instant::now();
+            let refused = client.detect(&self.scene, options.clone()).await;
+            times.push(started.elapsed());
+            ensure!(refused.is_err(), "the model `missing` is served");
+            tokio::time::sleep(PAUSE).await;
+        }
+        times.sort_unstable();
+        let [p50, p99] = [0.5, 0.99].map(|share| milliseconds(Report::quantile(&times, share)));
+        let columns = ["calls", "p50 ms", "p99 ms", "inferences/s"];
+        let mut table = Table::new("vgn, refusals beside eight callers", &columns);
+        let throughput = load.await?;
+        table.row("a model that does not exist", [times.len() as f64, p50, p99, throughput]);
+        findings.figure("refusal_p50_ms", p50);
+        findings.figure("refusal_p99_ms", p99);
+        findings.figure("refusal_inferences", throughput);
+        findings.table(table);
+        Ok(())
     }
 
     /// Calls that start together and follow the hints of their refusals.

@@ -10,6 +10,7 @@ mod numbers;
 mod overlay;
 mod pose;
 mod record;
+mod replay;
 mod scene;
 mod show;
 mod table;
@@ -35,6 +36,7 @@ use tonic::Code;
 
 use crate::detect_args::DetectArgs;
 use crate::pose::Poses;
+use crate::replay::Replay;
 use crate::scene::SceneArgs;
 use crate::table::Table;
 use crate::view::ViewArgs;
@@ -91,6 +93,8 @@ enum Command {
     View(View),
     /// Measure latency and throughput of the server with repeated requests.
     Bench(Bench),
+    /// Send recorded requests again and compare the answers; exit status 1 if any has changed.
+    Replay(Replay),
     /// List the models of the server.
     Models,
     /// Print whether the server is ready; exit status 1 if it is not.
@@ -307,6 +311,11 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             show::print(&if json { show::report_json(&report) } else { show::report(&report) })?;
         }
         Command::Table(table) => table.run(json)?,
+        Command::Replay(replay) => {
+            if !replay.run(&connect().await?, json).await? {
+                return Ok(ExitCode::FAILURE);
+            }
+        }
         Command::Models => {
             let models = connect().await?.list_models().await?;
             show::print(&if json { show::models_json(&models) } else { show::models(&models) })?;

@@ -1,0 +1,54 @@
+//! Requests of clients to load and unload models.
+
+use std::time::Duration;
+
+use tokio::sync::{mpsc, oneshot};
+
+use crate::rpc::refusal::Refusal;
+
+/// Sends requests to the task that watches the model folder.
+#[derive(Clone)]
+pub(crate) struct ModelControl {
+    commands: mpsc::Sender<Command>,
+    /// Whether clients may load and unload models.
+    is_allowed: bool,
+}
+
+pub(crate) enum Change {
+    /// Reads the model folder again and serves the model.
+    Load,
+    /// No longer serves the model, until it is loaded again.
+    Unload,
+}
+
+/// A request to change a served model.
+pub(super) struct Command {
+    pub name: String,
+    pub change: Change,
+    pub done: oneshot::Sender<Result<(), Refusal>>,
+}
+
+/// Requests that wait for the one before them.
+const WAITING: usize = 8;
+
+/// Retry hint if too many requests wait: a reload takes seconds.
+const RETRY_AFTER: Duration = Duration::from_secs(1);
+
+impl ModelControl {
+    pub(super) fn new(is_allowed: bool) -> (Self, mpsc::Receiver<Command>) {
+        let (commands, receiver) = mpsc::channel(WAITING);
+        (Self { commands, is_allowed }, receiver)
+    }
+
+    /// Changes a model, and waits until it is loaded or no longer served.
+    pub async fn change(&self, name: String, change: Change) -> Result<(), Refusal> {
+        if !self.is_allowed {
+            return Err(Refusal::NoModelControl);
+        }
+        let (done, outcome) = oneshot::channel();
+        let sent = self.commands.try_send(Command { name, change, done });
+        sent.map_err(|_| Refusal::Starting(RETRY_AFTER))?;
+        // The folder's task ends only with the server.
+        outcome.await.unwrap_or(Err(Refusal::Draining))
+    }
+}

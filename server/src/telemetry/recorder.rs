@@ -1,0 +1,202 @@
+//! Recording of requests and their answers (`--record`), with which `grasp replay` finds regressions.
+
+use std::collections::VecDeque;
+use std::fs;
+use std::io::{self, Write};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::thread;
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use anyhow::Context;
+use grasp_proto::pb;
+use grasp_proto::pb::recording::{Answer, Request};
+use prometheus::IntCounterVec;
+use prost::Message;
+use tracing::warn;
+
+use crate::rpc::refusal::Refusal;
+
+/// Recordings that wait to be written. Further ones are dropped and counted, so that a slow disk delays no reply.
+const WAITING: usize = 64;
+
+/// Extension of the files.
+const EXTENSION: &str = "recording";
+
+/// Extension of a file that is being written.
+const PARTIAL: &str = "part";
+
+/// Records requests and their answers. Without a folder it does nothing.
+#[derive(Clone)]
+pub(crate) struct Recorder(Option<Arc<Writer>>);
+
+struct Writer {
+    recordings: SyncSender<pb::Recording>,
+    outcomes: IntCounterVec,
+}
+
+/// A request that will be recorded with its answer.
+pub(crate) struct Pending(Option<(Arc<Writer>, pb::Recording)>);
+
+impl Recorder {
+    /// Records nothing.
+    pub fn none() -> Self {
+        Self(None)
+    }
+
+    /// Records into a folder, and deletes the oldest recordings so that all together have at most `capacity` bytes.
+    /// `outcomes` counts them by outcome.
+    pub fn start(folder: &Path, capacity: u64, outcomes: IntCounterVec) -> anyhow::Result<Self> {
+        for outcome in ["written", "dropped", "failed"] {
+            outcomes.with_label_values(&[outcome]);
+        }
+        let files =
+            Files::open(folder, capacity).with_context(|| format!("cannot record into {}", folder.display()))?;
+        let (recordings, receiver) = sync_channel(WAITING);
+        let counted = outcomes.clone();
+        thread::Builder::new().name("record".to_owned()).spawn(move || write(files, &receiver, &counted))?;
+        Ok(Self(Some(Arc::new(Writer { recordings, outcomes }))))
+    }
+
+    /// A request, which is copied only if it will be recorded. The copy shares the data of images and volumes.
+    pub fn request(&self, request: impl FnOnce() -> Request) -> Pending {
+        Pending(self.0.as_ref().map(|writer| {
+            let received = Some(SystemTime::now().into());
+            (Arc::clone(writer), pb::Recording { received, request: Some(request()), answer: None })
+        }))
+    }
+}
+
+impl Pending {
+    /// Is not recorded.
+    pub fn none() -> Self {
+        Self(None)
+    }
+
+    /// Records the request with its answer.
+    pub fn answered<T>(self, outcome: &Result<T, Refusal>, answer: impl FnOnce(&T) -> Answer) {
+        let Self(Some((writer, mut recording))) = self else { return };
+        recording.answer = Some(match outcome {
+            Ok(response) => answer(response),
+            Err(refusal) => Answer::Error(refusal.into()),
+        });
+        if writer.recordings.try_send(recording).is_err() {
+            writer.outcomes.with_label_values(&["dropped"]).inc();
+        }
+    }
+}
+
+/// Writes recordings until the sender is dropped.
+fn write(mut files: Files, recordings: &Receiver<pb::Recording>, outcomes: &IntCounterVec) {
+    while let Ok(recording) = recordings.recv() {
+        let written = files.write(&recording);
+        if let Err(error) = &written {
+            warn!(%error, folder = %files.folder.display(), "cannot write a recording");
+        }
+        outcomes.with_label_values(&[if written.is_ok() { "written" } else { "failed" }]).inc();
+    }
+}
+
+/// The files of the folder.
+struct Files {
+    folder: PathBuf,
+    capacity: u64,
+    /// Name and size of each file, the oldest first.
+    known: VecDeque<(PathBuf, u64)>,
+    bytes: u64,
+    next: u64,
+}
+
+impl Files {
+    /// Creates the folder if it is missing.
+    fn open(folder: &Path, capacity: u64) -> io::Result<Self> {
+        fs::create_dir_all(folder)?;
+        let mut known = Vec::new();
+        for entry in fs::read_dir(folder)? {
+            let path = entry?.path();
+            match path.extension().and_then(|extension| extension.to_str()) {
+                Some(EXTENSION) => known.push((path.clone(), fs::metadata(&path)?.len())),
+                // Left over from a process that was killed.
+                Some(PARTIAL) => fs::remove_file(&path)?,
+                _ => {}
+            }
+        }
+        // The names begin with the time.
+        known.sort();
+        let bytes = known.iter().map(|(_, bytes)| bytes).sum();
+        let mut files = Self { folder: folder.to_owned(), capacity, known: known.into(), bytes, next: 0 };
+        files.remove_oldest()?;
+        Ok(files)
+    }
+
+    fn write(&mut self, recording: &pb::Recording) -> io::Result<()> {
+        let bytes = recording.encode_to_vec();
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_millis();
+        let path = self.folder.join(format!("{now:013}-{:06}.{EXTENSION}", self.next));
+        self.next += 1;
+        let partial = path.with_extension(PARTIAL);
+        // The scenes of a robot are not for every user of the machine.
+        let mut file = fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(&partial)?;
+        file.write_all(&bytes)?;
+        fs::rename(&partial, &path)?;
+        let size = bytes.len() as u64;
+        self.known.push_back((path, size));
+        self.bytes += size;
+        self.remove_oldest()
+    }
+
+    fn remove_oldest(&mut self) -> io::Result<()> {
+        while self.bytes > self.capacity
+            && let Some((oldest, bytes)) = self.known.pop_front()
+        {
+            self.bytes -= bytes;
+            match fs::remove_file(&oldest) {
+                // Someone else has removed it.
+                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+                removed => removed?,
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_folder_is_bounded_and_the_newest_recordings_stay() {
+        let folder = std::env::temp_dir().join(format!("graspd-recordings-{}", std::process::id()));
+        let recording = |id: &str| pb::Recording {
+            request: Some(Request::Volume(pb::DetectGraspsRequest {
+                request_id: id.repeat(100),
+                ..Default::default()
+            })),
+            ..Default::default()
+        };
+        let ids = || {
+            let mut paths: Vec<_> = fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+            paths.sort();
+            let read = |path: &PathBuf| pb::Recording::decode(&*fs::read(path).unwrap()).unwrap();
+            let id = |recording: pb::Recording| match recording.request {
+                Some(Request::Volume(request)) => request.request_id[..1].to_owned(),
+                other => panic!("{other:?}"),
+            };
+            paths.iter().map(read).map(id).collect::<String>()
+        };
+        let mut files = Files::open(&folder, 350).unwrap();
+        for id in ["a", "b", "c", "d", "e"] {
+            files.write(&recording(id)).unwrap();
+        }
+        assert_eq!(ids(), "cde");
+        fs::write(folder.join("0.part"), "").unwrap();
+        // A later process continues with a smaller folder.
+        let mut files = Files::open(&folder, 250).unwrap();
+        assert_eq!(ids(), "de");
+        files.write(&recording("f")).unwrap();
+        assert_eq!(ids(), "ef");
+        fs::remove_dir_all(&folder).unwrap();
+    }
+}
