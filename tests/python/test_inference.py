@@ -10,6 +10,7 @@ import re
 import subprocess
 import unittest
 from queue import SimpleQueue
+from tempfile import NamedTemporaryFile
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
@@ -230,12 +231,18 @@ class InferenceTest(unittest.TestCase):
                 self.assertIn(message, json.loads(text)["error"])
 
     def test_perf_analyzer_measures_the_server(self):
-        # NVIDIA's load generator reads the metadata, the configuration and the statistics of the model.
+        # NVIDIA's load generator reads the metadata, the configuration and the statistics of the model. Its own random
+        # numbers are no volume.
+        tensor = {"content": VOLUMES[0].ravel().tolist(), "shape": VOLUMES[0].shape}
+        file = self.enterContext(NamedTemporaryFile("w", suffix=".json"))
+        json.dump({"data": [{"tsdf": tensor}]}, file)
+        file.flush()
         for protocol, address in [("grpc", self.server.grpc), ("http", self.server.rest)]:
             with self.subTest(protocol):
                 command = [os.environ["GRASPD_PERF_ANALYZER"], "-m", MODEL, "-i", protocol, "-u", address]
                 # Until two windows of ten requests differ by less than this percentage, or after a minute.
                 command += ["--measurement-mode", "count_windows", "--measurement-request-count", "10", "-s", "999"]
+                command += ["--input-data", file.name]
                 done = subprocess.run(command, capture_output=True, text=True, timeout=600)
                 self.assertEqual(done.returncode, 0, done.stdout + done.stderr)
                 throughput = re.search(r"throughput: ([\d.]+) infer/sec", done.stdout)

@@ -135,10 +135,11 @@ impl GraspRpc {
         // Selects the model first, so that no volume is converted that no model accepts.
         let engine = self.models.select(&params.model, &params.version, Some(resolution(&volume)?))?;
         call.set_model(&engine);
+        let ticket = call.ticket(params.priority);
         let checked = if volume.data.len() <= INLINE_BYTES {
+            engine.check_capacity(ticket)?;
             Volume::try_from(&volume)?
         } else {
-            let ticket = call.ticket(params.priority);
             let permits = (self.conversion_permit(&engine, ticket)?, self.fusion_permit(call).await?);
             engine.check_capacity(ticket)?;
             blocking(permits, move || Ok(Volume::try_from(&volume)?)).await?

@@ -29,6 +29,10 @@ use crate::transport::response_buffer::{ResponseBuffer, ResponsePermit};
 
 const FP32: &str = "FP32";
 
+/// The parameter with which Triton's clients ask for an empty message after the last response of a stream. There is no
+/// such stream here, so that it has no effect on any server.
+const EMPTY_FINAL_RESPONSE: &str = "triton_enable_empty_final_response";
+
 /// Maximum number of volumes per request.
 const MAX_BATCH: usize = 64;
 
@@ -162,7 +166,7 @@ fn check_parameters(request: &oip::ModelInferRequest) -> Result<(), FieldError> 
         request.outputs.iter().enumerate().map(|(i, output)| (format!("outputs[{i}]."), &output.parameters));
     let all = [(String::new(), &request.parameters)].into_iter().chain(of_inputs).chain(of_outputs);
     for (of, parameters) in all {
-        if let Some(name) = parameters.keys().min() {
+        if let Some(name) = parameters.keys().filter(|name| **name != EMPTY_FINAL_RESPONSE).min() {
             let value = format_args!("`{}`", on_a_line(name));
             return Err(FieldError::new(format!("{of}parameters"), value, "which is not supported; remove it"));
         }

@@ -169,12 +169,12 @@ impl Engine {
         Err(FieldError::new("workspace.extent", value, needed))
     }
 
-    /// Refuses if the queue is full now, before the caller converts and fuses data.
+    /// Refuses a request that the queue would refuse now, before the caller converts and fuses data.
     pub fn check_capacity(&self, ticket: Ticket) -> Result<(), EngineError> {
         if self.is_hanging() {
             return Err(EngineError::NoSession);
         }
-        if self.queue.is_full_for(ticket) { Err(self.full().into()) } else { Ok(()) }
+        self.queue.check(ticket, self.service_time.get()).map_err(|refused| self.refused(&refused).into())
     }
 
     fn push(&self, scene: Scene, task: Task, ticket: Ticket, span: Span) -> Result<QueueSlot<Job>, EngineError> {
@@ -190,8 +190,14 @@ impl Engine {
                 }
                 Ok(slot)
             }
-            Err(Refused::Full) => Err(self.full().into()),
-            Err(Refused::TooLate(estimate)) => Err(self.too_late(estimate).into()),
+            Err(refused) => Err(self.refused(&refused).into()),
+        }
+    }
+
+    fn refused(&self, refused: &Refused) -> Overloaded {
+        match refused {
+            Refused::Full => self.full(),
+            Refused::TooLate(estimate) => self.too_late(*estimate),
         }
     }
 
@@ -224,7 +230,7 @@ impl Engine {
 
     /// A refusal with a hint when to retry.
     pub fn overloaded(&self, reason: String) -> Overloaded {
-        let pace = self.service_time.get() / u32::try_from(self.workers).unwrap_or(u32::MAX);
+        let pace = self.service_time.get().mean / u32::try_from(self.workers).unwrap_or(u32::MAX);
         let places = u32::try_from(self.capacity() + self.workers).unwrap_or(u32::MAX);
         Overloaded { reason, retry_after: self.retries.next(pace, places, Instant::now()) }
     }

@@ -68,9 +68,11 @@ pub(crate) struct Reply<T> {
 }
 
 /// Sends the result of a scene, once. It is shared with the watch for inferences that do not end.
-pub(super) struct Sender<T>(Arc<Mutex<Option<oneshot::Sender<Result<SessionOutput<T>, EngineError>>>>>);
+pub(super) struct Sender<T>(Arc<Mutex<Option<oneshot::Sender<Outcome<T>>>>>);
 
-type Receiver<T> = oneshot::Receiver<Result<SessionOutput<T>, EngineError>>;
+type Receiver<T> = oneshot::Receiver<Outcome<T>>;
+
+type Outcome<T> = Result<SessionOutput<T>, EngineError>;
 
 /// A pending request that can be failed.
 pub(super) trait Fail: Send + Sync {
@@ -90,13 +92,13 @@ impl<T: Send + 'static> Sender<T> {
     }
 
     /// A failed send is ignored: the call counts as cancelled by the client.
-    pub fn send(&self, result: Result<SessionOutput<T>, EngineError>) {
+    pub fn send(&self, result: Outcome<T>) {
         if let Some(sender) = self.sender().take() {
             let _ = sender.send(result);
         }
     }
 
-    fn sender(&self) -> MutexGuard<'_, Option<oneshot::Sender<Result<SessionOutput<T>, EngineError>>>> {
+    fn sender(&self) -> MutexGuard<'_, Option<oneshot::Sender<Outcome<T>>>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 

@@ -76,6 +76,14 @@ impl Batching {
     }
 }
 
+/// The time of one job.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Service {
+    pub mean: Duration,
+    /// A time that few jobs exceed.
+    pub long: Duration,
+}
+
 /// Why a job is refused.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Refused {
@@ -183,28 +191,16 @@ impl<T> Queue<T> {
         self: &Arc<Self>,
         job: T,
         ticket: Ticket,
-        service: Duration,
+        service: Service,
     ) -> Result<(QueueSlot<T>, Option<T>), Refused> {
         let mut state = self.lock();
         let now = Instant::now();
-        // An idle server accepts every job, so that its expectation cannot become wrong for ever.
-        if let Some(deadline) = ticket.deadline
-            && state.free == 0
-        {
-            let running = self.sessions as f64 / 2.0;
-            let turns = 1.0 + (state.ahead_of(ticket) as f64 + running) / self.sessions as f64;
-            let estimate = service.mul_f64(turns);
-            if deadline < now + estimate {
-                return Err(Refused::TooLate(estimate));
-            }
-        }
-        let mut displaced = None;
-        if state.is_full(self.capacity) {
-            let (class, line) = state.displaced_by(ticket).ok_or(Refused::Full)?;
+        let displaced = self.place(&state, ticket, service, now)?;
+        let displaced = displaced.and_then(|(class, line)| {
             let newest = state.lines[class][line].jobs.len() - 1;
-            displaced = state.remove(class, line, newest);
             self.gauge.dec();
-        }
+            state.remove(class, line, newest)
+        });
         let number = state.next;
         state.next += 1;
         state.append(ticket, Waiting { number, since: now, job });
@@ -214,6 +210,33 @@ impl<T> Queue<T> {
         Ok((QueueSlot { queue: Arc::clone(self), number }, displaced))
     }
 
+    /// Whether [`push`](Self::push) would accept a job now.
+    pub fn check(&self, ticket: Ticket, service: Service) -> Result<(), Refused> {
+        self.place(&self.lock(), ticket, service, Instant::now()).map(|_| ())
+    }
+
+    /// The line whose newest job a new job would displace, if the queue is full.
+    fn place(
+        &self,
+        state: &State<T>,
+        ticket: Ticket,
+        service: Service,
+        now: Instant,
+    ) -> Result<Option<(usize, usize)>, Refused> {
+        // An idle server accepts every job, so that its expectation cannot become wrong for ever.
+        if let Some(deadline) = ticket.deadline
+            && state.free == 0
+        {
+            let running = self.sessions as f64 / 2.0;
+            let turns = (state.ahead_of(ticket) as f64 + running) / self.sessions as f64;
+            let estimate = service.mean.mul_f64(turns) + service.long;
+            if deadline < now + estimate {
+                return Err(Refused::TooLate(estimate));
+            }
+        }
+        if state.is_full(self.capacity) { state.displaced_by(ticket).map(Some).ok_or(Refused::Full) } else { Ok(None) }
+    }
+
     pub fn capacity(&self) -> usize {
         self.capacity
     }
@@ -221,12 +244,6 @@ impl<T> Queue<T> {
     /// Number of waiting jobs.
     pub fn waiting(&self) -> usize {
         self.lock().waiting
-    }
-
-    /// Whether [`push`](Self::push) would refuse a job now, because the queue is full.
-    pub fn is_full_for(&self, ticket: Ticket) -> bool {
-        let state = self.lock();
-        state.is_full(self.capacity) && state.displaced_by(ticket).is_none()
     }
 
     /// Waits for jobs and takes a batch; None when the queue is closed and empty. The session counts as busy until it
@@ -327,7 +344,7 @@ mod tests {
 
     /// Pushes a job that does not displace another.
     fn push(queue: &Arc<Queue<u32>>, job: u32) -> Result<QueueSlot<u32>, Refused> {
-        let (slot, displaced) = queue.push(job, ticket(CALLER, Priority::Normal), Duration::ZERO)?;
+        let (slot, displaced) = queue.push(job, ticket(CALLER, Priority::Normal), Service::default())?;
         assert_eq!(displaced, None);
         Ok(slot)
     }
@@ -439,7 +456,7 @@ mod tests {
         let (queue, _) = queue(1, 16);
         let slots: Vec<_> = [(1, 10), (1, 11), (1, 12), (1, 13), (2, 20), (2, 21), (3, 30)]
             .map(|(number, job)| {
-                queue.push(job, ticket(caller(number), Priority::Normal), Duration::ZERO).ok().unwrap()
+                queue.push(job, ticket(caller(number), Priority::Normal), Service::default()).ok().unwrap()
             })
             .into();
         assert_eq!(queue.take(Batching { max: 8, ..ONE }).unwrap(), [10, 20, 30, 11]);
@@ -451,16 +468,16 @@ mod tests {
     #[test]
     fn in_a_full_queue_a_caller_with_few_jobs_displaces_the_newest_of_the_caller_with_the_most() {
         let (queue, gauge) = queue(0, 4);
-        let push = |number: u8, job: u32| queue.push(job, ticket(caller(number), Priority::Normal), Duration::ZERO);
+        let push = |number: u8, job: u32| queue.push(job, ticket(caller(number), Priority::Normal), Service::default());
         let mut slots: Vec<_> = (0..4).map(|job| push(1, job).ok().unwrap()).collect();
         assert_eq!(push(1, 4).err(), Some(Refused::Full));
         for (job, displaced) in [(20, 3), (21, 2)] {
-            assert!(!queue.is_full_for(ticket(caller(2), Priority::Normal)));
+            assert!(queue.check(ticket(caller(2), Priority::Normal), Service::default()).is_ok());
             let (slot, job) = push(2, job).ok().unwrap();
             assert_eq!(job, Some(displaced));
             slots.push((slot, None));
         }
-        assert!(queue.is_full_for(ticket(caller(2), Priority::Normal)));
+        assert_eq!(queue.check(ticket(caller(2), Priority::Normal), Service::default()), Err(Refused::Full));
         assert_eq!(push(2, 22).err(), Some(Refused::Full), "both have two");
         assert_eq!((gauge.get(), queue.waiting()), (4, 4));
         queue.free();
@@ -472,7 +489,7 @@ mod tests {
     #[test]
     fn batch_jobs_wait_for_normal_ones_and_are_displaced_by_them_but_not_for_ever() {
         let (queue, _) = queue(1, 12);
-        let push = |job: u32, priority| queue.push(job, ticket(CALLER, priority), Duration::ZERO);
+        let push = |job: u32, priority| queue.push(job, ticket(CALLER, priority), Service::default());
         let mut slots: Vec<_> = (0..3).map(|job| push(100 + job, Priority::Batch).ok().unwrap()).collect();
         slots.extend((0..10).map(|job| push(job, Priority::Normal).ok().unwrap()));
         assert_eq!(push(103, Priority::Batch).err(), Some(Refused::Full));
@@ -486,7 +503,7 @@ mod tests {
     #[test]
     fn a_job_that_cannot_be_done_before_its_deadline_is_refused_unless_a_session_is_idle() {
         let (queue, _) = queue(1, 16);
-        let service = Duration::from_secs(10);
+        let service = Service { mean: Duration::from_secs(10), long: Duration::from_secs(10) };
         let push = |number: u8, seconds: u64| {
             let deadline = Some(Instant::now() + Duration::from_secs(seconds));
             queue.push(0, Ticket { deadline, ..ticket(caller(number), Priority::Normal) }, service)

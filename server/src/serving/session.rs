@@ -13,7 +13,7 @@ use tracing::{Span, error};
 
 use super::detection::{Detection, Score};
 use super::job::{EngineError, Job, Sender, SessionOutput, Task, Tensors};
-use super::queue::{Batching, Queue};
+use super::queue::{Batching, Queue, Service};
 use super::session_threads::Running;
 use crate::transport::deadline::Deadline;
 
@@ -29,13 +29,14 @@ pub(super) struct Session {
     pub service_time: Arc<ServiceTime>,
 }
 
-/// Mean time per scene, in which the latest batches count most.
+/// Mean time per scene and its mean deviation, in which the latest batches count most.
 pub(super) struct ServiceTime(Mutex<Mean>);
 
-/// A mean and the number of its values.
+/// A mean, the mean deviation from it, and the number of the values.
 #[derive(Clone, Copy)]
 struct Mean {
     seconds: f64,
+    deviation: f64,
     values: f64,
 }
 
@@ -56,19 +57,27 @@ struct BatchTimes<'a> {
 
 impl ServiceTime {
     pub fn new(duration: Duration) -> Self {
-        Self(Mutex::new(Mean { seconds: duration.as_secs_f64(), values: 0.0 }))
+        Self(Mutex::new(Mean { seconds: duration.as_secs_f64(), deviation: 0.0, values: 0.0 }))
     }
 
     /// Adds the time of a scene. The first replaces the initial time.
     pub fn add(&self, duration: Duration) {
         let mut mean = self.mean();
         mean.values = (mean.values + 1.0).min(MEMORY);
-        mean.seconds += (duration.as_secs_f64() - mean.seconds) / mean.values;
+        let difference = duration.as_secs_f64() - mean.seconds;
+        // The difference from the initial time is no deviation.
+        if mean.values > 1.0 {
+            mean.deviation += (difference.abs() - mean.deviation) / mean.values;
+        }
+        mean.seconds += difference / mean.values;
     }
 
-    /// At least one millisecond, the unit of the retry hint.
-    pub fn get(&self) -> Duration {
-        Duration::from_secs_f64(self.mean().seconds).max(Duration::from_millis(1))
+    /// The mean is at least one millisecond, the unit of the retry hint. Two mean deviations above it are, for a normal
+    /// distribution, exceeded by one in twenty.
+    pub fn get(&self) -> Service {
+        let Mean { seconds, deviation, .. } = *self.mean();
+        let mean = Duration::from_secs_f64(seconds).max(Duration::from_millis(1));
+        Service { mean, long: mean + Duration::from_secs_f64(2.0 * deviation) }
     }
 
     fn mean(&self) -> MutexGuard<'_, Mean> {
@@ -83,7 +92,7 @@ impl Session {
         while let Some(mut jobs) = self.queue.take(batching) {
             let now = Instant::now();
             // While others wait, a job that would end after its deadline is dropped before its inference.
-            let until = if self.queue.waiting() > 0 { now + self.service_time.get() } else { now };
+            let until = if self.queue.waiting() > 0 { now + self.service_time.get().long } else { now };
             let expired = |job: &mut Job| job.deadline.is_some_and(|Deadline(deadline)| deadline <= until);
             for job in jobs.extract_if(.., expired) {
                 job.task.fail(EngineError::Expired);

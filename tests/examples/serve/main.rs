@@ -2,8 +2,8 @@
 //!
 //! `make bench-serve`, or `cargo run --release -p grasp-tests --example serve [SECONDS [FILE [PART…]]]` with
 //! `ORT_DYLIB_PATH` set. `SECONDS` is the duration of each load, 5 by default. All results are also written to `FILE`, as
-//! JSON. The parts are `hop`, `vgn`, `transformer`, `throughput`, `depth`, `overload`, `streams` and `start`; all by
-//! default.
+//! JSON. The parts are `hop`, `vgn`, `transformer`, `throughput`, `depth`, `overload`, `callers`, `refusals`,
+//! `streams` and `start`; all by default.
 //! `GRASP_TRAIN` names grasp-train, for libtorch's eager mode; `GRASPD_PEERS` names a Python with the packages of
 //! tests/peers, for the other servers. Without a variable its part is left out.
 //!
@@ -85,6 +85,13 @@ async fn main() -> anyhow::Result<()> {
     }
     if is_wanted("overload") {
         bench.overload(&mut findings).await?;
+    }
+    if is_wanted("callers") {
+        bench.burst(&mut findings).await?;
+        bench.fairness(&mut findings).await?;
+    }
+    if is_wanted("refusals") {
+        bench.beside_inferences(&mut findings).await?;
     }
     if is_wanted("streams") {
         bench.streams(&mut findings).await?;

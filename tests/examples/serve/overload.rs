@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use grasp_client::{Access, Arrivals, Client, DetectOptions, Options, Report, Retry, Until};
+use tonic::Code;
 
 use crate::findings::{Findings, Table, milliseconds};
 use crate::{Bench, run_load};
@@ -13,9 +14,8 @@ use crate::{Bench, run_load};
 /// Arrivals relative to the capacity.
 const OVERLOAD: f64 = 3.0;
 
-/// Networks, and deadlines that are shorter than the wait in a full queue.
-const DEADLINES: [(&str, Duration); 2] =
-    [("vgn", Duration::from_millis(60)), ("transformer", Duration::from_millis(250))];
+/// Deadlines, in inferences: shorter than the wait in a full queue.
+const DEADLINE: f64 = 6.0;
 
 /// Concurrent calls that are all retried as recommended.
 const BURST: usize = 100;
@@ -28,37 +28,43 @@ impl Bench {
     pub async fn overload(&self, findings: &mut Findings) -> anyhow::Result<()> {
         let mut table = Table::new(
             &format!("{OVERLOAD} times the capacity, {:?} each", 2 * self.seconds),
-            &["capacity /s", "arrivals /s", "answers /s", "of capacity", "refused"],
+            &["capacity /s", "arrivals /s", "answers /s", "of capacity", "refused", "late"],
         );
-        for (network, deadline) in DEADLINES {
+        for network in ["vgn", "transformer"] {
             let server = self.serve(network, &[])?;
             let client = Client::connect(server.grpc().to_string()).await?;
             let until = Until::Elapsed(2 * self.seconds);
             let callers = Arrivals::Callers(8);
             let capacity = run_load(&client, &self.scene, callers, until, Options::default()).await.throughput();
-            for timeout in [None, Some(deadline)] {
+            for timeout in [None, Some(Duration::from_secs_f64(DEADLINE / capacity))] {
                 let options = Options { timeout, ..Options::default() };
                 let arrivals = Arrivals::Rate(OVERLOAD * capacity);
                 let report = run_load(&client, &self.scene, arrivals, until, options).await;
                 let goodput = report.throughput();
                 let kind =
-                    timeout.map_or("without deadlines".to_owned(), |timeout| format!("deadlines of {timeout:?}"));
+                    timeout.map_or("without deadlines".to_owned(), |timeout| format!("deadlines of {timeout:.0?}"));
+                let late = report.refused.get(&(Code::DeadlineExceeded as i32)).map_or(0, Vec::len);
                 table.row(
                     &format!("{network}, {kind}"),
-                    [capacity, OVERLOAD * capacity, goodput, goodput / capacity, report.refusals() as f64],
+                    [
+                        capacity,
+                        OVERLOAD * capacity,
+                        goodput,
+                        goodput / capacity,
+                        (report.refusals() - late) as f64,
+                        late as f64,
+                    ],
                 );
                 let kind = if timeout.is_some() { "deadline" } else { "overload" };
                 findings.figure(&format!("{network}_{kind}_goodput"), goodput / capacity);
             }
         }
         findings.table(table);
-        self.burst(findings).await?;
-        self.fairness(findings).await?;
-        self.beside_inferences(findings).await
+        Ok(())
     }
 
     /// Requests that need no inference, while others keep all processors busy.
-    async fn beside_inferences(&self, findings: &mut Findings) -> anyhow::Result<()> {
+    pub async fn beside_inferences(&self, findings: &mut Findings) -> anyhow::Result<()> {
         let server = self.serve("vgn", &[])?;
         let client = Client::connect(server.grpc().to_string()).await?;
         let (scene, loaded) = (Arc::clone(&self.scene), client.clone());
@@ -90,7 +96,7 @@ impl Bench {
     }
 
     /// Calls that start together and follow the hints of their refusals.
-    async fn burst(&self, findings: &mut Findings) -> anyhow::Result<()> {
+    pub async fn burst(&self, findings: &mut Findings) -> anyhow::Result<()> {
         let mut table = Table::new(&format!("vgn, a burst of {BURST} calls"), &["answered"]);
         let server = self.serve("vgn", &[])?;
         let access = Access { retry: Retry::RECOMMENDED, ..Access::default() };
@@ -104,7 +110,7 @@ impl Bench {
     }
 
     /// A caller with 64 open calls beside one with a single call.
-    async fn fairness(&self, findings: &mut Findings) -> anyhow::Result<()> {
+    pub async fn fairness(&self, findings: &mut Findings) -> anyhow::Result<()> {
         let tokens = self.models("vgn").join("tokens");
         fs::write(&tokens, "many\nsingle\n")?;
         let server = self.serve("vgn", &["--token-file", tokens.to_str().context("a temporary path is UTF-8")?])?;
