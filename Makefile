@@ -89,7 +89,7 @@ bench-serve: ## measure latency and throughput of the server, libtorch, OpenVINO
 	$(with_onnxruntime) $(with_libtorch) GRASPD_PEERS="$$($(PYTHON) tests/tools.py peers)" && export GRASPD_PEERS && \
 		GRASP_TRAIN=$(RELEASE)/grasp-train $(RELEASE)/examples/serve 5 $(CARGO_TARGET_DIR)/bench-serve.json
 
-soak: ## load test: four times the sustainable load for a minute, then 80 % of it for 20 minutes; MINUTES=N
+soak: ## load test: four times the sustainable load, also with deadlines, then 80 % of it for 20 minutes; MINUTES=N
 	$(CARGO) build --release $(WORKSPACE) --bins
 	$(CARGO) build --release $(WORKSPACE) --example soak
 	$(with_onnxruntime) $(RELEASE)/examples/soak $(MINUTES)

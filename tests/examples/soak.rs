@@ -1,8 +1,8 @@
 //! Checks that throughput, latency and memory of the server are stable under overload and over time.
 //!
 //! `make soak`, or `cargo run --release -p grasp-tests --example soak [MINUTES]` with `ORT_DYLIB_PATH` set. First a
-//! minute of Poisson arrivals at four times the capacity, then `MINUTES` (20 by default) at 80 % of it. With two
-//! or more processors, the callers have one of their own, so that they take no time from the server. Each minute's
+//! minute of Poisson arrivals at four times the capacity, then another with deadlines, then `MINUTES` (20 by default) at
+//! 80 % of it. With two or more processors, the callers have one of their own, so that they take no time from the server. Each minute's
 //! line includes the share of processor time that other machines on the host used. The last line is one JSON object.
 
 use std::fs;
@@ -30,6 +30,8 @@ const CAPACITY: Duration = Duration::from_secs(15);
 const CALLERS: usize = 4;
 /// Rate of the overload, as a multiple of the capacity.
 const OVERLOAD: f64 = 4.0;
+/// Deadline of the calls in the second minute, in inferences.
+const DEADLINE: f64 = 6.0;
 /// Rate of the soak, as a share of the capacity.
 const SOAK: f64 = 0.8;
 
@@ -49,12 +51,12 @@ async fn main() -> anyhow::Result<()> {
         client: GraspServiceClient::connect(format!("http://{}", server.grpc())).await?,
         request: DetectGraspsRequest { volume, ..DetectGraspsRequest::default() },
     };
-    caller.load(Arrivals::Callers(1), Duration::from_secs(2)).await;
-    let capacity = caller.load(Arrivals::Callers(CALLERS), CAPACITY).await.throughput();
+    caller.load(Arrivals::Callers(1), Duration::from_secs(2), None).await;
+    let capacity = caller.load(Arrivals::Callers(CALLERS), CAPACITY, None).await.throughput();
     println!("capacity: {capacity:.1} answers a second to {CALLERS} callers, in {CAPACITY:?}");
 
     let before = Use::of(&server)?;
-    let report = caller.load(Arrivals::Rate(OVERLOAD * capacity), MINUTE).await;
+    let report = caller.load(Arrivals::Rate(OVERLOAD * capacity), MINUTE, None).await;
     let after = Use::of(&server)?;
     let only_overload = report.refused.keys().all(|&code| code == i32::from(Code::ResourceExhausted));
     ensure!(only_overload, "refusals with other codes than RESOURCE_EXHAUSTED: {:?}", report.refused.keys());
@@ -71,6 +73,22 @@ async fn main() -> anyhow::Result<()> {
         after.megabytes
     );
 
+    let deadline = Duration::from_secs_f64(DEADLINE / capacity);
+    let report = caller.load(Arrivals::Rate(OVERLOAD * capacity), MINUTE, Some(deadline)).await;
+    let known = [Code::ResourceExhausted, Code::DeadlineExceeded].map(i32::from);
+    let only_known = report.refused.keys().all(|code| known.contains(code));
+    ensure!(only_known, "other codes than RESOURCE_EXHAUSTED and DEADLINE_EXCEEDED: {:?}", report.refused.keys());
+    let late = report.refused.get(&known[1]).map_or(0, Vec::len);
+    let deadline_goodput = report.throughput() / capacity;
+    println!(
+        "the same with deadlines of {deadline:.0?}: {} answered, {:.1} % of capacity; {} refused, {late} late; memory \
+         {:.1} MB after",
+        report.answered.len(),
+        100.0 * deadline_goodput,
+        report.refusals() - late,
+        Use::of(&server)?.megabytes
+    );
+
     println!(
         "\n{:.1} a second for {minutes} minutes\nminute   answered  refused  p50 ms  p99 ms      MB  files  stolen %",
         SOAK * capacity
@@ -79,7 +97,7 @@ async fn main() -> anyhow::Result<()> {
     let started = Stolen::so_far();
     for minute in 1..=minutes {
         let stolen = Stolen::so_far();
-        let report = caller.load(Arrivals::Rate(SOAK * capacity), MINUTE).await;
+        let report = caller.load(Arrivals::Rate(SOAK * capacity), MINUTE, None).await;
         refusals += report.refusals();
         let [p50, p99] = [0.5, 0.99].map(|share| Report::quantile(&report.answered, share).as_secs_f64() * 1e3);
         let used = Use::of(&server)?;
@@ -97,6 +115,7 @@ async fn main() -> anyhow::Result<()> {
     let figures = json!({
         "capacity_per_s": capacity,
         "goodput_ratio": goodput,
+        "deadline_goodput_ratio": deadline_goodput,
         "refusal_p99_ms": refusal_p99,
         "overload_memory_growth": after.megabytes / before.megabytes - 1.0,
         "soak_refusals": refusals,
@@ -131,11 +150,22 @@ struct Caller {
 }
 
 impl Caller {
-    async fn load(&self, arrivals: Arrivals, duration: Duration) -> Report {
+    /// A load whose calls have this deadline.
+    async fn load(&self, arrivals: Arrivals, duration: Duration, deadline: Option<Duration>) -> Report {
         let (client, request) = (self.client.clone(), self.request.clone());
         load(arrivals, Until::Elapsed(duration), move |_| {
             let (mut client, request) = (client.clone(), request.clone());
-            async move { client.detect_grasps(request).await.map(drop).map_err(|status| status.code()) }
+            async move {
+                let mut request = tonic::Request::new(request);
+                if let Some(deadline) = deadline {
+                    request.set_timeout(deadline);
+                }
+                client.detect_grasps(request).await.map(drop).map_err(|status| match status.code() {
+                    // What the client's own timer reports, if the server's status has not arrived yet.
+                    Code::Cancelled => Code::DeadlineExceeded,
+                    code => code,
+                })
+            }
         })
         .await
     }

@@ -4,7 +4,7 @@ use std::fs;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, anyhow, ensure};
 use grasp_client::{Access, Arrivals, Client, DetectOptions, Options, Report, Retry, Until};
 use tonic::Code;
 
@@ -67,10 +67,15 @@ impl Bench {
     pub async fn beside_inferences(&self, findings: &mut Findings) -> anyhow::Result<()> {
         let server = self.serve("vgn", &[])?;
         let client = Client::connect(server.grpc().to_string()).await?;
-        let (scene, loaded) = (Arc::clone(&self.scene), client.clone());
+        let (scene, address) = (Arc::clone(&self.scene), server.grpc().to_string());
         let until = Until::Elapsed(2 * self.seconds);
-        let load = tokio::spawn(async move {
-            run_load(&loaded, &scene, Arrivals::Callers(8), until, Options::default()).await.throughput()
+        // On a thread of its own: otherwise the refusals would wait for the other calls in this process.
+        let load = std::thread::spawn(move || -> anyhow::Result<f64> {
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+            runtime.block_on(async {
+                let client = Client::connect(address).await?;
+                Ok(run_load(&client, &scene, Arrivals::Callers(8), until, Options::default()).await.throughput())
+            })
         });
         let detect = DetectOptions { model: "missing".to_owned(), ..DetectOptions::default() };
         let options = Options { detect, ..Options::default() };
@@ -86,7 +91,7 @@ impl Bench {
         let [p50, p99] = [0.5, 0.99].map(|share| milliseconds(Report::quantile(&times, share)));
         let columns = ["calls", "p50 ms", "p99 ms", "inferences/s"];
         let mut table = Table::new("vgn, refusals beside eight callers", &columns);
-        let throughput = load.await?;
+        let throughput = load.join().map_err(|_| anyhow!("the load panicked"))??;
         table.row("a model that does not exist", [times.len() as f64, p50, p99, throughput]);
         findings.figure("refusal_p50_ms", p50);
         findings.figure("refusal_p99_ms", p99);
