@@ -4,7 +4,6 @@ use std::thread;
 use std::time::Instant;
 
 use grasp::{Volume, WORKSPACE_SIZE};
-use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::find_table_request::Observation as Seen;
 use grasp_proto::pb::grasp_service_server::GraspService;
 use grasp_proto::pb::recording::{Answer, Request as Recorded};
@@ -12,14 +11,11 @@ use grasp_proto::{
     Candidate, DetectParams, FieldError, Priority, TABLE_HEIGHT, Workspace, candidates, check_count, cloud_view,
     depth_view, pb, resolution,
 };
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::timeout_at;
-use tokio_stream::StreamExt;
-use tokio_stream::wrappers::ReceiverStream;
 use tonic::codegen::BoxStream;
 use tonic::{Request, Response, Status, Streaming};
 
-use crate::readiness::draining;
 use crate::rpc::call::{Call, CallContext, Calls, FrameStamp, Observed, PendingReply};
 use crate::rpc::refusal::Refusal;
 use crate::serving::cubes::{CubeScene, Cubes};
@@ -29,7 +25,7 @@ use crate::serving::job::EngineError;
 use crate::serving::observation::Observation;
 use crate::serving::queue::Ticket;
 use crate::serving::registry::{ModelRegistry, check_voxel_size};
-use crate::serving::tracking::{Start, Track, TrackedVolumes};
+use crate::serving::tracking::TrackedVolumes;
 use crate::telemetry::recorder::{Pending, Recorder};
 use crate::transport::deadline::Deadline;
 use grasp_planner::Scene;
@@ -41,12 +37,12 @@ const INLINE_BYTES: usize = 1 << 20;
 /// grasp.v1.GraspService.
 #[derive(Clone)]
 pub(crate) struct GraspRpc {
-    models: Arc<ModelRegistry>,
-    calls: Calls,
-    tracked_volumes: Arc<TrackedVolumes>,
-    recorder: Recorder,
+    pub(super) models: Arc<ModelRegistry>,
+    pub(super) calls: Calls,
+    pub(super) tracked_volumes: Arc<TrackedVolumes>,
+    pub(super) recorder: Recorder,
     /// Requests of one stream that are queued behind the current one.
-    read_ahead: usize,
+    pub(super) read_ahead: usize,
     /// One permit per CPU. A request holds one while it is converted and fused.
     fusion_permits: Arc<Semaphore>,
     /// One permit per CPU and per place in a model's queue. A request holds one while it waits for a fusion permit and
@@ -61,14 +57,14 @@ type Placed = (Observation, Option<pb::FoundTable>);
 type Fused = (Vec<CubeScene>, Observed);
 
 /// A call that is queued, or refused with its refusal not yet sent.
-struct PendingCall {
-    call: Call,
+pub(super) struct PendingCall {
+    pub call: Call,
     reply: Result<PendingReply, Refusal>,
     recording: Pending,
 }
 
 impl PendingCall {
-    async fn finish(self) -> Result<pb::DetectGraspsResponse, Refusal> {
+    pub async fn finish(self) -> Result<pb::DetectGraspsResponse, Refusal> {
         let outcome = self.call.finish(self.reply).await;
         self.recording.answered(&outcome, |response| Answer::Grasps(response.clone()));
         outcome
@@ -100,7 +96,7 @@ impl GraspRpc {
     }
 
     /// Opens a call and submits its request. [`PendingCall::finish`] returns both results and refusals.
-    async fn begin(
+    pub(super) async fn begin(
         &self,
         request_id: String,
         context: CallContext,
@@ -115,7 +111,11 @@ impl GraspRpc {
         PendingCall { call, reply, recording }
     }
 
-    async fn submit(&self, request: pb::DetectGraspsRequest, call: &mut Call) -> Result<PendingReply, Refusal> {
+    pub(super) async fn submit(
+        &self,
+        request: pb::DetectGraspsRequest,
+        call: &mut Call,
+    ) -> Result<PendingReply, Refusal> {
         let pb::DetectGraspsRequest { volume, options, .. } = request;
         let volume = volume.ok_or_else(|| FieldError::new("volume", "absent", "must be given"))?;
         let params = DetectParams::try_from(&options.unwrap_or_default())?;
@@ -290,7 +290,7 @@ impl GraspRpc {
     }
 
     /// The status that ends a stream. The refusal is logged and counted.
-    fn refuse(&self, refusal: Refusal, context: CallContext) -> Status {
+    pub(super) fn refuse(&self, refusal: Refusal, context: CallContext) -> Status {
         let (call, _) = self.calls.open(String::new(), context);
         let id = call.id.clone();
         call.end(refusal).status(&id)
@@ -304,7 +304,7 @@ impl GraspRpc {
     }
 
     /// Waits for a fusion permit until the call's deadline.
-    async fn fusion_permit(&self, call: &Call) -> Result<OwnedSemaphorePermit, Refusal> {
+    pub(super) async fn fusion_permit(&self, call: &Call) -> Result<OwnedSemaphorePermit, Refusal> {
         let permit = Arc::clone(&self.fusion_permits).acquire_owned();
         let permit = match call.deadline {
             None => permit.await,
@@ -312,33 +312,6 @@ impl GraspRpc {
         };
         // Cannot fail: the semaphore is never closed.
         permit.map_err(|_| EngineError::SessionEnded.into())
-    }
-
-    /// Integrates the views of a request into the stream's volume, and queues the scene.
-    async fn submit_track(
-        &self,
-        request: pb::TrackGraspsRequest,
-        track: &mut Option<Track>,
-        call: &mut Call,
-    ) -> Result<PendingReply, Refusal> {
-        let pb::TrackGraspsRequest { mut views, workspace, options, half_life, .. } = request;
-        let before = track.as_ref().map(|track| track.params.clone());
-        let params = match (options, before) {
-            (None, Some(before)) => before,
-            (options, _) => DetectParams::try_from(&options.unwrap_or_default())?,
-        };
-        let engine = self.models.select(&params.model, &params.version, None)?;
-        call.set_model(&engine);
-        // No conversion permit is needed: --max-tracked already limits the streams.
-        let permit = self.fusion_permit(call).await?;
-        let (selected, old, of_request) = (Arc::clone(&engine), track.take(), params.clone());
-        let start = workspace.map(|workspace| Start { workspace, half_life });
-        // The volume is returned in any case, so an invalid view does not lose it.
-        let (new, fused) =
-            blocking(permit, move || Ok(Track::integrate(old, &selected, of_request, start, &mut views))).await?;
-        *track = new;
-        let (scenes, origin, observed) = fused?;
-        call.submit(&engine, scenes, params, origin, observed)
     }
 }
 
@@ -389,7 +362,7 @@ fn fuse(
 }
 
 /// Runs `work` on a thread for blocking tasks, to keep the async runtime's threads free.
-async fn blocking<T: Send + 'static>(
+pub(super) async fn blocking<T: Send + 'static>(
     permits: impl Send + 'static,
     work: impl FnOnce() -> Result<T, Refusal> + Send + 'static,
 ) -> Result<T, Refusal> {
@@ -476,37 +449,7 @@ impl GraspService for GraspRpc {
         &self,
         request: Request<Streaming<pb::DetectGraspsRequest>>,
     ) -> Result<Response<Self::DetectGraspsStreamStream>, Status> {
-        // Of the stream, and so of every request in it.
-        let context = CallContext::of(&request);
-        let mut requests = request.into_inner();
-        let service = self.clone();
-        let (pending, calls) = mpsc::channel(self.read_ahead);
-        tokio::spawn(async move {
-            // Reserves a slot before it reads a message, so that flow control keeps further messages at the client.
-            while let Ok(slot) = pending.reserve().await {
-                let message = tokio::select! {
-                    message = requests.message() => message,
-                    () = draining(service.calls.state()) => return slot.send(Err(service.refuse(Refusal::Draining, context))),
-                };
-                match message {
-                    Ok(Some(mut request)) => {
-                        let recording = service.recorder.request(|| Recorded::Volume(request.clone()));
-                        let id = std::mem::take(&mut request.request_id);
-                        let submit = async |call: &mut Call| service.submit(request, call).await;
-                        slot.send(Ok(service.begin(id, context.clone(), recording, submit).await));
-                    }
-                    Ok(None) => return,
-                    // Too large or malformed: the framing of messages is lost, so the stream ends with this status.
-                    Err(status) => return slot.send(Err(service.calls.unreadable(status))),
-                }
-            }
-        });
-        let replies = ReceiverStream::new(calls).then(async |pending: Result<PendingCall, Status>| {
-            let pending = pending?;
-            let id = pending.call.id.clone();
-            Ok(response(id, pending.finish().await))
-        });
-        Ok(Response::new(Box::pin(replies)))
+        self.answer_each(request)
     }
 
     type TrackGraspsStream = BoxStream<pb::DetectGraspsStreamResponse>;
@@ -515,69 +458,10 @@ impl GraspService for GraspRpc {
         &self,
         request: Request<Streaming<pb::TrackGraspsRequest>>,
     ) -> Result<Response<Self::TrackGraspsStream>, Status> {
-        let context = CallContext::of(&request);
-        let mut requests = request.into_inner();
-        let service = self.clone();
-        let permit = self.tracked_volumes.acquire().map_err(|refusal| self.refuse(refusal, context.clone()))?;
-        let (replies, sent) = mpsc::channel(2);
-        // One of the two slots is reserved for the status that ends the stream, in case the client reads no replies.
-        let Ok(end) = replies.clone().try_reserve_owned() else {
-            return Err(Status::internal("cannot reserve a slot in a new channel"));
-        };
-        tokio::spawn(async move {
-            // Released when the stream ends, with the volume.
-            let _permit = permit;
-            let mut track = None;
-            let ended = loop {
-                let next = async {
-                    // Reserves the reply's slot before it reads a message, so that unread replies stop further reading.
-                    let reply = replies.reserve().await.ok()?;
-                    Some((reply, requests.message().await))
-                };
-                let (reply, message) = tokio::select! {
-                    next = next => match next {
-                        Some(next) => next,
-                        None => return,
-                    },
-                    () = draining(service.calls.state()) => break service.refuse(Refusal::Draining, context),
-                    refusal = service.tracked_volumes.expired() => break service.refuse(refusal, context),
-                };
-                let mut request = match message {
-                    Ok(Some(request)) => request,
-                    Ok(None) => return,
-                    Err(status) => break service.calls.unreadable(status),
-                };
-                let id = std::mem::take(&mut request.request_id);
-                let result = async {
-                    let submit = async |call: &mut Call| service.submit_track(request, &mut track, call).await;
-                    // A request cannot be repeated without those before it.
-                    let pending = service.begin(id, context.clone(), Pending::none(), submit).await;
-                    let id = pending.call.id.clone();
-                    response(id, pending.finish().await)
-                };
-                tokio::select! {
-                    // Polls the request first, so that it is opened and counted.
-                    biased;
-                    result = result => reply.send(Ok(result)),
-                    // The client has closed the stream; the call counts as cancelled.
-                    () = replies.closed() => return,
-                }
-            };
-            end.send(Err(ended));
-        });
-        Ok(Response::new(Box::pin(ReceiverStream::new(sent))))
+        self.track(request)
     }
 
     async fn list_models(&self, _: Request<pb::ListModelsRequest>) -> Result<Response<pb::ListModelsResponse>, Status> {
         Ok(Response::new((&*self.models).into()))
     }
-}
-
-/// One response of a stream. The stream continues after a refusal.
-fn response(request_id: String, outcome: Result<pb::DetectGraspsResponse, Refusal>) -> pb::DetectGraspsStreamResponse {
-    let outcome = match outcome {
-        Ok(response) => Outcome::Response(response),
-        Err(refusal) => Outcome::Error((&refusal).into()),
-    };
-    pb::DetectGraspsStreamResponse { request_id, outcome: Some(outcome) }
 }
