@@ -72,7 +72,7 @@ test-python: ## run only the tests of test-rust with `python` in their names
 	$(with_onnxruntime) $(with_python) $(with_programs) $(CARGO) test $(WORKSPACE) python
 
 test-faults: ## run the tests that `test` excludes: a replica killed behind haproxy, ten thousand connections
-	$(with_onnxruntime) $(with_haproxy) $(CARGO) test --package grasp-tests --locked \
+	$(with_onnxruntime) $(with_haproxy) $(CARGO) test $(WORKSPACE) \
 		--test replicas --test faults -- --ignored --nocapture
 
 fuzz: ## fuzz the decoders of volumes and views, twenty million inputs each (needs cargo-fuzz)

@@ -138,7 +138,7 @@ class DocsTest(unittest.TestCase):
             script.write_text(f'#!/bin/sh\nexec {shlex.join(map(str, command))} "$@"\n')
             script.chmod(0o755)
         with mock.patch.dict(os.environ, {"GRASPD_MODELS": str(folder / "models/zoo")}):
-            server = self.enterContext(Server("--watch", 0.2))
+            server = self.enterContext(Server("--watch", 0.2, "--record", folder / "recordings"))
         page = Page(name, server, folder)
         for language, code, line, expected in page.blocks():
             if language not in ["sh", "python"]:
