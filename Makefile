@@ -22,11 +22,11 @@ with_programs = GRASPD_PROMETHEUS="$$($(PYTHON) tests/tools.py prometheus)" && e
 	GRASPD_PROMTOOL="$$($(PYTHON) tests/tools.py promtool)" && export GRASPD_PROMTOOL && \
 	GRASPD_CPP="$$($(PYTHON) tests/tools.py cpp)" && export GRASPD_CPP && \
 	GRASPD_CHROMIUM="$$($(PYTHON) tests/tools.py chromium)" && export GRASPD_CHROMIUM && \
+	GRASPD_HAPROXY="$$($(PYTHON) tests/tools.py haproxy)" && export GRASPD_HAPROXY && \
 	GRASPD_PERF_ANALYZER="$$($(PYTHON) tests/tools.py perf-analyzer)" && export GRASPD_PERF_ANALYZER &&
 with_libtorch = LIBTORCH="$$($(PYTHON) deploy/native.py libtorch)" && export LIBTORCH && \
 	LD_LIBRARY_PATH="$$LIBTORCH/lib$${LD_LIBRARY_PATH:+:$$LD_LIBRARY_PATH}" && export LD_LIBRARY_PATH &&
 
-with_haproxy = GRASPD_HAPROXY="$$($(PYTHON) tests/tools.py haproxy)" && export GRASPD_HAPROXY &&
 
 .PHONY: help demo build test fmt fmt-check lint doc deny test-rust test-train test-python test-faults fuzz bench-sim \
 	bench-serve soak tables clean
@@ -71,9 +71,8 @@ test-train: ## run the tests of training, in libtorch on the CPU
 test-python: ## run only the tests of test-rust with `python` in their names
 	$(with_onnxruntime) $(with_python) $(with_programs) $(CARGO) test $(WORKSPACE) python
 
-test-faults: ## run the tests that `test` excludes: a replica killed behind haproxy, ten thousand connections
-	$(with_onnxruntime) $(with_haproxy) $(CARGO) test $(WORKSPACE) \
-		--test replicas --test faults -- --ignored --nocapture
+test-faults: ## run the test that `test` excludes: ten thousand connections
+	$(with_onnxruntime) $(CARGO) test $(WORKSPACE) --test faults -- --ignored --nocapture
 
 fuzz: ## fuzz the decoders of volumes and views, twenty million inputs each (needs cargo-fuzz)
 	for target in request views; do RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run --fuzz-dir tests/fuzz \

@@ -3,7 +3,7 @@
 
     tools.py python      the interpreter of the Python tests, for GRASPD_PYTHON
     tools.py peers       the interpreter of the servers that graspd is compared with, for GRASPD_PEERS
-    tools.py haproxy     the load balancer of `make test-faults`, for GRASPD_HAPROXY
+    tools.py haproxy     the load balancer of the tests, for GRASPD_HAPROXY
     tools.py prometheus  for the tests of deploy/prometheus and deploy/grafana, for GRASPD_PROMETHEUS
     tools.py promtool    checks the rules of Prometheus, for GRASPD_PROMTOOL
     tools.py cpp         a prefix with CMake, protoc and gRPC for C++, for GRASPD_CPP

@@ -1,4 +1,4 @@
-//! Two servers behind a load balancer, one of which is killed. `make test-faults` runs this test: it needs haproxy.
+//! Two servers behind a load balancer, one of which is killed.
 
 use std::net::{SocketAddr, TcpListener};
 use std::process::{Child, Command};
@@ -21,7 +21,8 @@ struct Balancer {
 
 impl Balancer {
     fn run(replicas: [&Server; 2]) -> Self {
-        let haproxy = std::env::var_os("GRASPD_HAPROXY").expect("GRASPD_HAPROXY names haproxy: run `make test-faults`");
+        let haproxy =
+            std::env::var_os("GRASPD_HAPROXY").expect("GRASPD_HAPROXY is not set: run the tests by `make test`");
         let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
         let mut command = Command::new(haproxy);
         command.args(["-f", concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/haproxy.cfg")]);
@@ -42,7 +43,6 @@ impl Drop for Balancer {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-#[ignore = "needs haproxy: make test-faults"]
 async fn requests_with_retries_succeed_when_a_replica_is_killed() {
     const CALLS: usize = 2000;
     let model = || TestModel::new("mirror").resolution(RESOLUTION);
