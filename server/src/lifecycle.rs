@@ -4,14 +4,14 @@ use std::io::Write;
 use std::num::NonZero;
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::thread::available_parallelism;
-use std::time::{Duration, SystemTime};
+use std::thread::{self, available_parallelism};
+use std::time::{Duration, Instant, SystemTime};
 
 use anyhow::Context;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 use tracing::{error, info, warn};
 
 use crate::config::Config;
@@ -72,13 +72,17 @@ fn failed_to_start(error: &anyhow::Error) -> ExitCode {
     ExitCode::FAILURE
 }
 
+/// The CPUs available to the process.
+fn processors() -> usize {
+    available_parallelism().map_or(1, NonZero::get)
+}
+
 /// How long the shutdown waits for tasks and sessions that are still running.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(2);
 
 fn runtime() -> anyhow::Result<Runtime> {
-    let processors = available_parallelism().map_or(1, NonZero::get);
     // A request takes 0.1 ms of their time. More than four would only take CPUs from the networks.
-    let threads = processors.min(4);
+    let threads = processors().min(4);
     let mut builder = tokio::runtime::Builder::new_multi_thread();
     let builder = builder.worker_threads(threads).thread_name("grpc").enable_all();
     builder.build().context("cannot start the threads of the async runtime")
@@ -105,12 +109,25 @@ fn serve_until_stopped(
     let onnxruntime = grasp_models::init()?;
     info!(version = onnxruntime.version, library = %onnxruntime.library.display(), "ONNX Runtime loaded");
     let sessions = Arc::new(SessionThreads::default());
-    let served = runtime.block_on(serve(config, signals, connections, &metrics, &sessions));
+    let (recorder, recording) = match &config.record {
+        Some((folder, capacity)) => {
+            let (recorder, thread) = Recorder::start(folder, *capacity, metrics.recordings())?;
+            (recorder, Some(thread))
+        }
+        None => (Recorder::none(), None),
+    };
+    let served = runtime.block_on(serve(config, signals, connections, &metrics, &sessions, recorder));
     traces.finish();
     // Dropping the runtime's tasks drops the engines, which ends the sessions.
     runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
     // ONNX Runtime may crash if the process exits during an inference.
     sessions.join(SHUTDOWN_TIMEOUT);
+    if let Some(recording) = recording {
+        let until = Instant::now() + SHUTDOWN_TIMEOUT;
+        while !recording.is_finished() && Instant::now() < until {
+            thread::sleep(Duration::from_millis(1));
+        }
+    }
     served
 }
 
@@ -121,6 +138,7 @@ async fn serve(
     connections: usize,
     metrics: &Arc<Metrics>,
     sessions: &Arc<SessionThreads>,
+    recorder: Recorder,
 ) -> anyhow::Result<()> {
     let hangup = hangup().context("cannot install a signal handler")?;
     let grpc = config.listen.bind().await.with_context(|| format!("cannot listen on --listen {}", config.listen))?;
@@ -151,15 +169,12 @@ async fn serve(
     let (folder, control) = ModelFolder::new(config, Arc::clone(&models), Arc::clone(sessions), Arc::clone(metrics));
     let inference = InferenceRpc::new(Arc::clone(&models), calls.clone(), Arc::clone(metrics), control);
     let tracked_volumes = TrackedVolumes::new(*max_tracked, *track_timeout, metrics.tracked());
-    let recorder = match &config.record {
-        Some((folder, capacity)) => Recorder::start(folder, *capacity, metrics.recordings())?,
-        None => Recorder::none(),
-    };
     let at_once = config.workers * config.batching.max;
     let service = GraspRpc::new(Arc::clone(&models), calls, tracked_volumes, recorder, *queue, at_once);
     let rest = rest.map(|listener| {
         let (tokens, limits, metrics) = (tokens.clone(), *limits, Arc::clone(metrics));
-        let rest = Rest { inference: inference.clone(), tokens, limits, metrics };
+        let conversions = Arc::new(Semaphore::new(processors()));
+        let rest = Rest { inference: inference.clone(), tokens, limits, metrics, conversions };
         let tls = tls.as_ref().map(|tls| tls.http.clone());
         let config = HttpConfig { connections, tls, budget: Arc::clone(&budget) };
         tokio::spawn(crate::rest::serve(listener, rest, config, state.clone()))

@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use axum::body::Body;
 use axum::extract::{Path, Request, State};
-use axum::http::header::{CONTENT_TYPE, RETRY_AFTER};
+use axum::http::header::{CONTENT_TYPE, ORIGIN, RETRY_AFTER};
 use axum::http::request::Parts;
 use axum::http::{HeaderValue, StatusCode};
 use axum::middleware::{Next, from_fn_with_state};
@@ -19,7 +19,7 @@ use grasp_proto::oip;
 use grasp_proto::oip::grpc_inference_service_server::GrpcInferenceService;
 use serde_json::{Value, json};
 use tokio::net::TcpListener;
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 use tonic::metadata::MetadataMap;
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
@@ -31,7 +31,7 @@ use crate::transport::http_connections::{self, HttpConfig};
 use crate::transport::request_body::Limits;
 use crate::transport::response_buffer::keep_permit;
 use crate::transport::tokens::Tokens;
-use body::read;
+use body::{discard, read};
 use tensors::{HEADER_LENGTH, InferRequest, Parameters, response};
 
 /// State shared by the handlers.
@@ -42,6 +42,9 @@ pub(crate) struct Rest {
     pub tokens: Option<Arc<Tokens>>,
     pub limits: Limits,
     pub metrics: Arc<Metrics>,
+    /// One permit per CPU. A request holds one while its tensors are converted, because JSON needs much more memory than
+    /// its text.
+    pub conversions: Arc<Semaphore>,
 }
 
 /// Serves until the state is draining and all accepted requests are finished.
@@ -66,9 +69,9 @@ pub(crate) async fn serve(
             .route(&format!("{model}/infer"), post(infer));
     }
     let app = app
-        .layer(from_fn_with_state(rest.clone(), check_token))
+        .layer(from_fn_with_state(rest.clone(), check_access))
         // Probes have no token.
-        .route("/v2/health/live", get(StatusCode::OK))
+        .route("/v2/health/live", get(server_live))
         .route("/v2/health/ready", get(server_ready))
         .with_state(rest);
     http_connections::serve(listener, config, app, state).await;
@@ -112,13 +115,28 @@ fn http_status(code: Code) -> StatusCode {
     }
 }
 
-async fn check_token(State(rest): State<Rest>, mut request: Request, next: Next) -> Reply<Response> {
-    if let Some(tokens) = &rest.tokens {
-        let checked = tokens.check(&MetadataMap::from_headers(request.headers().clone()));
-        let caller = checked.inspect_err(|_| rest.metrics.ended("", Code::Unauthenticated))?;
-        request.extensions_mut().insert(caller);
+/// Refuses requests without a token, and those of web pages: any page could send them through the browser of someone who
+/// can reach this server.
+async fn check_access(State(rest): State<Rest>, mut request: Request, next: Next) -> Reply<Response> {
+    let headers = request.headers();
+    let checked = match &rest.tokens {
+        _ if headers.contains_key(ORIGIN) => Err(Status::permission_denied("requests of web pages are not accepted")),
+        Some(tokens) => tokens.check(&MetadataMap::from_headers(headers.clone())).map(Some),
+        None => Ok(None),
+    };
+    match checked {
+        Ok(caller) => {
+            if let Some(caller) = caller {
+                request.extensions_mut().insert(caller);
+            }
+            Ok(next.run(request).await)
+        }
+        Err(status) => {
+            rest.metrics.ended("", status.code());
+            discard(request.into_body(), rest.limits).await;
+            Err(status.into())
+        }
     }
-    Ok(next.run(request).await)
 }
 
 /// The gRPC request with a message, and the caller and the trace of an HTTP request.
@@ -132,6 +150,11 @@ struct Model {
     model: String,
     #[serde(default)]
     version: String,
+}
+
+async fn server_live(State(rest): State<Rest>) -> Reply<StatusCode> {
+    let live = rest.inference.server_live(tonic::Request::new(oip::ServerLiveRequest {})).await?;
+    Ok(ready_status(live.into_inner().live))
 }
 
 async fn server_ready(State(rest): State<Rest>) -> Reply<StatusCode> {
@@ -232,13 +255,12 @@ async fn infer(
 ) -> Reply<Response> {
     let (parts, body) = request.into_parts();
     let header_length = parts.headers.get(HEADER_LENGTH).cloned();
-    let bytes = read(body, &parts, rest.limits).await.inspect_err(|status| rest.metrics.ended("", status.code()))?;
-    // Megabytes of JSON would block the threads of the async runtime.
-    let parsed = blocking(move || InferRequest::parse(&bytes, header_length.as_ref())).await?;
+    let body = read(body, &parts, rest.limits).await.inspect_err(|status| rest.metrics.ended("", status.code()))?;
+    let parsed = rest.convert(move || InferRequest::parse(&body.bytes, header_length.as_ref())).await?;
     let parsed = parsed.inspect_err(|status| rest.metrics.ended("", status.code()))?;
     let (message, binary) = parsed.into_message(model, version);
     let (_, message, extensions) = rest.inference.model_infer(grpc(parts, message)).await?.into_parts();
-    let (content_type, header_length, bytes) = blocking(move || response(message, &binary)).await?;
+    let (content_type, header_length, bytes) = rest.convert(move || response(message, &binary)).await?;
     let mut response = http::Response::new(tonic::body::Body::new(Body::from(bytes)));
     *response.extensions_mut() = extensions;
     response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static(content_type));
@@ -248,9 +270,16 @@ async fn infer(
     Ok(keep_permit(response).map(Body::new))
 }
 
-async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, Status> {
-    let done = tokio::task::spawn_blocking(work).await;
-    done.map_err(|panic| Status::internal(format!("the conversion panicked: {panic}")))
+impl Rest {
+    /// Runs a conversion on a thread for blocking tasks: megabytes of JSON would block those of the async runtime.
+    async fn convert<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Status> {
+        let permit = Arc::clone(&self.conversions).acquire_owned().await;
+        let done = tokio::task::spawn_blocking(move || {
+            let _permit = permit;
+            work()
+        });
+        done.await.map_err(|panic| Status::internal(format!("the conversion panicked: {panic}")))
+    }
 }
 
 /// The body of a request to the model repository.
@@ -266,11 +295,11 @@ impl RepositoryRequest {
     /// Reads a body, which may be empty.
     async fn read(rest: &Rest, request: Request) -> Reply<(Parts, Self)> {
         let (parts, body) = request.into_parts();
-        let bytes = read(body, &parts, rest.limits).await?;
-        if bytes.is_empty() {
+        let body = read(body, &parts, rest.limits).await?;
+        if body.bytes.is_empty() {
             return Ok((parts, Self::default()));
         }
-        let request = serde_json::from_slice(&bytes);
+        let request = serde_json::from_slice(&body.bytes);
         let request = request.map_err(|error| Status::invalid_argument(format!("the body is not valid: {error}")))?;
         Ok((parts, request))
     }
@@ -297,9 +326,6 @@ async fn load(State(rest): State<Rest>, Path(Model { model, .. }): Path<Model>, 
 
 async fn unload(State(rest): State<Rest>, Path(Model { model, .. }): Path<Model>, request: Request) -> Reply {
     let (parts, RepositoryRequest { parameters, .. }) = RepositoryRequest::read(&rest, request).await?;
-    let mut parameters = parameters;
-    // No other model depends on an unloaded one.
-    parameters.take_flag("unload_dependents");
     let parameters = parameters.for_repository();
     let message = oip::RepositoryModelUnloadRequest { repository_name: String::new(), model_name: model, parameters };
     rest.inference.repository_model_unload(grpc(parts, message)).await?;

@@ -4,6 +4,7 @@ use grasp_client::{DetectOptions, Options};
 use grasp_proto::oip;
 use grasp_proto::oip::grpc_inference_service_client::GrpcInferenceServiceClient;
 use grasp_proto::oip::infer_parameter::ParameterChoice;
+use grasp_proto::oip::model_repository_parameter::ParameterChoice as ModelChoice;
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
 use nalgebra::Isometry3;
 use tonic::transport::Channel;
@@ -21,7 +22,10 @@ async fn load(client: &mut Inference, name: &str) -> Result<(), Status> {
 }
 
 async fn unload(client: &mut Inference, name: &str) -> Result<(), Status> {
-    let request = oip::RepositoryModelUnloadRequest { model_name: name.to_owned(), ..Default::default() };
+    // Triton's client sends this parameter always.
+    let dependents = oip::ModelRepositoryParameter { parameter_choice: Some(ModelChoice::BoolParam(false)) };
+    let parameters = [("unload_dependents".to_owned(), dependents)].into();
+    let request = oip::RepositoryModelUnloadRequest { model_name: name.to_owned(), parameters, ..Default::default() };
     client.repository_model_unload(request).await.map(|_| ())
 }
 
@@ -59,7 +63,16 @@ async fn models_are_loaded_and_unloaded_where_it_is_allowed() {
     std::fs::write(server.models().join("broken.onnx"), "text").unwrap();
     let error = load(&mut client, "broken").await.unwrap_err();
     assert_eq!(error.code(), Code::FailedPrecondition);
-    assert!(error.message().contains("`broken` is not served") && error.message().contains("broken.onnx"), "{error}");
+    assert!(
+        error.message().contains("`broken` cannot be served") && error.message().contains("broken.onnx"),
+        "{error}"
+    );
+    // The version that was loaded before is still served, and the client learns that the new file is not.
+    std::fs::write(server.models().join("b-2.onnx"), "text").unwrap();
+    let error = load(&mut client, "b").await.unwrap_err();
+    assert!(error.message().contains("`b` cannot be served") && error.message().contains("b-2.onnx"), "{error}");
+    assert!(index(&mut client, true).await.contains(&"b 2 READY".to_owned()));
+    std::fs::remove_file(server.models().join("b-2.onnx")).unwrap();
     assert_eq!(load(&mut client, "missing").await.unwrap_err().code(), Code::NotFound);
     assert_eq!(unload(&mut client, "missing").await.unwrap_err().code(), Code::NotFound);
     unload(&mut client, "a").await.unwrap();

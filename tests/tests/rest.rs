@@ -48,6 +48,22 @@ async fn bodies_that_stall_or_are_too_large_are_refused() {
 }
 
 #[tokio::test]
+async fn web_pages_and_compressed_bodies_are_refused() {
+    let server = Server::run(&[TestModel::new("mirror")], &["--rest", "127.0.0.1:0", "--allow-model-control"]);
+    for (header, status, reason) in [
+        ("Origin: http://attacker.example.com", 403, "requests of web pages are not accepted"),
+        ("Content-Encoding: gzip", 400, "the header Content-Encoding is"),
+    ] {
+        let mut stream = TcpStream::connect(server.rest().unwrap()).await.unwrap();
+        let path = "/v2/repository/models/mirror/unload";
+        let head = format!("POST {path} HTTP/1.1\r\nHost: graspd\r\nConnection: close\r\n{header}\r\n\r\n");
+        stream.write_all(head.as_bytes()).await.unwrap();
+        let (code, body) = response(stream).await;
+        assert!(code == status && body.contains(reason), "{code} {body}");
+    }
+}
+
+#[tokio::test]
 async fn incomplete_bodies_share_the_memory_of_incomplete_messages() {
     let flags = ["--rest", "127.0.0.1:0", "--max-message-bytes", "1000000", "--max-receiving-bytes", "2000000"];
     let server = Server::run(&[TestModel::new("mirror")], &flags);

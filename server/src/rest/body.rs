@@ -5,27 +5,42 @@ use std::pin::Pin;
 use std::time::{Duration, Instant};
 
 use axum::body::{Body, Bytes};
-use axum::http::header::CONTENT_LENGTH;
+use axum::http::header::{CONTENT_ENCODING, CONTENT_LENGTH};
 use axum::http::request::Parts;
 use http_body::{Body as _, Frame};
 use tokio::time::timeout;
 use tonic::{Code, Status};
 
 use crate::transport::connections::Peer;
+use crate::transport::receive_budget::Received;
 use crate::transport::request_body::Limits;
+
+/// The body of a request. It counts as a message that is being received until it is dropped.
+pub(super) struct Message {
+    pub bytes: Bytes,
+    _received: Received,
+}
 
 /// Reads the body of a request. Refuses it if it is too large, stalls, arrives too slowly, or exceeds the memory for
 /// messages that are being received.
-pub(super) async fn read(mut body: Body, parts: &Parts, limits: Limits) -> Result<Bytes, Status> {
-    let bytes = receive(&mut body, parts, limits).await;
-    if bytes.as_ref().is_err_and(|status| status.code() != Code::DeadlineExceeded) {
-        // A client that is still sending would not read the response, and see only a broken connection.
-        let _ = timeout(limits.stall, async { while let Some(Ok(_)) = next(&mut body).await {} }).await;
+pub(super) async fn read(mut body: Body, parts: &Parts, limits: Limits) -> Result<Message, Status> {
+    let message = receive(&mut body, parts, limits).await;
+    if message.as_ref().is_err_and(|status| status.code() != Code::DeadlineExceeded) {
+        discard(body, limits).await;
     }
-    bytes
+    message
 }
 
-async fn receive(body: &mut Body, parts: &Parts, limits: Limits) -> Result<Bytes, Status> {
+/// Reads the rest of a body whose request is refused: a client that is still sending would not read the response, and see
+/// only a broken connection.
+pub(super) async fn discard(mut body: Body, limits: Limits) {
+    let _ = timeout(limits.stall, async { while let Some(Ok(_)) = next(&mut body).await {} }).await;
+}
+
+async fn receive(body: &mut Body, parts: &Parts, limits: Limits) -> Result<Message, Status> {
+    if let Some(encoding) = parts.headers.get(CONTENT_ENCODING) {
+        return Err(Status::invalid_argument(format!("the header Content-Encoding is {encoding:?}, must be absent")));
+    }
     let announced = parts.headers.get(CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse::<usize>().ok());
     if let Some(bytes) = announced.filter(|bytes| *bytes > limits.message_bytes) {
         return Err(limits.too_large(bytes));
@@ -38,7 +53,7 @@ async fn receive(body: &mut Body, parts: &Parts, limits: Limits) -> Result<Bytes
         let longest = limits.longest(announced.unwrap_or(limits.message_bytes));
         let pause = limits.stall.min(longest.saturating_sub(started.elapsed()));
         let frame = timeout(pause, next(body)).await.map_err(|_| stalled(pause, limits.stall))?;
-        let Some(frame) = frame else { return Ok(bytes.into()) };
+        let Some(frame) = frame else { return Ok(Message { bytes: bytes.into(), _received: received }) };
         let frame = frame.map_err(|error| Status::cancelled(format!("the body ended early: {error}")))?;
         let Some(data) = frame.data_ref() else { continue };
         if bytes.len() + data.len() > limits.message_bytes {

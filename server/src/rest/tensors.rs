@@ -291,7 +291,7 @@ enum Parameter {
 }
 
 impl Parameters {
-    pub fn take_flag(&mut self, name: &str) -> Option<bool> {
+    fn take_flag(&mut self, name: &str) -> Option<bool> {
         match self.0.get(name) {
             Some(&Parameter::Flag(flag)) => {
                 self.0.remove(name);

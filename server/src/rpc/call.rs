@@ -31,7 +31,7 @@ use crate::transport::request_body::unreadable_message;
 const MAX_ID: usize = 256;
 
 /// Retry hint while the models are loaded and warmed up.
-const WARM_UP: Duration = Duration::from_secs(1);
+pub(super) const WARM_UP: Duration = Duration::from_secs(1);
 
 /// Creates the [`Call`] of each request.
 #[derive(Clone)]

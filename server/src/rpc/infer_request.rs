@@ -57,6 +57,11 @@ pub(super) fn batches(request: &oip::ModelInferRequest, n: usize, max_batch: usi
             let needed = format_args!("must be {} bytes for this shape", 4 * expected);
             return Err(FieldError::new("raw_input_contents[0]", format_args!("{} bytes", raw.len()), needed));
         }
+        ([], Some(contents)) if contents.fp32_contents.len() != expected => {
+            let value = format_args!("{} values", contents.fp32_contents.len());
+            let needed = format_args!("must be {expected} values for this shape");
+            return Err(FieldError::new("inputs[0]", value, needed));
+        }
         ([], Some(contents)) => contents.fp32_contents.clone(),
         (raw, contents) => {
             let given = usize::from(contents.is_some());

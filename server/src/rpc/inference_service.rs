@@ -16,7 +16,7 @@ use tokio::task::spawn_blocking;
 use tonic::{Request, Response, Status};
 
 use crate::readiness::State;
-use crate::rpc::call::{Call, CallContext, Calls};
+use crate::rpc::call::{Call, CallContext, Calls, WARM_UP};
 use crate::rpc::infer_request::{FP32, batches, check_parameters};
 use crate::rpc::refusal::Refusal;
 use crate::serving::control::{Change, ModelControl};
@@ -77,6 +77,9 @@ impl InferenceRpc {
         name: String,
         change: Change,
     ) -> Result<(), Refusal> {
+        if *self.calls.state().borrow() == State::Starting {
+            return Err(Refusal::Starting(WARM_UP));
+        }
         one_repository(repository)?;
         if let Some(parameter) = parameters.keys().min() {
             let value = format_args!("`{}`", on_a_line(parameter));
@@ -210,7 +213,8 @@ impl GrpcInferenceService for InferenceRpc {
         &self,
         _: Request<oip::ServerLiveRequest>,
     ) -> Result<Response<oip::ServerLiveResponse>, Status> {
-        Ok(Response::new(oip::ServerLiveResponse { live: true }))
+        let live = *self.calls.state().borrow() != State::Hanging;
+        Ok(Response::new(oip::ServerLiveResponse { live }))
     }
 
     async fn server_ready(
@@ -371,7 +375,9 @@ impl GrpcInferenceService for InferenceRpc {
         &self,
         request: Request<oip::RepositoryModelUnloadRequest>,
     ) -> Result<Response<oip::RepositoryModelUnloadResponse>, Status> {
-        let oip::RepositoryModelUnloadRequest { repository_name, model_name, parameters } = request.into_inner();
+        let oip::RepositoryModelUnloadRequest { repository_name, model_name, mut parameters } = request.into_inner();
+        // Triton's client always sends it. No other model depends on an unloaded one.
+        parameters.remove("unload_dependents");
         let changed = self.change(&repository_name, &parameters, model_name, Change::Unload).await;
         changed.map_err(|refusal| refusal.status(""))?;
         Ok(Response::new(oip::RepositoryModelUnloadResponse {}))

@@ -1,7 +1,6 @@
 //! Requests of clients to load and unload models.
 
-use std::time::Duration;
-
+use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 
 use crate::rpc::refusal::Refusal;
@@ -31,9 +30,6 @@ pub(super) struct Command {
 /// Requests that wait for the one before them.
 const WAITING: usize = 8;
 
-/// Retry hint if too many requests wait: a reload takes seconds.
-const RETRY_AFTER: Duration = Duration::from_secs(1);
-
 impl ModelControl {
     pub(super) fn new(is_allowed: bool) -> (Self, mpsc::Receiver<Command>) {
         let (commands, receiver) = mpsc::channel(WAITING);
@@ -46,8 +42,12 @@ impl ModelControl {
             return Err(Refusal::NoModelControl);
         }
         let (done, outcome) = oneshot::channel();
-        let sent = self.commands.try_send(Command { name, change, done });
-        sent.map_err(|_| Refusal::Starting(RETRY_AFTER))?;
+        self.commands.try_send(Command { name, change, done }).map_err(|error| match error {
+            TrySendError::Full(_) => {
+                Refusal::NotChanged(format!("{WAITING} requests to load or unload models already wait; retry later"))
+            }
+            TrySendError::Closed(_) => Refusal::Draining,
+        })?;
         // The folder's task ends only with the server.
         outcome.await.unwrap_or(Err(Refusal::Draining))
     }

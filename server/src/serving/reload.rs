@@ -43,6 +43,8 @@ pub(crate) struct ModelFolder {
     timeout: Duration,
     /// Number of the latest reload. Earlier ones that are still running change nothing.
     latest: AtomicU64,
+    /// Number of the latest reload that has read the whole folder.
+    completed: AtomicU64,
     /// Names of the models that clients have unloaded.
     unloaded: Mutex<BTreeSet<String>>,
     commands: Option<mpsc::Receiver<Command>>,
@@ -73,6 +75,7 @@ impl ModelFolder {
             max_bytes: config.max_model_bytes,
             timeout: config.reload_timeout,
             latest: AtomicU64::new(0),
+            completed: AtomicU64::new(0),
             unloaded: Mutex::default(),
             commands: Some(commands),
             serving,
@@ -142,10 +145,18 @@ impl ModelFolder {
             let poll = tokio::task::spawn_blocking(move || {
                 let _ = sender.send(stamps(&polled.directory));
             });
-            hanging.extend(folder.finish("polling the model folder", poll).await);
-            let Ok(now) = receiver.await else { continue };
+            let is_hanging = folder.finish("polling the model folder", poll).await;
+            let now = if is_hanging.is_none() { receiver.await.ok() } else { None };
+            hanging.extend(is_hanging);
+            let Some(now) = now else {
+                if let Some(Some(command)) = begun {
+                    folder.end(command, None);
+                }
+                continue;
+            };
+            let mut number = 0;
             if is_requested || (now != loaded && now == last) {
-                let number = folder.latest.fetch_add(1, Ordering::Relaxed) + 1;
+                number = folder.latest.fetch_add(1, Ordering::Relaxed) + 1;
                 let reloading = Arc::clone(&folder);
                 let reload = tokio::task::spawn_blocking(move || reloading.reload(number));
                 hanging.extend(folder.finish("reloading the models", reload).await);
@@ -153,7 +164,7 @@ impl ModelFolder {
             }
             last = now;
             if let Some(Some(command)) = begun {
-                folder.end(command);
+                folder.end(command, Some(number));
             }
         }
     }
@@ -182,13 +193,25 @@ impl ModelFolder {
         None
     }
 
-    /// Answers a command after the reload.
-    fn end(&self, Command { name, change, done }: Command) {
+    /// Answers a command after the reload with this number; None if there was none.
+    fn end(&self, Command { name, change, done }: Command, number: Option<u64>) {
+        if number != Some(self.completed.load(Ordering::Relaxed)) {
+            if matches!(change, Change::Unload) {
+                self.unloaded().remove(&name);
+            }
+            let reason = "the reload of the model folder failed, or takes longer than --reload-timeout; see the log";
+            let _ = done.send(Err(Refusal::NotChanged(reason.to_owned())));
+            return;
+        }
         let is_served = self.models.now().iter().any(|engine| engine.source.name() == name);
         let outcome = match change {
-            Change::Load if is_served => Ok(()),
+            // An older version may be served, because the new file was rejected.
+            Change::Load if is_served && self.models.unavailable().iter().all(|model| model.name != name) => Ok(()),
             Change::Load => Err(self.not_served(&name)),
-            Change::Unload if is_served => Err(Refusal::NotChanged(format!("`{name}` is still served; see the log"))),
+            Change::Unload if is_served => {
+                self.unloaded().remove(&name);
+                Err(Refusal::NotChanged(format!("`{name}` is still served; see the log")))
+            }
             Change::Unload => Ok(()),
         };
         let _ = done.send(outcome);
@@ -198,7 +221,7 @@ impl ModelFolder {
     fn not_served(&self, name: &str) -> Refusal {
         let unavailable = self.models.unavailable();
         match unavailable.iter().find(|model| model.name == name) {
-            Some(Unavailable { reason, .. }) => Refusal::NotChanged(format!("`{name}` is not served: {reason}")),
+            Some(Unavailable { reason, .. }) => Refusal::NotChanged(format!("`{name}` cannot be served: {reason}")),
             None => Refusal::UnknownModel {
                 field: "model_name",
                 requested: on_a_line(name),
@@ -248,14 +271,16 @@ impl ModelFolder {
         let mut unavailable: Vec<_> =
             unloaded.iter().map(|name| Unavailable { name: name.clone(), reason: reason.to_owned() }).collect();
         let mut rejected: Vec<PathBuf> = Vec::new();
-        let mut reject = |path: &Path, error: String| {
+        let mut reject = |path: &Path, name: Option<&str>, error: String| {
             error!(error, "cannot load a model file; a model that was loaded from it before remains served");
-            let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-            unavailable.push(Unavailable { name, reason: error });
+            let before = served.iter().find(|engine| engine.source.path() == Some(path));
+            let name = name.or_else(|| before.map(|engine| engine.source.name())).map(str::to_owned);
+            let file = || path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            unavailable.push(Unavailable { name: name.unwrap_or_else(file), reason: error });
             rejected.push(path.to_owned());
         };
         for error in files.rejected {
-            reject(error.path(), error.to_string());
+            reject(error.path(), None, error.to_string());
         }
         let mut engines = Vec::new();
         for source in files.sources {
@@ -266,10 +291,10 @@ impl ModelFolder {
                 engines.push(Arc::clone(engine));
                 continue;
             }
-            let path = source.path().map(Path::to_owned);
+            let (path, name) = (source.path().map(Path::to_owned), source.name().to_owned());
             match self.start(source) {
                 Ok(engine) => engines.push(engine),
-                Err(error) => reject(path.as_deref().unwrap_or(&self.directory), format!("{error:#}")),
+                Err(error) => reject(path.as_deref().unwrap_or(&self.directory), Some(&name), format!("{error:#}")),
             }
         }
         if number != self.latest.load(Ordering::Relaxed) {
@@ -290,6 +315,7 @@ impl ModelFolder {
             self.replace(engines);
         }
         self.models.set_unavailable(unavailable);
+        self.completed.store(number, Ordering::Relaxed);
         // Last, so that the new models are served before the metric changes.
         self.metrics.reloaded(Ok(rejected.len()));
     }

@@ -105,7 +105,7 @@ impl Session {
             }
             self.batch.observe(jobs.len() as f64);
             let Self { planner, defaults, queue, running, service_time, .. } = &mut self;
-            running.begin(&jobs);
+            let _running = running.begin(&jobs);
             let scenes = u32::try_from(jobs.len()).unwrap_or(u32::MAX);
             let done = |inference: Duration| {
                 queue.free();
@@ -119,7 +119,6 @@ impl Session {
                     }
                 }
             }
-            running.end();
         }
     }
 }
@@ -223,8 +222,11 @@ fn send_result<T: Send + 'static>(
     });
     drop(span);
     let BatchTimes { taken, inference, scenes, service_time } = times;
-    // The time per scene, including decoding. Set before the reply, so that the next refusal already has it.
-    service_time.add(taken.elapsed() / scenes);
+    // The time per scene, including decoding. Set before the reply, so that the next refusal already has it. The time of
+    // a request that was cancelled, or failed because its inference hung, says nothing about the next one.
+    if !reply.is_closed() {
+        service_time.add(taken.elapsed() / scenes);
+    }
     let (queue, postprocessing) = (taken.duration_since(submitted), started.elapsed());
     reply.send(result.map(|value| SessionOutput { value, queue, inference, postprocessing }));
 }

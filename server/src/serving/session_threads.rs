@@ -44,17 +44,28 @@ struct Batch {
     is_hanging: bool,
 }
 
+/// Ends a batch when it is dropped, also if the session panics.
+struct Ended<'a>(&'a Running);
+
+impl Drop for Ended<'_> {
+    fn drop(&mut self) {
+        self.0.end();
+    }
+}
+
 impl Running {
     pub fn new(hanging: IntGauge) -> Self {
         Self { batch: Mutex::default(), latest: AtomicU64::new(0), hanging }
     }
 
-    pub fn begin(&self, jobs: &[Job]) {
+    /// The batch runs until the returned value is dropped.
+    pub fn begin(&self, jobs: &[Job]) -> impl Drop + use<'_> {
         let requests = jobs.iter().map(|job| job.task.reply()).collect();
         *self.batch() = Some(Batch { since: Instant::now(), requests, is_hanging: false });
+        Ended(self)
     }
 
-    pub fn end(&self) {
+    fn end(&self) {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         self.latest.store(u64::try_from(now.as_millis()).unwrap_or(u64::MAX), Ordering::Relaxed);
         if self.batch().take().is_some_and(|batch| batch.is_hanging) {

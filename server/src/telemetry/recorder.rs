@@ -7,7 +7,7 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::thread;
+use std::thread::{self, JoinHandle};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::Context;
@@ -15,6 +15,7 @@ use grasp_proto::pb;
 use grasp_proto::pb::recording::{Answer, Request};
 use prometheus::IntCounterVec;
 use prost::Message;
+use tonic::Code;
 use tracing::warn;
 
 use crate::rpc::refusal::Refusal;
@@ -48,7 +49,9 @@ impl Recorder {
 
     /// Records into a folder, and deletes the oldest recordings so that all together have at most `capacity` bytes.
     /// `outcomes` counts them by outcome.
-    pub fn start(folder: &Path, capacity: u64, outcomes: IntCounterVec) -> anyhow::Result<Self> {
+    ///
+    /// The thread ends when the recorder is dropped and all waiting recordings are written.
+    pub fn start(folder: &Path, capacity: u64, outcomes: IntCounterVec) -> anyhow::Result<(Self, JoinHandle<()>)> {
         for outcome in ["written", "dropped", "failed"] {
             outcomes.with_label_values(&[outcome]);
         }
@@ -56,8 +59,9 @@ impl Recorder {
             Files::open(folder, capacity).with_context(|| format!("cannot record into {}", folder.display()))?;
         let (recordings, receiver) = sync_channel(WAITING);
         let counted = outcomes.clone();
-        thread::Builder::new().name("record".to_owned()).spawn(move || write(files, &receiver, &counted))?;
-        Ok(Self(Some(Arc::new(Writer { recordings, outcomes }))))
+        let thread = thread::Builder::new().name("record".to_owned());
+        let thread = thread.spawn(move || write(files, &receiver, &counted))?;
+        Ok((Self(Some(Arc::new(Writer { recordings, outcomes }))), thread))
     }
 
     /// A request, which is copied only if it will be recorded. The copy shares the data of images and volumes.
@@ -78,6 +82,13 @@ impl Pending {
     /// Records the request with its answer.
     pub fn answered<T>(self, outcome: &Result<T, Refusal>, answer: impl FnOnce(&T) -> Answer) {
         let Self(Some((writer, mut recording))) = self else { return };
+        // They say nothing about the request, and would displace those that do.
+        let is_overload = |refusal: &Refusal| {
+            matches!(refusal.code(), Code::ResourceExhausted | Code::Unavailable | Code::DeadlineExceeded)
+        };
+        if outcome.as_ref().is_err_and(is_overload) {
+            return;
+        }
         recording.answer = Some(match outcome {
             Ok(response) => answer(response),
             Err(refusal) => Answer::Error(refusal.into()),
@@ -139,8 +150,10 @@ impl Files {
         let partial = path.with_extension(PARTIAL);
         // The scenes of a robot are not for every user of the machine.
         let mut file = fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(&partial)?;
-        file.write_all(&bytes)?;
-        fs::rename(&partial, &path)?;
+        if let Err(error) = file.write_all(&bytes).and_then(|()| fs::rename(&partial, &path)) {
+            let _ = fs::remove_file(&partial);
+            return Err(error);
+        }
         let size = bytes.len() as u64;
         self.known.push_back((path, size));
         self.bytes += size;
@@ -149,14 +162,15 @@ impl Files {
 
     fn remove_oldest(&mut self) -> io::Result<()> {
         while self.bytes > self.capacity
-            && let Some((oldest, bytes)) = self.known.pop_front()
+            && let Some((oldest, bytes)) = self.known.front()
         {
-            self.bytes -= bytes;
-            match fs::remove_file(&oldest) {
+            match fs::remove_file(oldest) {
                 // Someone else has removed it.
                 Err(error) if error.kind() == io::ErrorKind::NotFound => {}
                 removed => removed?,
             }
+            self.bytes -= bytes;
+            self.known.pop_front();
         }
         Ok(())
     }

@@ -1,6 +1,7 @@
 //! `grasp replay`: sends recorded requests again and compares the answers.
 
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -16,6 +17,9 @@ use crate::show;
 
 /// Extension of the files of recordings.
 const EXTENSION: &str = "recording";
+
+/// Codes that say nothing about a request.
+const OVERLOAD: [Code; 4] = [Code::ResourceExhausted, Code::Unavailable, Code::DeadlineExceeded, Code::Cancelled];
 
 #[derive(Args)]
 pub(crate) struct Replay {
@@ -44,8 +48,10 @@ enum Outcome {
     Same,
     /// With what has changed.
     Changed(String),
-    /// The recorded answer says nothing about the request: the server was overloaded, or the caller's time was over.
+    /// The recorded answer says nothing about the request, or the server has deleted the recording.
     Skipped,
+    /// The server is overloaded or not ready.
+    Unanswered(String),
 }
 
 /// Seconds of the inference, recorded and now.
@@ -55,7 +61,7 @@ impl Replay {
     /// Returns whether no answer has changed.
     pub async fn run(&self, client: &Client, as_json: bool) -> anyhow::Result<bool> {
         let files = files(&self.recordings)?;
-        let (mut same, mut skipped, mut changes) = (0, 0, Vec::new());
+        let (mut same, mut skipped, mut unanswered, mut changes) = (0, 0, 0, Vec::new());
         let (mut before, mut now) = (Vec::new(), Vec::new());
         for file in &files {
             let (outcome, inference) = self.repeat(client, file).await.with_context(|| file.display().to_string())?;
@@ -66,6 +72,10 @@ impl Replay {
             match outcome {
                 Outcome::Same => same += 1,
                 Outcome::Skipped => skipped += 1,
+                Outcome::Unanswered(reason) => {
+                    unanswered += 1;
+                    eprintln!("grasp: {}: {reason}", file.display());
+                }
                 Outcome::Changed(what) => {
                     let name = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
                     if !as_json && !show::print(&format!("{name}: {what}"))? {
@@ -84,6 +94,7 @@ impl Replay {
                 "same": same,
                 "changed": changed,
                 "skipped": skipped,
+                "unanswered": unanswered,
                 "inference_seconds": seconds,
                 "changes": Value::Array(changes),
             });
@@ -92,20 +103,25 @@ impl Replay {
             let inference = inference.map_or_else(String::new, |(before, now)| {
                 format!("; median inference {:.1} ms, now {:.1} ms", 1e3 * before, 1e3 * now)
             });
-            format!("{recordings} recordings: {same} same, {changed} changed, {skipped} skipped{inference}")
+            let unanswered = if unanswered > 0 { format!(", {unanswered} not answered") } else { String::new() };
+            format!("{recordings} recordings: {same} same, {changed} changed, {skipped} skipped{unanswered}{inference}")
         })?;
-        Ok(changed == 0)
+        Ok(changed == 0 && unanswered == 0)
     }
 
     /// Sends the request of a file again.
     async fn repeat(&self, client: &Client, file: &Path) -> anyhow::Result<(Outcome, Inference)> {
-        let recording = Recording::decode(&*fs::read(file)?).context("it is not a recording")?;
+        let bytes = match fs::read(file) {
+            // A server that records deletes the oldest.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((Outcome::Skipped, None)),
+            bytes => bytes?,
+        };
+        let recording = Recording::decode(&*bytes).context("it is not a recording")?;
         let (Some(request), Some(answer)) = (recording.request, recording.answer) else {
             bail!("it has no request or no answer; it was recorded by a newer graspd");
         };
         if let Answer::Error(error) = &answer
-            && [Code::ResourceExhausted, Code::Unavailable, Code::DeadlineExceeded, Code::Cancelled]
-                .contains(&Code::from_i32(error.code))
+            && OVERLOAD.contains(&Code::from_i32(error.code))
         {
             return Ok((Outcome::Skipped, None));
         }
@@ -113,6 +129,9 @@ impl Replay {
             Ok(repeated) => Ok(repeated),
             // The server cannot be asked at all.
             Err(error @ Error::Connect { .. }) => return Err(error.into()),
+            Err(error) if error.code().is_some_and(|code| OVERLOAD.contains(&code)) => {
+                return Ok((Outcome::Unanswered(error.to_string()), None));
+            }
             Err(error) => Err(error),
         };
         Ok(match (answer, repeated) {
