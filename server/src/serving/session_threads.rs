@@ -116,7 +116,7 @@ impl SessionThreads {
         Ok(())
     }
 
-    /// Checks for inferences that take longer than `timeout`, for ever. `is_able` is told whether each served model has
+    /// Looks for inferences that take longer than `timeout`, without end. `is_able` receives whether each served model has
     /// a session that does not hang.
     pub async fn watch(self: Arc<Self>, models: Arc<ModelRegistry>, timeout: Duration, is_able: watch::Sender<bool>) {
         let pause = (timeout / 10).clamp(Duration::from_millis(10), Duration::from_secs(1));

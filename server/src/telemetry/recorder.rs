@@ -144,8 +144,8 @@ impl Files {
 
     fn write(&mut self, recording: &pb::Recording) -> io::Result<()> {
         let bytes = recording.encode_to_vec();
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_millis();
-        let path = self.folder.join(format!("{now:013}-{:06}.{EXTENSION}", self.next));
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos();
+        let path = self.folder.join(format!("{now:019}-{:06}.{EXTENSION}", self.next));
         self.next += 1;
         let partial = path.with_extension(PARTIAL);
         // The scenes of a robot are not for every user of the machine.
