@@ -43,9 +43,9 @@ struct Mean {
 /// Number of values that the mean of the service time remembers.
 const MEMORY: f64 = 8.0;
 
-/// The times of a batch.
-#[derive(Clone, Copy)]
-struct BatchTimes<'a> {
+/// A batch that a session computes. The session counts as busy in its queue until it sends its first result, so that a
+/// client that has received one finds a slot for its next request.
+struct Batch<'a> {
     /// When the session took it from the queue.
     taken: Instant,
     /// How long its inference took.
@@ -53,6 +53,22 @@ struct BatchTimes<'a> {
     /// Its number of scenes.
     scenes: u32,
     service_time: &'a ServiceTime,
+    /// None when the session counts as idle again.
+    queue: Option<&'a Queue<Job>>,
+}
+
+impl Batch<'_> {
+    fn free(&mut self) {
+        if let Some(queue) = self.queue.take() {
+            queue.free();
+        }
+    }
+}
+
+impl Drop for Batch<'_> {
+    fn drop(&mut self) {
+        self.free();
+    }
 }
 
 impl ServiceTime {
@@ -107,15 +123,12 @@ impl Session {
             let Self { planner, defaults, queue, running, service_time, .. } = &mut self;
             let _running = running.begin(&jobs);
             let scenes = u32::try_from(jobs.len()).unwrap_or(u32::MAX);
-            let done = |inference: Duration| {
-                queue.free();
-                BatchTimes { taken: now, inference, scenes, service_time }
-            };
+            let batch = Batch { taken: now, inference: Duration::ZERO, scenes, service_time, queue: Some(queue) };
             match planner {
-                Loaded::Network(network) => infer(network, *defaults, jobs, done),
+                Loaded::Network(network) => infer(network, *defaults, jobs, batch),
                 Loaded::Single(planner) => {
                     if let Some(job) = jobs.pop() {
-                        plan(planner.as_mut(), *defaults, job, done);
+                        plan(planner.as_mut(), *defaults, job, batch);
                     }
                 }
             }
@@ -123,20 +136,16 @@ impl Session {
     }
 }
 
-/// Runs the network on a batch, then decodes or returns each output. `done` is called after the inference.
-fn infer<'a>(
-    network: &mut NetworkPlanner,
-    defaults: DecodeParams,
-    jobs: Vec<Job>,
-    done: impl FnOnce(Duration) -> BatchTimes<'a>,
-) {
+/// Runs the network on a batch, then decodes or returns each output.
+fn infer(network: &mut NetworkPlanner, defaults: DecodeParams, jobs: Vec<Job>, mut batch: Batch<'_>) {
     let started = Instant::now();
     let volumes: Vec<&Volume> = jobs.iter().map(|job| &job.scene.volume).collect();
     let mut output = caught(|| Ok(network.infer(&volumes)?));
-    let times = done(started.elapsed());
+    batch.inference = started.elapsed();
     for (index, Job { scene, task, deadline, span, submitted }) in jobs.into_iter().enumerate() {
         if task.is_closed() || deadline.is_some_and(Deadline::has_passed) {
             // Skips the decoding, so that the other jobs of the batch finish earlier.
+            batch.free();
             task.fail(EngineError::Expired);
             continue;
         }
@@ -145,6 +154,7 @@ fn infer<'a>(
             Err(error) => {
                 span.in_scope(|| error!(%error, "the session failed"));
                 drop(span);
+                batch.free();
                 task.fail(error.clone());
                 continue;
             }
@@ -159,27 +169,24 @@ fn infer<'a>(
                     })
                 });
                 let detection = || Ok(Detection::of(decoded?, scene.volume, &params));
-                send_result(reply, span, submitted, times, started, detection);
+                send_result(reply, span, submitted, &mut batch, started, detection);
             }
             Task::Scores(params, candidates, reply) => {
                 let decode = params.decode_params(defaults);
                 let poses: Vec<_> = candidates.iter().map(|candidate| candidate.pose).collect();
                 let qualities = span.in_scope(|| caught(|| Ok(output.score(index, &scene.volume, &poses, &decode)?)));
                 let scores = || Ok(Score::of(&candidates, qualities?, &scene.volume, &params, decode.threshold));
-                send_result(reply, span, submitted, times, started, scores);
+                send_result(reply, span, submitted, &mut batch, started, scores);
             }
-            Task::Maps(reply) => send_result(reply, span, submitted, times, started, || Ok(tensors(output, index))),
+            Task::Maps(reply) => {
+                send_result(reply, span, submitted, &mut batch, started, || Ok(tensors(output, index)))
+            }
         }
     }
 }
 
-/// Runs a planner without a network on a scene. `done` is called after the planning.
-fn plan<'a>(
-    planner: &mut dyn Planner,
-    defaults: DecodeParams,
-    job: Job,
-    done: impl FnOnce(Duration) -> BatchTimes<'a>,
-) {
+/// Runs a planner without a network on a scene.
+fn plan(planner: &mut dyn Planner, defaults: DecodeParams, job: Job, mut batch: Batch<'_>) {
     let Job { scene, task, deadline, span, submitted } = job;
     match task {
         Task::Grasps(params, reply) => {
@@ -191,12 +198,12 @@ fn plan<'a>(
                     Ok(planner.plan(&scene, &params, &keep_going)?)
                 })
             });
-            let times = done(started.elapsed());
+            batch.inference = started.elapsed();
             let detection = || Ok(Detection::of(decoded?, scene.volume, &params));
-            send_result(reply, span, submitted, times, Instant::now(), detection);
+            send_result(reply, span, submitted, &mut batch, Instant::now(), detection);
         }
         Task::Maps(_) | Task::Scores(..) => {
-            done(Duration::ZERO);
+            batch.free();
             task.fail(EngineError::NoNetwork);
         }
     }
@@ -208,7 +215,7 @@ fn send_result<T: Send + 'static>(
     reply: Sender<T>,
     span: Span,
     submitted: Instant,
-    times: BatchTimes<'_>,
+    batch: &mut Batch<'_>,
     started: Instant,
     postprocess: impl FnOnce() -> Result<T, EngineError>,
 ) {
@@ -221,13 +228,14 @@ fn send_result<T: Send + 'static>(
         })
     });
     drop(span);
-    let BatchTimes { taken, inference, scenes, service_time } = times;
+    let Batch { taken, inference, scenes, service_time, .. } = *batch;
     // The time per scene, including decoding. Set before the reply, so that the next refusal already has it. The time of
     // a request that was cancelled, or failed because its inference hung, says nothing about the next one.
     if !reply.is_closed() {
         service_time.add(taken.elapsed() / scenes);
     }
     let (queue, postprocessing) = (taken.duration_since(submitted), started.elapsed());
+    batch.free();
     reply.send(result.map(|value| SessionOutput { value, queue, inference, postprocessing }));
 }
 
