@@ -293,6 +293,10 @@ async fn batch_requests_wait_for_normal_ones() {
     let refused: Vec<_> = outcomes.iter().filter_map(|outcome| outcome.as_ref().err()).collect();
     assert_eq!(refused.len(), 1, "the normal request took the place of one: {refused:?}");
     assert!(refused[0].to_string().contains("has taken this one's place"), "{refused:?}");
+    for (priority, count) in [("NORMAL", 1.0), ("BATCH", 9.0)] {
+        let queued = format!("graspd_queued_total{{model=\"slow 1\",priority=\"{priority}\"}}");
+        assert_eq!(server.metric(&queued), count, "{priority}");
+    }
 }
 
 #[tokio::test]

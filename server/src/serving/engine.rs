@@ -6,6 +6,7 @@ use grasp::Volume;
 use grasp_models::{Backend, Options};
 use grasp_planner::{Loaded, Scene, Source};
 use grasp_proto::{Candidate, FieldError};
+use prometheus::IntCounter;
 use thiserror::Error;
 use tracing::{Span, info};
 
@@ -32,6 +33,8 @@ pub(crate) struct Engine {
     service_time: Arc<ServiceTime>,
     retries: Retries,
     refused: RefusalCounters,
+    /// Accepted scenes by priority.
+    queued: [IntCounter; 2],
 }
 
 /// Settings that all engines share.
@@ -73,14 +76,14 @@ impl Engine {
                     .with_context(|| format!("the warm-up inference of the model {label} failed"))?;
             }
         }
-        let QueueMetrics { waiting, batch, refused, hanging } = metrics.queue(&label);
+        let QueueMetrics { waiting, batch, refused, queued, hanging } = metrics.queue(&label);
         let queue = Arc::new(Queue::new(workers, capacity, waiting));
         // Created before the threads, so that an early return drops it, which closes the queue and ends started
         // threads.
         let service_time = Arc::new(ServiceTime::new(service_time));
         let retries = Retries::default();
         let running: Vec<_> = planners.iter().map(|_| Arc::new(Running::new(hanging.clone()))).collect();
-        let engine = Self { source, label, backend, workers, queue, running, service_time, retries, refused };
+        let engine = Self { source, label, backend, workers, queue, running, service_time, retries, refused, queued };
         for (worker, planner) in planners.into_iter().enumerate() {
             let (queue, service_time) = (Arc::clone(&engine.queue), Arc::clone(&engine.service_time));
             let defaults = engine.source.decode_params();
@@ -185,6 +188,7 @@ impl Engine {
         // The queue is open: only dropping the engine closes it.
         match self.queue.push(job, ticket, self.service_time.get()) {
             Ok((slot, displaced)) => {
+                self.queued[ticket.priority as usize].inc();
                 if let Some(job) = displaced {
                     job.task.fail(self.displaced().into());
                 }

@@ -3,6 +3,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use grasp_proto::Priority;
 use grasp_proto::pb::geometry_warning::Code as WarningCode;
 use prometheus::core::Collector;
 #[cfg(target_os = "linux")]
@@ -39,6 +40,7 @@ pub(crate) struct Metrics {
     grasps: IntCounterVec,
     warnings: IntCounterVec,
     refused: IntCounterVec,
+    queued: IntCounterVec,
     waiting: IntGaugeVec,
     batches: HistogramVec,
     models: IntGaugeVec,
@@ -72,6 +74,8 @@ pub(crate) struct QueueMetrics {
     /// Volumes per batch.
     pub batch: Histogram,
     pub refused: RefusalCounters,
+    /// Accepted scenes, by [`Priority`].
+    pub queued: [IntCounter; 2],
     /// Sessions whose inference does not end.
     pub hanging: IntGauge,
 }
@@ -127,6 +131,11 @@ impl Metrics {
                 "Requests refused by a queue: it was full, the reply would have been too late, or another caller's \
                  request displaced it.",
                 &["model", "reason"],
+            ),
+            queued: counters(
+                "graspd_queued_total",
+                "Scenes that a queue has accepted, by the priority of the request.",
+                &["model", "priority"],
             ),
             waiting: gauges("graspd_queue_requests", "Queued requests.", &["model"]),
             batches: histograms("graspd_batch_size", "Volumes per batch.", &["model"], &BATCHES),
@@ -250,9 +259,9 @@ impl Metrics {
         if expired.is_empty() {
             return;
         }
-        let Self { stages, requests, grasps, warnings, refused, waiting, batches, hanging, .. } = self;
+        let Self { stages, requests, grasps, warnings, refused, queued, waiting, batches, hanging, .. } = self;
         for model in &expired {
-            for counters in [requests, grasps, warnings, refused] {
+            for counters in [requests, grasps, warnings, refused, queued] {
                 remove(counters, model, |labels| counters.remove(labels));
             }
             for gauges in [waiting, hanging] {
@@ -298,6 +307,8 @@ impl Metrics {
         }
         let refused = |reason| self.refused.with_label_values(&[model, reason]);
         QueueMetrics {
+            queued: [Priority::Normal, Priority::Batch]
+                .map(|priority| self.queued.with_label_values(&[model, priority_name(priority)])),
             refused: RefusalCounters {
                 full: refused("full"),
                 too_late: refused("deadline"),
@@ -366,6 +377,11 @@ fn remove(metric: &dyn Collector, model: &str, series: impl Fn(&HashMap<&str, &s
             let _ = series(&labels);
         }
     }
+}
+
+/// The name of a priority without its prefix: `NORMAL` or `BATCH`.
+fn priority_name(priority: Priority) -> &'static str {
+    priority.as_str_name().trim_start_matches("PRIORITY_")
 }
 
 /// The name of a warning's code without its prefix, for example `TABLE_TILTED`.
