@@ -91,8 +91,8 @@ void print(const pb::DetectGraspsResponse &reply, double round_trip) {
     const auto &took = reply.latency();
     const std::pair<const char *, double> stages[] = {
         {"queue", took.queue()}, {"preprocessing", took.preprocessing()}, {"fusion", took.fusion()},
-        {"inference", took.inference()}, {"postprocessing", took.postprocessing()}, {"total", took.total()},
-        {"round trip", round_trip}};
+        {"inference", took.inference()}, {"evaluation", took.evaluation()}, {"postprocessing", took.postprocessing()},
+        {"total", took.total()}, {"round trip", round_trip}};
     std::printf("milliseconds:");
     for (const auto &[stage, seconds] : stages) std::printf(" %s %.2f", stage, seconds * 1e3);
     std::printf("\n");

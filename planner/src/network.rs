@@ -1,4 +1,5 @@
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 use grasp::{DecodeParams, Decoded, Maps, Volume, decode, quality_at};
 use grasp_models::{LoadError, Network, Options, Output, RuntimeError};
@@ -17,6 +18,7 @@ pub struct NetworkPlanner {
 pub struct Inference<'a> {
     output: Output<'a>,
     evaluator: Option<&'a mut Evaluator>,
+    evaluation: Option<Duration>,
 }
 
 impl NetworkPlanner {
@@ -45,7 +47,7 @@ impl NetworkPlanner {
     /// # Errors
     /// [`RuntimeError`] if the batch does not fit the network or ONNX Runtime fails.
     pub fn infer(&mut self, volumes: &[&Volume]) -> Result<Inference<'_>, RuntimeError> {
-        Ok(Inference { output: self.network.infer(volumes)?, evaluator: self.evaluator.as_mut() })
+        Ok(Inference { output: self.network.infer(volumes)?, evaluator: self.evaluator.as_mut(), evaluation: None })
     }
 }
 
@@ -54,6 +56,12 @@ impl Inference<'_> {
     #[must_use]
     pub fn maps(&self, index: usize) -> Maps<'_> {
         self.output.maps(index)
+    }
+
+    /// Time of the evaluator in the last [`decode`](Self::decode) or [`score`](Self::score); None without an evaluator.
+    #[must_use]
+    pub fn evaluation(&self) -> Option<Duration> {
+        self.evaluation
     }
 
     /// The grasps in `volume`, which is the one at `index` of the batch. The evaluator stops when `is_wanted` returns
@@ -73,13 +81,14 @@ impl Inference<'_> {
             None => decode(volume, &maps, params)?,
             Some(evaluator) => {
                 let proposals = decode(volume, &maps, &Evaluator::proposal_params(params))?;
-                evaluator.refine(proposals, volume, params, is_wanted)?
+                let started = Instant::now();
+                let refined = evaluator.refine(proposals, volume, params, is_wanted)?;
+                self.evaluation = Some(started.elapsed());
+                refined
             }
         })
     }
-}
 
-impl Inference<'_> {
     /// The predicted quality of grasps at `poses` in `volume`, which is the one at `index` of the batch. An evaluator
     /// predicts it for the pose; a network alone for the best rotation at the position.
     ///
@@ -94,7 +103,12 @@ impl Inference<'_> {
     ) -> Result<Vec<f32>, PlanError> {
         match &mut self.evaluator {
             None => Ok(quality_at(volume, &self.output.maps(index), poses, params)?),
-            Some(evaluator) => Ok(evaluator.score(poses, volume, params)?),
+            Some(evaluator) => {
+                let started = Instant::now();
+                let qualities = evaluator.score(poses, volume, params)?;
+                self.evaluation = Some(started.elapsed());
+                Ok(qualities)
+            }
         }
     }
 }

@@ -129,7 +129,7 @@ class CppTest(unittest.TestCase):
             self.assertGreater(-approach[2], math.cos(1) - 1e-3)
         self.assertTrue((np.diff(grasps[:, 0]) <= 0).all(), "best first")
         stages = dict(re.findall(r"([a-z ]+?) (\d+\.\d+) ?", self.latency))
-        parts = ["queue", "preprocessing", "fusion", "inference", "postprocessing"]
+        parts = ["queue", "preprocessing", "fusion", "inference", "evaluation", "postprocessing"]
         self.assertEqual(list(stages), [*parts, "total", "round trip"])
         *parts, total, round_trip = map(float, stages.values())
         self.assertTrue(0 < sum(parts) <= total + 0.1 <= round_trip + 0.1, self.latency)

@@ -301,14 +301,24 @@ async fn an_evaluator_scores_the_grasps_of_its_network() {
     let views = [camera(30.0, -90.0), camera(40.0, 90.0)].map(|camera| view(&camera));
     let detect = async |model: &str| {
         let detect = DetectOptions { model: model.to_owned(), threshold: Some(0.01), ..DetectOptions::default() };
-        client.detect_from_depth(&views, &Workspace::default(), with_options(detect)).await.unwrap().grasps
+        client.detect_from_depth(&views, &Workspace::default(), with_options(detect)).await.unwrap()
     };
-    let evaluated = detect("graspd-packed").await;
+    let Detection { grasps: evaluated, latency, .. } = detect("graspd-packed").await;
+    assert!(latency.evaluation > latency.postprocessing, "{latency:?}");
+    let stages = [latency.queue, latency.preprocessing, latency.fusion, latency.inference, latency.postprocessing];
+    assert!(stages.iter().sum::<f64>() + latency.evaluation <= latency.total, "{latency:?}");
+    let series = format!(
+        "graspd_stage_duration_seconds_sum{{model=\"{}\",stage=\"evaluation\"}}",
+        format_args!("{} {}", models[2].name, models[2].version)
+    );
+    assert!((server.metric(&series) - latency.evaluation).abs() < 1e-9);
     assert!(!evaluated.is_empty() && evaluated.is_sorted_by(|a, b| a.quality >= b.quality));
     assert_at_the_block(&evaluated[0]);
-    assert_same(&detect("graspd-packed").await, &evaluated);
+    assert_same(&detect("graspd-packed").await.grasps, &evaluated);
     let qualities = |grasps: &[Proposal]| grasps.iter().map(|grasp| grasp.quality).collect::<Vec<_>>();
-    assert_ne!(qualities(&detect("vgn-packed").await), qualities(&evaluated));
+    let alone = detect("vgn-packed").await;
+    assert_eq!(alone.latency.evaluation, 0.0, "no evaluator");
+    assert_ne!(qualities(&alone.grasps), qualities(&evaluated));
 
     // After the removal of the network's file the loaded evaluator stays.
     std::fs::remove_file(&network).unwrap();

@@ -143,6 +143,7 @@ impl Calls {
             preprocessing = Empty,
             fusion = Empty,
             inference = Empty,
+            evaluation = Empty,
             postprocessing = Empty,
             total = Empty,
         );
@@ -260,7 +261,7 @@ impl Call {
         let mut maps = Vec::with_capacity(replies.len());
         let mut timings = StageTimings { preprocessing, ..StageTimings::default() };
         for reply in replies {
-            let SessionOutput { value, queue, inference, postprocessing } = match reply.wait(self.deadline).await {
+            let SessionOutput { value, queue, inference, postprocessing, .. } = match reply.wait(self.deadline).await {
                 Ok(output) => output,
                 Err(error) => return Err(self.end(error.into())),
             };
@@ -436,19 +437,28 @@ impl Drop for Call {
 }
 
 /// Waits for the results of all cubes. The timings of the sessions are those from the first cube to the last: the cubes
-/// are inferred in parallel, and one after another.
+/// are computed in parallel, and one after another.
 async fn all<T>(replies: Vec<Reply<T>>, deadline: Option<Deadline>) -> Result<(Vec<T>, StageTimings), EngineError> {
     let mut values = Vec::with_capacity(replies.len());
-    let (mut queue, mut inferred, mut decoded) = (Duration::MAX, Duration::ZERO, Duration::ZERO);
+    // When the first cube was taken from the queue, and the last one had passed each stage.
+    let mut taken = Duration::MAX;
+    let (mut inferred, mut evaluated, mut decoded) = (Duration::ZERO, None, Duration::ZERO);
     for reply in replies {
-        let output = reply.wait(deadline).await?;
-        values.push(output.value);
-        queue = queue.min(output.queue);
-        inferred = inferred.max(output.queue + output.inference);
-        decoded = decoded.max(output.queue + output.inference + output.postprocessing);
+        let SessionOutput { value, queue, inference, evaluation, postprocessing } = reply.wait(deadline).await?;
+        values.push(value);
+        taken = taken.min(queue);
+        inferred = inferred.max(queue + inference);
+        evaluated = evaluated.max(evaluation.map(|evaluation| queue + inference + evaluation));
+        decoded = decoded.max(queue + inference + evaluation.unwrap_or_default() + postprocessing);
     }
-    let (inference, postprocessing) = (inferred.saturating_sub(queue), decoded.saturating_sub(inferred));
-    Ok((values, StageTimings { queue, inference, postprocessing, ..StageTimings::default() }))
+    let stages = StageTimings {
+        queue: taken,
+        inference: inferred.saturating_sub(taken),
+        evaluation: evaluated.map(|evaluated| evaluated.saturating_sub(inferred)),
+        postprocessing: decoded.saturating_sub(evaluated.unwrap_or(inferred)),
+        ..StageTimings::default()
+    };
+    Ok((values, stages))
 }
 
 /// The warning about the table, unless it is as expected in one of the cubes.

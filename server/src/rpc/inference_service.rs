@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use grasp::Volume;
 use grasp_models::{INPUT, OUTPUTS};
+use grasp_planner::Source;
 use grasp_proto::oip::grpc_inference_service_server::GrpcInferenceService;
 use grasp_proto::oip::model_infer_response::InferOutputTensor;
 use grasp_proto::oip::model_metadata_response::TensorMetadata;
@@ -98,6 +99,11 @@ impl InferenceRpc {
             let (count, seconds) = self.metrics.stage(&engine.label, name);
             duration(count, seconds)
         };
+        // As compute_output of Triton: all work on the outputs of the network.
+        let (count, decoding) = self.metrics.stage(&engine.label, "postprocessing");
+        let is_evaluated = matches!(engine.source, Source::Evaluated { .. });
+        let evaluation = if is_evaluated { self.metrics.stage(&engine.label, "evaluation").1 } else { 0.0 };
+        let output = duration(count, decoding + evaluation);
         let (batches, volumes) = self.metrics.batches(&engine.label);
         oip::ModelStatistics {
             name: engine.source.name().to_owned(),
@@ -111,7 +117,7 @@ impl InferenceRpc {
                 queue: stage("queue"),
                 compute_input: stage("preprocessing"),
                 compute_infer: stage("inference"),
-                compute_output: stage("postprocessing"),
+                compute_output: output,
             }),
         }
     }

@@ -21,6 +21,8 @@ pub(crate) struct SessionOutput<T> {
     pub value: T,
     pub queue: Duration,
     pub inference: Duration,
+    /// None for models without an evaluator.
+    pub evaluation: Option<Duration>,
     pub postprocessing: Duration,
 }
 

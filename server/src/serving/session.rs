@@ -169,17 +169,17 @@ fn infer(network: &mut NetworkPlanner, defaults: DecodeParams, jobs: Vec<Job>, m
                     })
                 });
                 let detection = || Ok(Detection::of(decoded?, scene.volume, &params));
-                send_result(reply, span, submitted, &mut batch, started, detection);
+                send_result(reply, span, submitted, &mut batch, started, output.evaluation(), detection);
             }
             Task::Scores(params, candidates, reply) => {
                 let decode = params.decode_params(defaults);
                 let poses: Vec<_> = candidates.iter().map(|candidate| candidate.pose).collect();
                 let qualities = span.in_scope(|| caught(|| Ok(output.score(index, &scene.volume, &poses, &decode)?)));
                 let scores = || Ok(Score::of(&candidates, qualities?, &scene.volume, &params, decode.threshold));
-                send_result(reply, span, submitted, &mut batch, started, scores);
+                send_result(reply, span, submitted, &mut batch, started, output.evaluation(), scores);
             }
             Task::Maps(reply) => {
-                send_result(reply, span, submitted, &mut batch, started, || Ok(tensors(output, index)))
+                send_result(reply, span, submitted, &mut batch, started, None, || Ok(tensors(output, index)))
             }
         }
     }
@@ -200,7 +200,7 @@ fn plan(planner: &mut dyn Planner, defaults: DecodeParams, job: Job, mut batch: 
             });
             batch.inference = started.elapsed();
             let detection = || Ok(Detection::of(decoded?, scene.volume, &params));
-            send_result(reply, span, submitted, &mut batch, Instant::now(), detection);
+            send_result(reply, span, submitted, &mut batch, Instant::now(), None, detection);
         }
         Task::Maps(_) | Task::Scores(..) => {
             batch.free();
@@ -209,7 +209,7 @@ fn plan(planner: &mut dyn Planner, defaults: DecodeParams, job: Job, mut batch: 
     }
 }
 
-/// Ends the post-processing, which began at `started`, and sends its result. The job's part of the span ends before:
+/// Ends the post-processing, which began at `started` and contains the evaluation, and sends its result. The job's part of the span ends before:
 /// otherwise a server that stops after the reply could lose the span.
 fn send_result<T: Send + 'static>(
     reply: Sender<T>,
@@ -217,6 +217,7 @@ fn send_result<T: Send + 'static>(
     submitted: Instant,
     batch: &mut Batch<'_>,
     started: Instant,
+    evaluation: Option<Duration>,
     postprocess: impl FnOnce() -> Result<T, EngineError>,
 ) {
     let result = span.in_scope(|| {
@@ -234,9 +235,10 @@ fn send_result<T: Send + 'static>(
     if !reply.is_closed() {
         service_time.add(taken.elapsed() / scenes);
     }
-    let (queue, postprocessing) = (taken.duration_since(submitted), started.elapsed());
+    let queue = taken.duration_since(submitted);
+    let postprocessing = started.elapsed().saturating_sub(evaluation.unwrap_or_default());
     batch.free();
-    reply.send(result.map(|value| SessionOutput { value, queue, inference, postprocessing }));
+    reply.send(result.map(|value| SessionOutput { value, queue, inference, evaluation, postprocessing }));
 }
 
 fn tensors(output: &Inference, index: usize) -> Tensors {

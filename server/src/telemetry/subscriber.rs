@@ -141,12 +141,13 @@ pub(crate) fn stages(span: &Span, timings: &StageTimings) {
         return;
     }
     let tracer = global::tracer(NAME);
-    let StageTimings { preprocessing, fusion, queue, inference, postprocessing, total } = *timings;
-    let stages: [(&str, Option<Duration>); 5] = [
+    let StageTimings { preprocessing, fusion, queue, inference, evaluation, postprocessing, total } = *timings;
+    let stages: [(&str, Option<Duration>); 6] = [
         ("preprocessing", Some(preprocessing)),
         ("fusion", fusion),
         ("queue", Some(queue)),
         ("inference", Some(inference)),
+        ("evaluation", evaluation),
         ("postprocessing", Some(postprocessing)),
     ];
     let mut at = SystemTime::now() - total;

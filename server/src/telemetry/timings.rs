@@ -11,6 +11,8 @@ pub(crate) struct StageTimings {
     /// None for requests that contain a volume.
     pub fusion: Option<Duration>,
     pub inference: Duration,
+    /// None for models without an evaluator.
+    pub evaluation: Option<Duration>,
     pub postprocessing: Duration,
     pub total: Duration,
 }
@@ -23,6 +25,7 @@ impl StageTimings {
             ("preprocessing", Some(self.preprocessing)),
             ("fusion", self.fusion),
             ("inference", Some(self.inference)),
+            ("evaluation", self.evaluation),
             ("postprocessing", Some(self.postprocessing)),
             ("total", Some(self.total)),
         ];
@@ -44,6 +47,7 @@ impl From<&StageTimings> for pb::Latency {
             preprocessing: timings.preprocessing.as_secs_f64(),
             fusion: timings.fusion.unwrap_or_default().as_secs_f64(),
             inference: timings.inference.as_secs_f64(),
+            evaluation: timings.evaluation.unwrap_or_default().as_secs_f64(),
             postprocessing: timings.postprocessing.as_secs_f64(),
             total: timings.total.as_secs_f64(),
         }

@@ -114,11 +114,12 @@ fn print_detection(detection: &Detection) {
     let ms = |seconds: f64| format!("{:.2} ms", seconds * 1e3);
     let latency = &detection.latency;
     println!(
-        "latency: queue {}, pre-processing {}, fusion {}, inference {}, post-processing {}, total {}",
+        "latency: queue {}, pre-processing {}, fusion {}, inference {}, evaluation {}, post-processing {}, total {}",
         ms(latency.queue),
         ms(latency.preprocessing),
         ms(latency.fusion),
         ms(latency.inference),
+        ms(latency.evaluation),
         ms(latency.postprocessing),
         ms(latency.total)
     );

@@ -62,8 +62,10 @@ class Latency:
     """Fusion of depth images or points into a volume."""
     inference: float
     """The network; for a planner without a network, the whole planner."""
+    evaluation: float
+    """The evaluator of the model: qualities of grasps, and search for better poses; 0 for models without one."""
     postprocessing: float
-    """Decoding of the network's output to grasps."""
+    """Decoding of the network's output to grasps, and the checks of each grasp."""
     total: float
     """From the decoded request to the reply."""
 

@@ -429,6 +429,7 @@ def latency(message: pb.Latency) -> Latency:
         preprocessing=message.preprocessing,
         fusion=message.fusion,
         inference=message.inference,
+        evaluation=message.evaluation,
         postprocessing=message.postprocessing,
         total=message.total,
     )

@@ -253,12 +253,13 @@ pub(crate) fn health_json(serving: bool) -> String {
     format!("{:#}", json!({ "serving": serving }))
 }
 
-fn stages(latency: &Latency) -> [(&'static str, f64); 6] {
+fn stages(latency: &Latency) -> [(&'static str, f64); 7] {
     [
         ("queue", latency.queue),
         ("preprocessing", latency.preprocessing),
         ("fusion", latency.fusion),
         ("inference", latency.inference),
+        ("evaluation", latency.evaluation),
         ("postprocessing", latency.postprocessing),
         ("total", latency.total),
     ]
