@@ -97,6 +97,9 @@ pub struct Workspace {
     pub extent: Option<[f64; 2]>,
     /// Find the table in the first depth image or point cloud instead of using `pose`.
     pub find_table: Option<FindTable>,
+    /// Multiply the depths of each view by one factor, so that the table is at its height: for cameras whose pose is
+    /// known and whose depth has an error of scale. Not with `find_table`.
+    pub correct_depth_scale: bool,
 }
 
 /// A search for the table in an observation: the workspace is placed over what stands on it.
@@ -130,6 +133,8 @@ pub struct Detection {
     pub warnings: Vec<pb::GeometryWarning>,
     /// The table that was found, with [`Workspace::find_table`].
     pub table: Option<pb::FoundTable>,
+    /// By which the depths of each view were multiplied, with [`Workspace::correct_depth_scale`].
+    pub depth_factors: Vec<f64>,
 }
 
 /// A grasp with its pre-grasp and retreat poses.
@@ -171,6 +176,8 @@ pub struct Scores {
     pub warnings: Vec<pb::GeometryWarning>,
     /// The table that was found, with [`Workspace::find_table`].
     pub table: Option<pb::FoundTable>,
+    /// By which the depths of each view were multiplied, with [`Workspace::correct_depth_scale`].
+    pub depth_factors: Vec<f64>,
 }
 
 impl From<pb::ScoreGraspsResponse> for Scores {
@@ -183,6 +190,7 @@ impl From<pb::ScoreGraspsResponse> for Scores {
             latency: response.latency.unwrap_or_default(),
             warnings: response.warnings,
             table: response.table,
+            depth_factors: response.depth_factors,
         }
     }
 }
@@ -292,6 +300,7 @@ impl Workspace {
             find_table: self.find_table.is_some(),
             gravity: gravity.map(|[x, y, z]| pb::Vector3 { x, y, z }),
             extent: self.extent.map(|[x, y]| pb::Extent { x, y }),
+            correct_depth_scale: self.correct_depth_scale,
         }
     }
 }
@@ -358,6 +367,7 @@ impl TryFrom<pb::DetectGraspsResponse> for Detection {
             dropped: response.dropped,
             warnings: response.warnings,
             table: response.table,
+            depth_factors: response.depth_factors,
         })
     }
 }

@@ -33,7 +33,8 @@ pub enum Warning {
     /// The table is level, but not at the expected height.
     #[error(
         "the table is at z = {height:.3} m in the volume, expected at {expected:.3} m; check the height of \
-         workspace.pose and the camera pose, or set collision.table_height"
+         workspace.pose and the camera pose, or set collision.table_height; if the scale of the depths is in doubt, set \
+         workspace.correct_depth_scale"
     )]
     TableHeight {
         /// Height of the table, metres above the bottom of the volume.
@@ -87,6 +88,15 @@ pub enum Warning {
         view: usize,
         /// Angle between the vertical and the direction to the camera, radians.
         angle: f64,
+    },
+    /// The scale of the depths of a view cannot be corrected.
+    #[error(
+        "views[{view}] shows no table within 10 % of its distance, so its depths were not corrected; check the camera \
+         pose, workspace.pose and collision.table_height"
+    )]
+    DepthScale {
+        /// Index of the view.
+        view: usize,
     },
 }
 

@@ -24,6 +24,7 @@ impl From<&Warning> for pb::GeometryWarning {
             Warning::CameraAngle { view, angle } => {
                 (Code::CameraAngle, Some(view), &[("angle_degrees", degrees(angle))])
             }
+            Warning::DepthScale { view } => (Code::DepthScale, Some(view), &[]),
         };
         Self {
             code: code.into(),

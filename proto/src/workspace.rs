@@ -30,13 +30,15 @@ pub struct Workspace {
     pub gravity: Option<Unit<Vector3<f64>>>,
     /// Lengths along x and y, metres; `None` means one cube.
     pub extent: Option<[f64; 2]>,
+    /// Whether to multiply the depths of each view by a factor that puts the table at its height.
+    pub correct_depth_scale: bool,
 }
 
 impl TryFrom<pb::Workspace> for Workspace {
     type Error = FieldError;
 
     fn try_from(workspace: pb::Workspace) -> Result<Self, FieldError> {
-        let pb::Workspace { pose, size, frame_id, stamp, find_table, gravity, extent } = workspace;
+        let pb::Workspace { pose, size, frame_id, stamp, find_table, gravity, extent, correct_depth_scale } = workspace;
         if !(0.0..=100.0).contains(&size) {
             return Err(FieldError::new(
                 "workspace.size",
@@ -47,11 +49,15 @@ impl TryFrom<pb::Workspace> for Workspace {
         if find_table && pose.is_some() {
             return Err(FieldError::new("workspace.pose", "given", "must be absent with workspace.find_table"));
         }
+        if find_table && correct_depth_scale {
+            let needed = "must be false with workspace.find_table, which takes the table where the depths show it";
+            return Err(FieldError::new("workspace.correct_depth_scale", true, needed));
+        }
         let frame_from_task = pose.map_or(Ok(Isometry3::identity()), |pose| pose::decode(&pose, &WORKSPACE))?;
         let gravity = gravity.map(|gravity| direction(Some(gravity), "workspace.gravity")).transpose()?;
         let size = Some(size).filter(|size| *size > 0.0);
         let extent = extent.map(checked_extent).transpose()?;
-        Ok(Self { frame_from_task, size, frame_id, stamp, find_table, gravity, extent })
+        Ok(Self { frame_from_task, size, frame_id, stamp, find_table, gravity, extent, correct_depth_scale })
     }
 }
 

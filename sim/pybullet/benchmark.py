@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from camera import Array, look_at, observe, render, save_png, sees_anything
-from graspd import Options
+from graspd import Options, Workspace
 from planners import Grasp, Planner, Random, Served
 from world import Attempt, World
 
@@ -32,6 +32,8 @@ class BenchmarkConfig:
     """`random` or `grpc:HOST:PORT`."""
     options: Options
     """Options of each request."""
+    workspace: Workspace
+    """Workspace of each request."""
     cameras: list[Array]
     noise: bool
     hand: Path
@@ -74,7 +76,9 @@ class Benchmark:
     def __init__(self, config: BenchmarkConfig) -> None:
         self.config = config
         self.world = World(config.hand)
-        self.served = Served(config.planner.removeprefix("grpc:"), config.options) if config.planner != "random" else None
+        self.served = None
+        if config.planner != "random":
+            self.served = Served(config.planner.removeprefix("grpc:"), config.options, config.workspace)
 
     def play(self, seed: int, number: int) -> Round:
         """Clears the scene of a round as far as the planner can."""

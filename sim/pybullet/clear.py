@@ -16,7 +16,7 @@ from typing import Any
 
 from benchmark import Benchmark, BenchmarkConfig, Round
 from camera import Array, circle, side
-from graspd import CollisionCheck, Error, Options
+from graspd import CollisionCheck, Error, Options, Workspace
 from score import spread, summary
 from world import HAND
 
@@ -64,6 +64,11 @@ def arguments() -> argparse.Namespace:
         "VGN's circle, 30 degrees from the vertical",
     )
     parser.add_argument("--noise", choices=["none", "dex"], default="dex", help="depth noise; the benchmark uses dex")
+    parser.add_argument(
+        "--correct-depth-scale",
+        action="store_true",
+        help="let graspd multiply the depths of each image by one factor, so that the table is at its height",
+    )
     parser.add_argument("--rounds", type=positive, default=100, metavar="N", help="rounds (scenes) per seed")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="the first seed")
     parser.add_argument("--seeds", type=positive, default=1, metavar="K", help="number of seeds, starting with --seed")
@@ -198,6 +203,7 @@ def main() -> None:
         count=args.count,
         planner=args.planner,
         options=Options(args.model, threshold=args.threshold, force=args.force, collision=collision),
+        workspace=Workspace(correct_depth_scale=args.correct_depth_scale),
         cameras=args.views,
         noise=args.noise == "dex",
         hand=args.hand,
@@ -221,6 +227,7 @@ def main() -> None:
             "threshold": args.threshold,
             "force": args.force,
             "clear": args.clear,
+            "correct_depth_scale": args.correct_depth_scale,
         },
         "setup": f"PyBullet, {args.scene}, {len(config.urdfs)} objects of {args.objects} ({args.part}), "
         f"{len(config.cameras)} views, noise {args.noise}, {args.count} objects a scene, {args.rounds} rounds, "

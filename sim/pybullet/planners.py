@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 from camera import Array, is_within_reach, points
-from graspd import Client, DepthView, Options, Pose
+from graspd import Client, DepthView, Options, Pose, Workspace
 from hand import MAX_OPENING
 
 FINGER_DEPTH = 0.05
@@ -45,14 +45,15 @@ class Planner(Protocol):
 class Served:
     """A running graspd. It gets the depth images."""
 
-    def __init__(self, address: str, options: Options | None = None) -> None:
+    def __init__(self, address: str, options: Options | None = None, workspace: Workspace = Workspace()) -> None:
         self.options = options
+        self.workspace = workspace
         # GPD takes seconds on a busy machine.
         self.client = Client(address, timeout=60.0)
 
     def plan(self, views: Sequence[DepthView]) -> Plan:
         """Requests grasps. Raises `graspd.Error` if the server refuses or cannot be reached."""
-        found = self.client.detect_from_depth(views, options=self.options)
+        found = self.client.detect_from_depth(views, self.workspace, self.options)
         grasps = [Grasp(grasp.pose, grasp.width, grasp.quality) for grasp in found.grasps]
         return Plan(grasps, found.latency.fusion)
 

@@ -115,14 +115,16 @@ pub struct DepthNoise {
     pub share: f64,
     /// The sensor.
     pub sensor: Sensor,
+    /// Whether the scale of the depths is corrected by the table, as by a graspd with `Workspace.correct_depth_scale`.
+    pub is_scale_corrected: bool,
 }
 
 impl DepthNoise {
     /// No noise.
-    pub const NONE: Self = Self { share: 0.0, sensor: Sensor::Dex };
+    pub const NONE: Self = Self { share: 0.0, sensor: Sensor::Dex, is_scale_corrected: false };
 
     /// The noise of the benchmark in all observations.
-    pub const BENCHMARK: Self = Self { share: 1.0, sensor: Sensor::Dex };
+    pub const BENCHMARK: Self = Self { share: 1.0, sensor: Sensor::Dex, is_scale_corrected: false };
 }
 
 /// Renders the scene from cameras drawn from `views`.
@@ -135,7 +137,18 @@ pub fn observe(world: &World, views: &Views, noise: DepthNoise, rng: &mut impl R
             Sensor::Stereo => add_stereo_noise(view, rng),
         });
     }
+    if noise.is_scale_corrected {
+        views.iter_mut().for_each(correct_scale);
+    }
     views
+}
+
+/// Multiplies the depths by the factor that puts the table at its height, if it is in view.
+fn correct_scale(view: &mut View) {
+    let image = DepthImage::new(Intrinsics::BENCHMARK, &view.depth).expect("views are of the benchmark's camera");
+    if let Some(factor) = image.depth_factor(&view.camera_from_task, TABLE_HEIGHT, [grasp::WORKSPACE_SIZE; 2]) {
+        view.depth.iter_mut().for_each(|depth| *depth *= factor as f32);
+    }
 }
 
 /// Adds the noise of GIGA's evaluation (Dex-Net's model): one Gamma(1000, 0.001) factor per image, and with probability

@@ -121,6 +121,11 @@ struct SceneArgs {
     #[arg(long, value_enum, default_value = "dex")]
     sensor: Sensor,
 
+    /// Multiply the depths of each image by one factor, so that the table is at its height, as graspd does with
+    /// `Workspace.correct_depth_scale`.
+    #[arg(long)]
+    correct_depth_scale: bool,
+
     /// Random seed.
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -230,7 +235,7 @@ impl Scene {
 
 impl SceneArgs {
     fn noise(&self) -> DepthNoise {
-        DepthNoise { share: self.noise, sensor: self.sensor.into() }
+        DepthNoise { share: self.noise, sensor: self.sensor.into(), is_scale_corrected: self.correct_depth_scale }
     }
 
     fn kind(&self) -> SceneKind {

@@ -222,6 +222,73 @@ async fn invalid_views_are_refused_with_the_field_and_the_value() {
 }
 
 #[tokio::test]
+async fn the_scale_of_depths_is_corrected_by_the_table() {
+    let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS)], &[]);
+    let client = server.client().await;
+    let cameras = [camera(30.0, -90.0), camera(40.0, 90.0)];
+    let factors = [0.96, 1.03];
+    let scaled = |camera: &Isometry3<f64>, factor: f32| {
+        let depth = depth(camera).into_iter().map(|depth| depth / factor).collect();
+        DepthView { depth: Depth::Metres(depth), ..view(camera) }
+    };
+    let good = cameras.map(|camera| view(&camera));
+    let wrong: Vec<_> = cameras.iter().zip(factors).map(|(camera, factor)| scaled(camera, factor)).collect();
+    let corrected = Workspace { correct_depth_scale: true, ..Workspace::default() };
+    let detect = async |views: &[DepthView], workspace: &Workspace| {
+        client.detect_from_depth(views, workspace, low()).await.unwrap()
+    };
+    let expected = detect(&good, &Workspace::default()).await;
+    assert_eq!(expected.depth_factors, [0.0; 0], "not asked for");
+    let codes = |warnings: &[pb::GeometryWarning]| warnings.iter().map(|warning| warning.code()).collect::<Vec<_>>();
+    let uncorrected = detect(&wrong, &Workspace::default()).await;
+    assert!(!codes(&uncorrected.warnings).is_empty(), "the views disagree");
+
+    let found = detect(&wrong, &corrected).await;
+    assert_eq!(codes(&found.warnings), []);
+    let is_close =
+        |found: &[f64]| found.len() == 2 && found.iter().zip(factors).all(|(a, b)| (a - f64::from(b)).abs() < 2e-3);
+    assert!(is_close(&found.depth_factors), "{:?}", found.depth_factors);
+    assert_eq!(found.grasps.len(), expected.grasps.len());
+    let distance = (found.grasps[0].pose.translation.vector - expected.grasps[0].pose.translation.vector).norm();
+    assert!(distance < 2e-3, "{distance} m from the grasp in the views without an error");
+
+    // Point clouds, scores and a tracked volume are corrected too.
+    let cloud = |camera: &Isometry3<f64>, factor: f64| {
+        let depth = depth(camera);
+        let image = DepthImage::new(CAMERA, &depth).unwrap();
+        let image: Vec<_> = image.points(camera).map(|point| point.position).collect();
+        let eye = camera.inverse() * Point3::origin();
+        let points = image.iter().map(|point| (eye + (point - eye) / factor).coords.cast().into()).collect();
+        CloudView { points, camera_position: eye.coords.into(), frame_from_cloud: Isometry3::identity(), labels: None }
+    };
+    let clouds: Vec<_> = cameras.iter().zip(factors).map(|(camera, factor)| cloud(camera, factor.into())).collect();
+    let found = client.detect_from_cloud(&clouds, &corrected, low()).await.unwrap();
+    assert!(is_close(&found.depth_factors), "{:?}", found.depth_factors);
+    let mut tracking = client.track(corrected).await.unwrap();
+    let found = tracking.add(&wrong, low()).await.unwrap();
+    assert!(is_close(&found.depth_factors), "{:?}", found.depth_factors);
+
+    // Without a table at about its height the depths stay as they are, with a warning.
+    let low = Workspace { pose: Isometry3::translation(0.0, 0.0, -0.1), ..corrected };
+    let hand_eye = |view: &DepthView, camera: &Isometry3<f64>| DepthView {
+        extrinsics: Extrinsics::FrameFromCamera(camera.inverse()),
+        ..view.clone()
+    };
+    let found = detect(&[hand_eye(&good[0], &cameras[0])], &low).await;
+    assert_eq!(found.depth_factors, [1.0]);
+    assert!(codes(&found.warnings).contains(&pb::geometry_warning::Code::DepthScale), "{:?}", found.warnings);
+    let both = Workspace { find_table: Some(FindTable::default()), ..corrected };
+    let hand_eye = [hand_eye(&good[0], &cameras[0])];
+    let (code, message) =
+        refusal(client.detect_from_depth(&hand_eye, &both, with_options(DetectOptions::default())).await);
+    assert!(code == Code::InvalidArgument && message.starts_with("workspace.correct_depth_scale is true"), "{message}");
+    let none = Some(pb::CollisionCheck { table_height: Some(-1.0), ..Default::default() });
+    let none = with_options(DetectOptions { collision: none, ..DetectOptions::default() });
+    let (code, message) = refusal(client.detect_from_depth(&good, &corrected, none).await);
+    assert!(code == Code::InvalidArgument && message.starts_with("workspace.correct_depth_scale is true"), "{message}");
+}
+
+#[tokio::test]
 async fn planners_without_a_network_are_selected_by_name() {
     let server = Server::run(&[TestModel::new("mirror").resolution(PAPERS)], &[]);
     let classifiers = server.models().join("classifiers");

@@ -60,6 +60,9 @@ pub struct Provenance {
     /// Sensor of the depth noise: `dex`, that of the benchmark, or `stereo`.
     #[serde(default = "dex", skip_serializing_if = "is_dex")]
     pub sensor: String,
+    /// Whether the scale of the depths was corrected by the table.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub correct_depth_scale: bool,
     /// Seed of the data set. Each scene number selects a random stream.
     pub seed: u64,
     /// Seed of the observations, if they were not generated with the labels.

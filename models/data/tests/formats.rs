@@ -21,6 +21,7 @@ fn setup() -> Setup {
         observations: 2,
         noise: 0.0,
         sensor: "dex".into(),
+        correct_depth_scale: false,
         seed: 1,
         observation_seed: None,
         network: None,

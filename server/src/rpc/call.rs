@@ -98,6 +98,8 @@ pub(crate) struct Observed {
     pub warnings: Vec<Warning>,
     /// The table that determined the workspace.
     pub table: Option<pb::FoundTable>,
+    /// By which the depths of each view were multiplied; empty if they were not to be corrected.
+    pub depth_factors: Vec<f64>,
 }
 
 /// Frame id and time stamp of a request's views, echoed in the response.
@@ -325,7 +327,7 @@ impl Call {
 
     async fn scores(&mut self, pending: PendingReply<Vec<Score>>) -> Result<pb::ScoreGraspsResponse, Refusal> {
         let PendingReply { replies, preprocessing, observed, origin, .. } = pending;
-        let Observed { fusion, warnings, table } = observed;
+        let Observed { fusion, warnings, table, depth_factors } = observed;
         let (values, stages) = all(replies, self.deadline).await?;
         let total = self.started.elapsed();
         let timings = StageTimings { preprocessing, fusion, total, ..stages };
@@ -342,12 +344,13 @@ impl Call {
             latency: Some((&timings).into()),
             warnings,
             table,
+            depth_factors,
         })
     }
 
     async fn reply(&mut self, pending: PendingReply) -> Result<pb::DetectGraspsResponse, Refusal> {
         let PendingReply { replies, params, threshold, preprocessing, observed, origin } = pending;
-        let Observed { fusion, warnings, table } = observed;
+        let Observed { fusion, warnings, table, depth_factors } = observed;
         let (cubes, stages) = all(replies, self.deadline).await?;
         let Detection { grasps: found, dropped, over_limit, volumes } = Detection::merged(cubes, &params, threshold);
 
@@ -390,6 +393,7 @@ impl Call {
             dropped,
             warnings,
             table,
+            depth_factors,
         })
     }
 

@@ -206,7 +206,7 @@ impl GraspRpc {
         let (selected, params) = (Arc::clone(&engine), params.clone());
         let fused = blocking(permits, move || {
             let (observation, table) = place(&mut workspace, params.table.unwrap_or(TABLE_HEIGHT))?;
-            fuse(&selected, &params, &workspace, &observation, table)
+            fuse(&selected, &params, &workspace, observation, table)
         });
         Ok((engine, fused.await?, origin))
     }
@@ -348,17 +348,17 @@ fn fuse(
     engine: &Engine,
     params: &DetectParams,
     workspace: &Workspace,
-    observation: &Observation,
+    mut observation: Observation,
     table: Option<pb::FoundTable>,
 ) -> Result<Fused, Refusal> {
     let started = Instant::now();
     params.check_objects(observation.is_labelled())?;
     let mut cubes = Cubes::of(&engine.source, workspace, &observation.cameras(), params.margin)?;
-    let integrated = cubes.integrate(observation)?;
-    let warnings = integrated.warnings.clone();
+    let integrated = cubes.integrate(&mut observation, params.table)?;
+    let (warnings, depth_factors) = (integrated.warnings.clone(), integrated.depth_factors.clone());
     let objects = observation.objects(cubes.frame_from_task(), &params.objects)?;
     let scenes = cubes.scenes(integrated, objects.as_ref(), params)?;
-    Ok((scenes, Observed { fusion: Some(started.elapsed()), warnings, table }))
+    Ok((scenes, Observed { fusion: Some(started.elapsed()), warnings, table, depth_factors }))
 }
 
 /// Runs `work` on a thread for blocking tasks, to keep the async runtime's threads free.

@@ -15,6 +15,10 @@ pub(crate) struct Cubes {
     frame_from_task: Isometry3<f64>,
     /// `T_task_middle`: the cube in the middle of the workspace.
     task_from_middle: Isometry3<f64>,
+    /// Lengths of the workspace along x and y, metres.
+    extent: [f64; 2],
+    /// Whether to correct the scale of the depths.
+    corrects_depth_scale: bool,
 }
 
 /// A cube and the field that its views are fused into.
@@ -38,6 +42,8 @@ pub(crate) struct CubeScene {
 pub(crate) struct Integrated {
     /// For each cube the observed points, if the planner needs them.
     points: Vec<Option<Vec<SurfacePoint>>>,
+    /// By which the depths of each view were multiplied; empty if they are not to be corrected.
+    pub depth_factors: Vec<f64>,
     /// Signs that the geometry is wrong.
     pub warnings: Vec<Warning>,
 }
@@ -58,7 +64,7 @@ impl Cubes {
         cameras: &[Point3<f64>],
         margin: f64,
     ) -> Result<Self, FieldError> {
-        let Workspace { frame_from_task, size, extent, .. } = *workspace;
+        let Workspace { frame_from_task, size, extent, correct_depth_scale, .. } = *workspace;
         let edge = edge(source, size);
         let cube = |[x, y]: [f64; 2], inner| {
             let task_from_cube = Isometry3::translation(x, y, 0.0);
@@ -79,7 +85,13 @@ impl Cubes {
             }
         };
         let [x, y] = extent.map_or([0.0; 2], |extent| extent.map(|length| (length - edge) / 2.0));
-        Ok(Self { cubes, frame_from_task, task_from_middle: Isometry3::translation(x, y, 0.0) })
+        Ok(Self {
+            cubes,
+            frame_from_task,
+            task_from_middle: Isometry3::translation(x, y, 0.0),
+            extent: extent.unwrap_or([edge; 2]),
+            corrects_depth_scale: correct_depth_scale,
+        })
     }
 
     /// The cubes, whose fields forget with this half-life, views.
@@ -100,11 +112,19 @@ impl Cubes {
         self.cubes.iter().try_for_each(|cube| cube.grid.check(source))
     }
 
-    /// Integrates views, each of which must see a part of the workspace.
-    pub fn integrate(&mut self, observation: &Observation) -> Result<Integrated, FieldError> {
+    /// Integrates views, each of which must see a part of the workspace. `table` is the height of the table in it,
+    /// metres, to which the scale of the depths is corrected, if the workspace asks for it.
+    pub fn integrate(&mut self, observation: &mut Observation, table: Option<f64>) -> Result<Integrated, FieldError> {
+        let (depth_factors, mut warnings) = match (self.corrects_depth_scale, table) {
+            (false, _) => Default::default(),
+            (true, Some(table)) => observation.correct_depth_scale(table, self.extent),
+            (true, None) => {
+                let needed = "must be false without a table, which a negative collision.table_height means";
+                return Err(FieldError::new("workspace.correct_depth_scale", true, needed));
+            }
+        };
         let mut samplers: Vec<_> =
             self.cubes.iter().map(|cube| cube.grid.needs_points().then(PointSampler::default)).collect();
-        let mut warnings = Vec::new();
         for (index, camera) in observation.cameras().iter().enumerate() {
             if let Some(grid) = self.cubes.first().map(|cube| &cube.grid).filter(|grid| !grid.needs_points()) {
                 warnings.extend(Warning::of_camera(index, &(at(camera) * self.task_from_middle), grid.size()));
@@ -126,7 +146,7 @@ impl Cubes {
             warnings.extend(unseen.first());
         }
         let points = samplers.into_iter().map(|sampler| sampler.map(PointSampler::into_points)).collect();
-        Ok(Integrated { points, warnings })
+        Ok(Integrated { points, depth_factors, warnings })
     }
 
     /// The scenes for the planner: those of the cubes in which something stands on the table, and at least one.

@@ -2,7 +2,7 @@ use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use grasp::{DepthImage, ObjectMap, View, seen_from};
+use grasp::{DepthImage, ObjectMap, View, Warning, depth_factor, seen_from};
 use grasp_proto::{FieldError, Points};
 use nalgebra::{Isometry3, Point3, Translation3};
 
@@ -14,8 +14,8 @@ pub(crate) enum Observation {
     Clouds(Vec<Points>),
 }
 
-/// Labelled pixels of an image that are used, about.
-const LABELS: usize = 100_000;
+/// Labelled pixels of an image, and points of a cloud for its scale, that are used, about.
+const SAMPLES: usize = 100_000;
 
 impl Observation {
     /// Positions of the cameras in the task frame, metres.
@@ -24,6 +24,18 @@ impl Observation {
             Self::Depth(views) => views.iter().map(camera).collect(),
             Self::Clouds(clouds) => clouds.iter().map(|cloud| cloud.eye).collect(),
         }
+    }
+
+    /// Corrects the scale of the distances in each view, so that the table is at its height. Returns the factors, and
+    /// warnings about views without a table. `extent` is that of the workspace, metres.
+    pub fn correct_depth_scale(&mut self, table: f64, extent: [f64; 2]) -> (Vec<f64>, Vec<Warning>) {
+        let factors: Vec<Option<f64>> = match self {
+            Self::Depth(views) => views.iter_mut().map(|view| correct_view(view, table, extent)).collect(),
+            Self::Clouds(clouds) => clouds.iter_mut().map(|cloud| correct_cloud(cloud, table, extent)).collect(),
+        };
+        let missing = factors.iter().enumerate().filter(|(_, factor)| factor.is_none());
+        let warnings = missing.map(|(view, _)| Warning::DepthScale { view }).collect();
+        (factors.into_iter().map(|factor| factor.unwrap_or(1.0)).collect(), warnings)
     }
 
     /// View `index` as a depth image, with the pose of the camera (`T_camera_cube`) for a cube at `task_from_cube` with
@@ -86,6 +98,25 @@ impl Observation {
     }
 }
 
+/// Multiplies the depths of a view by the factor that puts the table at its height, and returns it.
+fn correct_view(view: &mut View, table: f64, extent: [f64; 2]) -> Option<f64> {
+    // An image that does not fit its intrinsics is refused when it is fused.
+    let image = DepthImage::new(view.intrinsics, &view.depth).ok()?;
+    let factor = image.depth_factor(&view.camera_from_task, table, extent)?;
+    view.depth.iter_mut().for_each(|depth| *depth *= factor as f32);
+    Some(factor)
+}
+
+/// Multiplies the distances of the points from their camera, as [`correct_view`].
+fn correct_cloud(cloud: &mut Points, table: f64, extent: [f64; 2]) -> Option<f64> {
+    let eye = cloud.eye;
+    // Odd, because the points of a sensor are often in rows of an even length.
+    let every = (cloud.points.len() / SAMPLES) | 1;
+    let factor = depth_factor(cloud.points.iter().step_by(every).copied(), &eye, table, extent)?;
+    cloud.points.iter_mut().for_each(|point| *point = eye + factor * (*point - eye));
+    Some(factor)
+}
+
 fn camera(view: &View) -> Point3<f64> {
     Point3::from(view.camera_from_task.inverse().translation.vector)
 }
@@ -98,7 +129,7 @@ fn labelled(view: &View) -> impl Iterator<Item = (Point3<f64>, u16)> {
     // An image that does not fit its intrinsics is refused when it is fused.
     let image = DepthImage::new(view.intrinsics, &view.depth).ok();
     // Odd, so that the pixels are not in few columns.
-    let pixels = labels.iter().enumerate().step_by((labels.len() / LABELS) | 1);
+    let pixels = labels.iter().enumerate().step_by((labels.len() / SAMPLES) | 1);
     pixels.filter_map(move |(pixel, &label)| {
         let point = image.as_ref()?.point(pixel % width, pixel / width)?;
         Some((task_from_camera * point, label))

@@ -92,12 +92,12 @@ impl Track {
             }
             (Some(mut track), None) => {
                 let views = converted(views, track.cubes.frame_from_task());
-                let fused = views.map_err(Refusal::from).and_then(|views| track.add(engine, params, &views, None));
+                let fused = views.map_err(Refusal::from).and_then(|views| track.add(engine, params, views, None));
                 (Some(track), fused)
             }
             (track, Some(start)) => match Self::start(engine, &params, start, views) {
                 Ok((mut track, views, table)) => {
-                    let fused = track.add(engine, params, &views, table);
+                    let fused = track.add(engine, params, views, table);
                     (Some(track), fused)
                 }
                 Err(refusal) => (track, Err(refusal)),
@@ -137,19 +137,19 @@ impl Track {
         &mut self,
         engine: &Engine,
         params: DetectParams,
-        views: &Observation,
+        mut views: Observation,
         table: Option<pb::FoundTable>,
     ) -> Result<Fused, Refusal> {
         let started = Instant::now();
         self.cubes.check(&engine.source)?;
         params.check_objects(views.is_labelled())?;
-        let integrated = self.cubes.integrate(views)?;
-        let warnings = integrated.warnings.clone();
+        let integrated = self.cubes.integrate(&mut views, params.table)?;
+        let (warnings, depth_factors) = (integrated.warnings.clone(), integrated.depth_factors.clone());
         let objects = views.objects(self.cubes.frame_from_task(), &params.objects)?;
         // Without points: those of earlier views are not stored.
         let scenes = self.cubes.scenes(integrated.without_points(), objects.as_ref(), &params)?;
         self.params = params;
-        let observed = Observed { fusion: Some(started.elapsed()), warnings, table };
+        let observed = Observed { fusion: Some(started.elapsed()), warnings, table, depth_factors };
         Ok((scenes, self.origin.clone(), observed))
     }
 }

@@ -153,13 +153,14 @@ impl Bench {
             seed: self.scene.seed,
         };
         let setup = format!(
-            "{}, objects {}{}, views {}, noise {} ({}), {} objects per scene, {} rounds, seed {}",
+            "{}, objects {}{}, views {}, noise {} ({}){}, {} objects per scene, {} rounds, seed {}",
             self.scene.scene.name(),
             self.scene.objects.as_deref().unwrap_or("test"),
             self.scene.part.suffix(),
             self.scene.views,
             benchmark.noise.share,
             self.scene.sensor.name(),
+            if benchmark.noise.is_scale_corrected { ", scale corrected" } else { "" },
             benchmark.count,
             benchmark.rounds,
             benchmark.seed

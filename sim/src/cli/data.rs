@@ -45,6 +45,7 @@ impl DataArgs {
             observations: config.observations,
             noise: config.noise.share,
             sensor: self.scene.sensor.name().to_owned(),
+            correct_depth_scale: config.noise.is_scale_corrected,
             seed: config.seed,
             observation_seed: None,
             network: None,

@@ -36,6 +36,10 @@ pub struct Observe {
     #[arg(long, value_enum, default_value = "dex")]
     sensor: Sensor,
 
+    /// Correct the scale of the depths by the table, as for `label`.
+    #[arg(long)]
+    correct_depth_scale: bool,
+
     /// Seed of the views and the noise. The scenes stay the same.
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -69,7 +73,11 @@ impl Observe {
             points: made.points,
             views: parse(&made.views)?,
             observations: made.observations,
-            noise: DepthNoise { share: made.noise, sensor: Sensor::of(&made.sensor)? },
+            noise: DepthNoise {
+                share: made.noise,
+                sensor: Sensor::of(&made.sensor)?,
+                is_scale_corrected: made.correct_depth_scale,
+            },
             seed: made.seed,
         };
         if let Some(&first) = scenes.first() {
@@ -87,6 +95,7 @@ impl Observe {
             observations: self.observations,
             noise: self.noise,
             sensor: self.sensor.name().to_owned(),
+            correct_depth_scale: self.correct_depth_scale,
             observation_seed: Some(self.seed),
             ..made
         });
@@ -97,7 +106,8 @@ impl Observe {
         let progress = ProgressBar::new(scenes.len() as u64).with_style(ProgressStyle::with_template(style)?);
         progress.set_position(done as u64);
         progress.reset_eta();
-        let noise = DepthNoise { share: self.noise, sensor: self.sensor.into() };
+        let noise =
+            DepthNoise { share: self.noise, sensor: self.sensor.into(), is_scale_corrected: self.correct_depth_scale };
         let config = SceneConfig { views, observations: self.observations, noise, ..before };
         ordered::for_each(
             done as u64..scenes.len() as u64,

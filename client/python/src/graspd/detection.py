@@ -154,6 +154,8 @@ class Detection:
     """Signs that the geometry of the request is wrong, or that the network was not trained for it."""
     table: FoundTable | None = None
     """The table that was found, if the workspace has `find_table`."""
+    depth_factors: tuple[float, ...] = ()
+    """By which the depths of each view were multiplied, if the workspace has `correct_depth_scale`."""
 
 
 @dataclass(frozen=True)
@@ -177,6 +179,8 @@ class Scores:
     """Signs that the geometry of the request is wrong."""
     table: FoundTable | None
     """The table that was found, if the workspace has `find_table`."""
+    depth_factors: tuple[float, ...]
+    """By which the depths of each view were multiplied, if the workspace has `correct_depth_scale`."""
 
 
 @dataclass(frozen=True)

@@ -242,6 +242,7 @@ def workspace_message(workspace: Workspace) -> pb.Workspace:
         find_table=workspace.find_table,
         gravity=None if workspace.gravity is None else vector_message(workspace.gravity),
         extent=given(extent_message, workspace.extent),
+        correct_depth_scale=workspace.correct_depth_scale,
     )
 
 
@@ -350,6 +351,7 @@ def detection(message: pb.DetectGraspsResponse) -> Detection:
         request_id=message.request_id,
         warnings=tuple(map(warning, message.warnings)),
         table=table(message.table) if message.HasField("table") else None,
+        depth_factors=tuple(message.depth_factors),
     )
 
 
@@ -364,6 +366,7 @@ def scores(message: pb.ScoreGraspsResponse) -> Scores:
         request_id=message.request_id,
         warnings=tuple(map(warning, message.warnings)),
         table=table(message.table) if message.HasField("table") else None,
+        depth_factors=tuple(message.depth_factors),
     )
 
 

@@ -88,6 +88,11 @@ pub(crate) struct SceneArgs {
     #[arg(long, value_name = "FILE|NUMBERS", allow_hyphen_values = true)]
     workspace: Option<Poses>,
 
+    /// Multiply the depths of each image or point cloud by one factor, so that the table is at its height: for cameras
+    /// whose pose is known and whose depth has an error of scale.
+    #[arg(long, conflicts_with = "find_table")]
+    correct_depth_scale: bool,
+
     /// Name of the frame of the grasps.
     #[arg(long, default_value = "", hide_default_value = true)]
     frame_id: String,
@@ -119,7 +124,8 @@ impl SceneArgs {
         let pose = self.workspace.as_ref().map(Poses::one).transpose()?.unwrap_or_default();
         let find_table = self.find_table.then(|| FindTable { gravity: self.gravity.map(|Numbers(gravity)| gravity) });
         let extent = self.size.map(|Numbers(extent)| extent);
-        let workspace = Workspace { pose, size: None, find_table, extent };
+        let correct_depth_scale = self.correct_depth_scale;
+        let workspace = Workspace { pose, size: None, find_table, extent, correct_depth_scale };
         if let Some(intrinsics) = &self.intrinsics {
             return Ok(Scene::Depth(self.images(intrinsics)?, workspace));
         }
@@ -127,8 +133,8 @@ impl SceneArgs {
             return Ok(Scene::Clouds(self.clouds()?, workspace));
         }
         ensure!(
-            find_table.is_none(),
-            "--find-table needs depth images (--intrinsics) or point clouds (--camera-position)"
+            find_table.is_none() && !correct_depth_scale,
+            "--find-table and --correct-depth-scale need depth images (--intrinsics) or point clouds (--camera-position)"
         );
         let [file] = &self.files[..] else {
             bail!(

@@ -47,6 +47,10 @@ pub(crate) fn detection(detection: &Detection) -> String {
             table.share * 100.0
         );
     }
+    if !detection.depth_factors.is_empty() {
+        let factors = detection.depth_factors.iter().map(|factor| format!("{factor:.4}"));
+        text += &format!("depths multiplied by {}\n", factors.collect::<Vec<_>>().join(", "));
+    }
     for warning in &detection.warnings {
         text += &format!("warning: {}\n", warning.message);
     }
@@ -79,6 +83,7 @@ pub(crate) fn detection_json(detection: &Detection) -> String {
         "version": detection.version,
         "grasps": grasps.collect::<Vec<_>>(),
         "table": detection.table.as_ref().map(table_json),
+        "depth_factors": detection.depth_factors,
         "warnings": detection.warnings.iter().map(warning_json).collect::<Vec<_>>(),
         "latency_seconds": object(&stages(&detection.latency).map(|(stage, seconds)| (stage, json!(seconds)))),
         "dropped": detection.dropped.as_ref().map(|d| object(&reasons(d).map(|(reason, n)| (reason, json!(n))))),
@@ -116,6 +121,7 @@ pub(crate) fn scores_json(scores: &Scores) -> String {
         "version": scores.version,
         "scores": scores.scores.iter().map(score).collect::<Vec<_>>(),
         "table": scores.table.as_ref().map(table_json),
+        "depth_factors": scores.depth_factors,
         "warnings": scores.warnings.iter().map(warning_json).collect::<Vec<_>>(),
     });
     format!("{value:#}")

@@ -52,6 +52,7 @@ pub fn provenance() -> Provenance {
         observations: 1,
         noise: 0.0,
         sensor: "dex".to_owned(),
+        correct_depth_scale: false,
         seed: 0,
         observation_seed: None,
         network: None,
