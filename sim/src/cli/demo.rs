@@ -52,7 +52,7 @@ impl Demo {
         let observation = benchmark
             .observe(&world, &mut rng)
             .context("the cameras see no object in this scene; try another --seed")?;
-        println!("a {:?} scene of {} objects, seed {}", self.scene.kind(), world.objects().len(), self.scene.seed);
+        println!("a {} scene of {} objects, seed {}", self.scene.scene.name(), world.objects().len(), self.scene.seed);
         println!("seen in {} depth image(s) of 640×480 pixels", observation.views.len());
 
         let arguments = ["--log".as_ref(), "warn".as_ref(), "--models".as_ref(), self.models.as_os_str()];
