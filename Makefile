@@ -81,6 +81,19 @@ fuzz: ## fuzz the decoders of volumes and views, twenty million inputs each (nee
 bench-sim: ## measure how fast scenes are generated, rendered and labelled on one core
 	$(CARGO) run --release --package grasp-sim --example speed --locked
 
+bench-gpu: ## measure latency and throughput of the server on an NVIDIA GPU, beside PyTorch (PYTORCH=python with torch and onnx)
+	$(CARGO) build --release $(WORKSPACE) --bins --example gpu
+	$(with_libtorch) $(CARGO) build --release $(TRAIN)
+	$(with_libtorch) $(RELEASE)/grasp-train init --network transformer --out $(CARGO_TARGET_DIR)/bench-gpu/transformer.onnx
+	$(RELEASE)/grasp-sim label --scene packed --scenes 1 --points 1 --seed 51 --format processed \
+		--out $(CARGO_TARGET_DIR)/bench-gpu/scene
+	ORT_DYLIB_PATH="$$($(PYTHON) deploy/native.py onnxruntime-gpu)" $(RELEASE)/examples/gpu $(RELEASE)/graspd \
+		$(CARGO_TARGET_DIR)/bench-gpu/scene/scenes/00000000.npz 3 $(CARGO_TARGET_DIR)/bench-gpu/results.json \
+		$(CARGO_TARGET_DIR)/bench-gpu/transformer.onnx models/zoo/vgn-packed.onnx
+	if [ "$(PYTORCH)" ]; then for model in $(CARGO_TARGET_DIR)/bench-gpu/transformer.onnx models/zoo/vgn-packed.onnx; do \
+		for precision in fp16 fp32; do $(PYTORCH) tests/peers/pytorch_latency.py $$model --precision $$precision \
+			--batches 1,4,16,64 --compiled 1,64; done; done; fi
+
 bench-serve: ## measure latency and throughput of the server, libtorch, OpenVINO, Triton and a Python server (idle machine only)
 	$(CARGO) build --release $(WORKSPACE) --bins
 	$(CARGO) build --release $(WORKSPACE) --example serve

@@ -8,6 +8,7 @@ mod calibration;
 mod evaluator;
 pub mod gpd;
 mod graph;
+mod half_computation;
 mod half_weights;
 mod metadata;
 mod networks;

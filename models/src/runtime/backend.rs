@@ -67,6 +67,9 @@ pub enum BackendError {
     /// The file has no scales for 8 bits.
     #[error("the model is not an int8 model; convert it with `grasp-train export --precision int8`")]
     NotInt8,
+    /// The graph cannot be converted to fp16.
+    #[error("the model cannot run in fp16: {0}; use fp32")]
+    Half(String),
     /// An int8 file cannot run in another precision.
     #[error("the model is an int8 model and cannot run in {0}; serve the file that it was exported from")]
     Int8(Precision),
@@ -126,7 +129,9 @@ impl AvailableBackends {
         match provider {
             Provider::TensorRt => vec![Precision::Fp16, Precision::Bf16, Precision::Fp32],
             Provider::OpenVino if self.bf16 => vec![Precision::Bf16, Precision::Fp32],
-            Provider::Cpu | Provider::OpenVino | Provider::Cuda => vec![Precision::Fp32],
+            // One volume is faster in fp32, which uses TF32, on an H200; batches of a transformer in fp16.
+            Provider::Cuda => vec![Precision::Fp32, Precision::Fp16],
+            Provider::Cpu | Provider::OpenVino => vec![Precision::Fp32],
         }
     }
 }
@@ -301,7 +306,7 @@ mod tests {
         assert_eq!(names(machine(OPENVINO, false).backends(None, None, false)), ["openvino fp32", "cpu fp32"]);
         assert_eq!(
             names(machine(GPU, false).backends(None, None, false)),
-            ["tensorrt fp16", "tensorrt bf16", "tensorrt fp32", "cuda fp32", "cpu fp32"]
+            ["tensorrt fp16", "tensorrt bf16", "tensorrt fp32", "cuda fp32", "cuda fp16", "cpu fp32"]
         );
         assert_eq!(names(machine(OPENVINO, true).backends(None, None, true)), ["openvino int8", "cpu int8"]);
     }

@@ -8,9 +8,10 @@ use ort::session::{IoBinding, Session};
 use ort::value::Tensor;
 use prost::Message;
 
-use super::backend::{Backend, Provider};
-use super::{INPUT, LoadReason, OUTPUTS, Options, runtime};
+use super::backend::{Backend, Precision, Provider};
+use super::{BackendError, INPUT, LoadReason, OUTPUTS, Options, runtime};
 use crate::gpd;
+use crate::half_computation::with_half_computation;
 use crate::onnx::ModelProto;
 use crate::upsampling::with_upsampling_folded;
 use crate::{Calibration, MetadataError, with_full_weights};
@@ -38,6 +39,8 @@ pub(super) struct BatchSession {
     session: Session,
     /// The fixed batch size; smaller batches are padded. `None` for any size.
     size: Option<usize>,
+    /// Sizes that batches are padded to, smallest first; empty if they are not padded.
+    padded_sizes: Vec<usize>,
     /// Buffers by batch size, allocated once per size. Callers that only use [`batch_sizes`] need less than three times
     /// the memory of the largest batch.
     buffers: BTreeMap<usize, Buffers>,
@@ -87,12 +90,26 @@ impl<'a> ModelFile<'a> {
         if let Some(provider) = backend.dispatch(self.threads) {
             builder = builder.with_execution_providers([provider]).map_err(ort::Error::from)?;
         }
-        if backend.provider == Provider::OpenVino {
-            // Without this option, operators that OpenVINO does not support run on the CPU kernels without an error.
+        if matches!(backend.provider, Provider::OpenVino | Provider::Cuda) {
+            // Without this option, operators that the provider does not support run on the CPU kernels without an error.
             builder = builder.with_config_entry("session.disable_cpu_ep_fallback", "1").map_err(ort::Error::from)?;
         }
-        Ok(builder.commit_from_memory(self.optimized.as_deref().unwrap_or(self.bytes))?)
+        let bytes = self.optimized.as_deref().unwrap_or(self.bytes);
+        // ONNX Runtime's CUDA kernels compute in the types of the graph.
+        let half = (backend == Backend { provider: Provider::Cuda, precision: Precision::Fp16 })
+            .then(|| half_precision(bytes))
+            .transpose()?;
+        Ok(builder.commit_from_memory(half.as_deref().unwrap_or(bytes))?)
     }
+}
+
+/// The graph with its convolutions and matrix products in f16.
+fn half_precision(bytes: &[u8]) -> Result<Vec<u8>, LoadReason> {
+    let convert = || -> Result<_, Box<dyn std::error::Error>> {
+        let model = with_full_weights(&ModelProto::from_bytes(bytes)?)?;
+        Ok(with_half_computation(&model)?.encode_to_vec())
+    };
+    convert().map_err(|error| BackendError::Half(error.to_string()).into())
 }
 
 /// An equivalent graph, if there is one. Only if our ONNX types represent the whole file: unknown fields would
@@ -109,11 +126,17 @@ impl BatchSession {
     /// supports changing shapes; otherwise there is one per size of [`batch_sizes`].
     ///
     /// OpenVINO fuses the operators after the heads only for a known shape, which halves the time of VGN's network in
-    /// bf16. TensorRT would build a new engine for each size.
+    /// bf16. TensorRT would build a new engine for each size. CUDA searches the fastest convolutions for each new size,
+    /// which takes up to a second, so that batches are padded to sizes that were run when the model was loaded.
     pub fn all(model: &ModelFile, backend: Backend, max_batch: usize) -> Result<Vec<Self>, LoadReason> {
         let fixed = matches!(backend.provider, Provider::OpenVino | Provider::TensorRt) && model.batch.is_some();
         let sizes = if fixed { batch_sizes(max_batch).map(Some).collect() } else { vec![None] };
-        let session = |size| Ok(Self { session: model.open(backend, size)?, size, buffers: BTreeMap::new() });
+        let padded_sizes: Vec<usize> =
+            if backend.provider == Provider::Cuda { batch_sizes(max_batch).collect() } else { Vec::new() };
+        let session = |size| {
+            let (session, padded_sizes) = (model.open(backend, size)?, padded_sizes.clone());
+            Ok(Self { session, size, padded_sizes, buffers: BTreeMap::new() })
+        };
         sizes.into_iter().map(session).collect()
     }
 
@@ -135,7 +158,7 @@ impl BatchSession {
         Ok(buffers.input.extract_tensor_mut().1)
     }
 
-    /// Runs a batch on the content of its buffers. If the fixed size is larger, the outputs of the remaining volumes are
+    /// Runs a batch on the content of its buffers. If the batch is padded, the outputs of the remaining volumes are
     /// ignored.
     pub fn run(&mut self, batch: usize, resolution: usize) -> ort::Result<&OutputTensors> {
         let (session, buffers) = self.session_and_buffers(batch, resolution)?;
@@ -146,13 +169,18 @@ impl BatchSession {
     }
 
     fn session_and_buffers(&mut self, batch: usize, resolution: usize) -> ort::Result<(&mut Session, &mut Buffers)> {
-        let size = self.size.unwrap_or(batch);
+        let size = self.size.unwrap_or_else(|| padded(batch, &self.padded_sizes));
         let buffers = match self.buffers.entry(size) {
             btree_map::Entry::Occupied(entry) => entry.into_mut(),
             btree_map::Entry::Vacant(entry) => entry.insert(Buffers::new(&self.session, size, resolution)?),
         };
         Ok((&mut self.session, buffers))
     }
+}
+
+/// The smallest of `sizes` that holds a batch, or the size of the batch if there is none.
+fn padded(batch: usize, sizes: &[usize]) -> usize {
+    sizes.iter().copied().find(|&size| size >= batch).unwrap_or(batch)
 }
 
 /// The batch sizes that networks are prepared for: the powers of two below `largest`, and `largest`.
@@ -204,5 +232,7 @@ mod tests {
         assert_eq!(sizes(2), [1, 2]);
         assert_eq!(sizes(6), [1, 2, 4, 6]);
         assert_eq!(sizes(8), [1, 2, 4, 8]);
+        assert_eq!([1, 2, 3, 5, 6].map(|batch| padded(batch, &sizes(6))), [1, 2, 4, 6, 6]);
+        assert_eq!(padded(5, &[]), 5, "a provider that needs no padding");
     }
 }

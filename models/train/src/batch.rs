@@ -5,14 +5,19 @@ use grasp::VoxelOrigin;
 use grasp_data::Dataset;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+use tch::{Device, Tensor};
 
 use crate::augment::Transform;
 use crate::loss::Targets;
-use crate::teacher::{Teacher, TeacherError};
+use crate::teacher::Teacher;
+use crate::trainer::TrainError;
 use crate::training_settings::QualityTarget;
 
-/// Number of batches that the background thread reads in advance.
+/// Number of batches that a background thread reads in advance.
 const READ_AHEAD: usize = 2;
+
+/// Background threads for a GPU.
+const GPU_READERS: usize = 4;
 
 /// A scene as an input of a training step, with its augmentation.
 #[derive(Clone, Copy, Debug, Default)]
@@ -29,8 +34,8 @@ pub(crate) struct Example {
 pub(crate) struct Batch {
     /// Number of scenes.
     pub len: usize,
-    /// `[len, N, N, N]`.
-    pub volumes: Vec<f32>,
+    /// `[len, 1, N, N, N]`, on the device of the training.
+    pub volumes: Tensor,
     pub targets: Targets,
     /// The teacher's outputs as targets; empty without a teacher.
     pub teacher_targets: Targets,
@@ -42,8 +47,9 @@ impl Batch {
         examples: &[Example],
         origin: VoxelOrigin,
         quality: QualityTarget,
+        device: Device,
         mut teacher: Option<&mut Teacher>,
-    ) -> Result<Self, TeacherError> {
+    ) -> Result<Self, TrainError> {
         let n = dataset.resolution();
         let mut volumes = vec![0.0; examples.len() * n.pow(3)];
         let (mut targets, mut teacher_targets) = (Targets::default(), Targets::default());
@@ -57,29 +63,43 @@ impl Batch {
                 teacher.add_targets(index, out, &mut ChaCha8Rng::seed_from_u64(voxel_seed), &mut teacher_targets)?;
             }
         }
-        Ok(Self { len: examples.len(), volumes, targets, teacher_targets })
+        let (len, edge) = (examples.len(), n as i64);
+        // Copied to the device here and not in the training step, so that a GPU does not wait for it.
+        let volumes =
+            Tensor::f_from_slice(&volumes)?.f_reshape([len as i64, 1, edge, edge, edge])?.f_to_device(device)?;
+        Ok(Self { len, volumes, targets, teacher_targets })
     }
 }
 
-/// Calls `consume` with the batches of a plan, which a background thread reads.
+/// Calls `consume` with the batches of a plan, which background threads read: several for a GPU, which one thread could
+/// not keep busy. A teacher is one network, so that its outputs are computed by one thread.
 pub(crate) fn read_ahead<R>(
     dataset: &Dataset,
     plan: &[&[Example]],
     origin: VoxelOrigin,
     quality: QualityTarget,
+    device: Device,
     mut teacher: Option<&mut Teacher>,
-    consume: impl FnOnce(mpsc::IntoIter<Result<Batch, TeacherError>>) -> R,
+    consume: impl FnOnce(&mut dyn Iterator<Item = Result<Batch, TrainError>>) -> R,
 ) -> R {
+    let readers = if device.is_cuda() && teacher.is_none() { GPU_READERS } else { 1 };
     thread::scope(|scope| {
-        let (sender, batches) = mpsc::sync_channel(READ_AHEAD);
-        scope.spawn(move || {
-            for examples in plan {
-                // Sending fails when `consume` has returned early.
-                if sender.send(Batch::read(dataset, examples, origin, quality, teacher.as_deref_mut())).is_err() {
-                    break;
-                }
-            }
-        });
-        consume(batches.into_iter())
+        let receivers: Vec<_> = (0..readers)
+            .map(|first| {
+                let (sender, batches) = mpsc::sync_channel(READ_AHEAD);
+                let mut teacher = teacher.take();
+                scope.spawn(move || {
+                    for examples in plan.iter().skip(first).step_by(readers) {
+                        let batch = Batch::read(dataset, examples, origin, quality, device, teacher.as_deref_mut());
+                        // Sending fails when `consume` has returned early.
+                        if sender.send(batch).is_err() {
+                            break;
+                        }
+                    }
+                });
+                batches
+            })
+            .collect();
+        consume(&mut receivers.iter().cycle().take(plan.len()).map_while(|batches| batches.recv().ok()))
     })
 }

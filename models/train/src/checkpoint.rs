@@ -55,6 +55,9 @@ pub struct Checkpoint {
     /// Consecutive results that were not better than the best.
     #[prost(uint64, tag = "11")]
     pub results_since_best: u64,
+    /// Duration of the run so far, seconds.
+    #[prost(double, tag = "12")]
+    pub seconds: f64,
 }
 
 /// Why a run cannot be resumed from a checkpoint.

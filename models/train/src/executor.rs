@@ -12,6 +12,7 @@ use grasp_models::{upsampled_convolutions, with_full_weights};
 use tch::{Device, Kind, Tensor};
 
 use crate::execution_options::ExecutionOptions;
+use crate::gelu::Gelus;
 use crate::operators::NodeCall;
 use crate::pointwise::{cubes, head_convolutions};
 use crate::supported::{ExecuteError, supported_graph};
@@ -28,6 +29,7 @@ pub struct Executor {
     heads: HashSet<usize>,
     /// Convolutions that are computed on their input before upsampling, with the upsampling node.
     upsampled: HashMap<usize, usize>,
+    gelus: Gelus,
 }
 
 /// The outputs of a grasp network, f32: for a batch of volumes, or at single voxels, which are volumes of 1³.
@@ -75,14 +77,15 @@ impl Executor {
                 constants.insert(output_name(node, 0), constant(value, execution.device)?);
             }
         }
-        let (heads, upsampled) = (head_convolutions(graph), upsampled_convolutions(graph));
-        Ok(Self { model, execution, parameters, constants, heads, upsampled })
+        let (heads, upsampled, gelus) = (head_convolutions(graph), upsampled_convolutions(graph), Gelus::of(graph));
+        Ok(Self { model, execution, parameters, constants, heads, upsampled, gelus })
     }
 
-    /// Disables the convolutions before upsampling, so that every value of the graph is computed.
+    /// Disables the convolutions before upsampling and the GELUs in one operation, so that every value of the graph is
+    /// computed.
     #[must_use]
     pub fn without_optimizations(self) -> Self {
-        Self { upsampled: HashMap::new(), ..self }
+        Self { upsampled: HashMap::new(), gelus: Gelus::default(), ..self }
     }
 
     /// The weights with the names of their initializers.
@@ -179,7 +182,15 @@ impl Executor {
             .collect();
         let skipped: HashSet<&String> = upsampled.values().flat_map(|resize| &resize.output).collect();
         let nodes = graph.node.iter().enumerate().filter(|(_, node)| node.op_type() != "Constant");
-        for (index, node) in nodes.filter(|(_, node)| !node.output.iter().any(|name| skipped.contains(name))) {
+        let is_skipped = |index: usize, node: &NodeProto| {
+            self.gelus.inner.contains(&index) || node.output.iter().any(|name| skipped.contains(name))
+        };
+        for (index, node) in nodes.filter(|&(index, node)| !is_skipped(index, node)) {
+            if let Some(x) = self.gelus.inputs.get(&index).and_then(|x| values.get(x)) {
+                let gelu = x.f_gelu("none").map_err(|source| ExecuteError::torch(node, source))?;
+                values.extend(node.output.first().map(|name| (name.clone(), gelu)));
+                continue;
+            }
             let small = upsampled.get(&index).and_then(|resize| resize.input.first());
             let inputs = small
                 .into_iter()

@@ -14,6 +14,7 @@ mod classifier_trainer;
 mod epoch_record;
 mod execution_options;
 mod executor;
+mod gelu;
 pub mod learning_curves;
 mod loss;
 mod operators;

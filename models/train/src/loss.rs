@@ -4,7 +4,7 @@
 use grasp::VoxelOrigin;
 use grasp_data::{DISTINCT_YAWS, Trial};
 use nalgebra::UnitQuaternion;
-use tch::{Kind, Reduction, TchError, Tensor};
+use tch::{Device, Kind, Reduction, TchError, Tensor};
 use thiserror::Error;
 
 use crate::executor::NetworkOutputs;
@@ -158,16 +158,22 @@ impl Targets {
         let width_loss = width_loss.sum(None) * (success * WIDTH_WEIGHT);
 
         let positive = quality.gt(0.5).to_kind(Kind::Float);
-        let count = |tensor: Tensor| tensor.sum(None).double_value(&[]);
-        let true_positives = count(&positive * &labels);
+        let angles = &labels * nearest.detach().clamp_max(1.0).acos() * 2.0;
+        let counts = [angles, &positive * &labels, positive].map(|values| values.sum(None));
+        let losses = [&quality_loss, &rotation_loss, &width_loss].map(Tensor::detach);
+        // One copy: on a GPU each copy waits for all kernels.
+        let sums: Vec<Tensor> = losses.into_iter().chain(counts).collect();
+        let sums = Tensor::f_stack(&sums, 0)?.to_device(Device::Cpu);
+        let sum = |index| sums.double_value(&[index]);
+        let true_positives = sum(4);
         let sums = LossSums {
             voxels: self.len() as f64,
-            quality: quality_loss.double_value(&[]),
-            rotation: rotation_loss.double_value(&[]),
-            width: width_loss.double_value(&[]),
-            angle: count(&labels * nearest.detach().clamp_max(1.0).acos() * 2.0).to_degrees(),
+            quality: sum(0),
+            rotation: sum(1),
+            width: sum(2),
+            angle: sum(3).to_degrees(),
             true_positives,
-            false_positives: count(positive) - true_positives,
+            false_positives: sum(5) - true_positives,
             false_negatives: f64::from(self.labels.iter().sum::<f32>()) - true_positives,
         };
         Ok(Loss { mean: (quality_loss + rotation_loss + width_loss) / self.len() as f64, sums })

@@ -83,6 +83,10 @@ struct TrainArgs {
     /// Number of epochs [default: 30 for vgn, 21 for the transformers].
     #[arg(long)]
     epochs: Option<u64>,
+    /// Time after which the run ends, minutes; its last epoch is cut short. With it the default of --epochs is no limit,
+    /// and the cosine schedule follows the time instead of the steps.
+    #[arg(long)]
+    minutes: Option<f64>,
     /// Scenes per batch [default: 32 for vgn, 64 for the transformers].
     #[arg(long)]
     batch: Option<usize>,

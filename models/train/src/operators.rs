@@ -315,6 +315,6 @@ impl NodeCall<'_> {
     }
 
     fn torch_error(&self, source: TchError) -> ExecuteError {
-        ExecuteError::Torch { node: self.node.name().to_owned(), op: self.node.op_type().to_owned(), source }
+        ExecuteError::torch(self.node, source)
     }
 }

@@ -78,25 +78,22 @@ fn is_pointwise(graph: &GraphProto, node: &NodeProto) -> bool {
 pub(crate) fn cubes(x: &Tensor, voxels: &[i64], edge: i64) -> Result<Tensor, TchError> {
     let (_, channels, depth, height, width) = x.size5()?;
     let reach = edge / 2;
-    let size = voxels.len() * edge.pow(3) as usize;
-    let (mut rows, mut inside) = (Vec::with_capacity(size), Vec::with_capacity(size));
-    for &voxel in voxels {
-        let (volume, [cx, cy, cz]) = (
+    let padded = x.f_permute([0, 2, 3, 4, 1])?.f_constant_pad_nd([&[0; 2][..], &[reach; 6]].concat())?;
+    let [rows, columns] = [height, width].map(|size| size + 2 * reach);
+    let row_of = |volume: i64, [x, y, z]: [i64; 3]| ((volume * (depth + 2 * reach) + x) * rows + y) * columns + z;
+    // The first voxel of a cube has the coordinates in the padded array that its centre has in `x`.
+    let corner = |&voxel: &i64| {
+        row_of(
             voxel / (depth * height * width),
             [voxel / (height * width) % depth, voxel / width % height, voxel % width],
-        );
-        for x in cx - reach..=cx + reach {
-            for y in cy - reach..=cy + reach {
-                for z in cz - reach..=cz + reach {
-                    let is_inside = (0..depth).contains(&x) && (0..height).contains(&y) && (0..width).contains(&z);
-                    rows.push(if is_inside { ((volume * depth + x) * height + y) * width + z } else { 0 });
-                    inside.push(is_inside);
-                }
-            }
-        }
-    }
-    let rows = Tensor::f_from_slice(&rows)?.f_to_device(x.device())?;
-    let inside = Tensor::f_from_slice(&inside)?.f_to_device(x.device())?.to_kind(Kind::Float).f_unsqueeze(1)?;
-    let features = x.f_permute([0, 2, 3, 4, 1])?.f_reshape([-1, channels])?;
-    (features.f_index_select(0, &rows)? * inside).f_reshape([voxels.len() as i64, -1])
+        )
+    };
+    let corners: Vec<i64> = voxels.iter().map(corner).collect();
+    let offsets = |index: i64| row_of(0, [index / (edge * edge), index / edge % edge, index % edge]);
+    let offsets: Vec<i64> = (0..edge.pow(3)).map(offsets).collect();
+    let corners = Tensor::f_from_slice(&corners)?.f_to_device(x.device())?.f_unsqueeze(1)?;
+    let offsets = Tensor::f_from_slice(&offsets)?.f_to_device(x.device())?;
+    let features = padded.f_reshape([-1, channels])?;
+    let cubes = features.f_index_select(0, &corners.f_add(&offsets)?.f_reshape([-1])?)?;
+    cubes.f_to_kind(Kind::Float)?.f_reshape([voxels.len() as i64, -1])
 }

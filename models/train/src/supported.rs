@@ -103,6 +103,12 @@ pub enum ExecuteError {
     Tensor(#[from] TensorError),
 }
 
+impl ExecuteError {
+    pub(crate) fn torch(node: &NodeProto, source: TchError) -> Self {
+        Self::Torch { node: node.name().to_owned(), op: node.op_type().to_owned(), source }
+    }
+}
+
 /// Checks that the opset and all nodes of a model are supported, and returns its graph.
 pub(crate) fn supported_graph(model: &ModelProto) -> Result<&GraphProto, ExecuteError> {
     let graph = model.graph.as_ref().ok_or(ExecuteError::NoGraph)?;

@@ -32,6 +32,9 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
     ensure!(training.save_every >= 0.0, "--save-every is {}, must be at least 0 seconds", training.save_every);
     ensure!(training.weight_decay >= 0.0, "--weight-decay is {}, must be at least 0", training.weight_decay);
     ensure!(training.rotation_weight >= 0.0, "--rotation-weight is {}, must be at least 0", training.rotation_weight);
+    if let Some(minutes) = training.minutes {
+        ensure!(minutes > 0.0, "--minutes is {minutes}, must be greater than 0");
+    }
     if let Some(decay) = training.ema {
         ensure!((0.0..1.0).contains(&decay), "--ema is {decay}, must be at least 0 and less than 1");
     }
@@ -53,7 +56,7 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
         metadata.resolution
     );
     let device = training.device.device()?;
-    let execution = ExecutionOptions { device, bf16: training.bf16, channels_last: true };
+    let execution = ExecutionOptions { device, bf16: training.bf16, channels_last: !device.is_cuda() };
     let mut trainer = Trainer::new(model, dataset, settings.clone(), execution)?;
     if let Some(path) = &training.teacher {
         let (teacher, name) = load_teacher(training, path, &metadata)?;
@@ -78,14 +81,16 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
         .context("cannot install the handler of Ctrl-C")?;
 
     let mut saved = Instant::now();
-    let continues = |epochs: u64, results_since: u64| {
-        epochs < settings.epochs && training.patience.is_none_or(|patience| results_since < patience)
+    let continues = |trainer: &Trainer, results_since: u64| {
+        trainer.epochs() < settings.epochs
+            && !trainer.is_over()
+            && training.patience.is_none_or(|patience| results_since < patience)
     };
-    while continues(trainer.epochs(), best.results_since) {
+    while continues(&trainer, best.results_since) {
         if training.follow && trainer.follow()? > 0 {
             print_counts(&trainer);
         }
-        let bar = progress_bar(trainer.steps_per_epoch(), trainer.epochs() + 1, settings.epochs);
+        let bar = progress_bar(trainer.steps_per_epoch(), trainer.epochs() + 1, &settings);
         let epoch = trainer.epoch(&stop, |batch, loss| {
             bar.set_position(batch);
             bar.set_message(format!("{loss:.4}"));
@@ -95,7 +100,8 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
         let interrupted = matches!(epoch, EpochOutcome::Interrupted);
         if let EpochOutcome::Completed(mut record) = epoch {
             add_provenance(training, &settings, trainer.dataset(), &mut metadata);
-            let due = trainer.epochs().is_multiple_of(training.evaluate_every) || trainer.epochs() == settings.epochs;
+            let last = trainer.epochs() == settings.epochs || trainer.is_over();
+            let due = last || trainer.epochs().is_multiple_of(training.evaluate_every);
             if let Some(command) = training.evaluate.as_deref().filter(|_| due) {
                 write_model(&mut trainer, &metadata, Some(&record), &files.evaluated)?;
                 record.benchmark = Some(evaluate(command, &files.evaluated)?);
@@ -107,7 +113,7 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
             learning_curves::draw(&files.curves, &records)?;
         }
         let BestResult { cost, results_since } = best;
-        let ends = interrupted || !continues(trainer.epochs(), results_since);
+        let ends = interrupted || !continues(&trainer, results_since);
         let due = ends || saved.elapsed().as_secs_f64() >= training.save_every;
         if better || training.keep == KeptWeights::Last && due {
             add_provenance(training, &settings, trainer.dataset(), &mut metadata);
@@ -216,7 +222,8 @@ fn settings(training: &TrainArgs, metadata: &Metadata) -> TrainingSettings {
     let (epochs, batch, learning_rate) = if is_transformer { (21, 64, 1e-4) } else { (30, 32, 3e-4) };
     let allows = |change| training.augment.contains(&change);
     TrainingSettings {
-        epochs: training.epochs.unwrap_or(epochs),
+        epochs: training.epochs.unwrap_or(if training.minutes.is_some() { u64::MAX } else { epochs }),
+        minutes: training.minutes,
         batch: training.batch.unwrap_or(batch),
         accumulate: training.accumulate,
         learning_rate: training.lr.unwrap_or(learning_rate),
@@ -280,9 +287,11 @@ fn write_model(trainer: &mut Trainer, metadata: &Metadata, last: Option<&EpochRe
     Ok(model.write(path)?)
 }
 
-fn progress_bar(steps: u64, epoch: u64, epochs: u64) -> ProgressBar {
+fn progress_bar(steps: u64, epoch: u64, settings: &TrainingSettings) -> ProgressBar {
     let style = ProgressStyle::with_template("{prefix} {bar:30} {pos}/{len} {elapsed} (left {eta}) loss {msg}");
-    let bar = ProgressBar::new(steps).with_prefix(format!("epoch {epoch}/{epochs}"));
+    let end =
+        settings.minutes.map_or(format!("/{}", settings.epochs), |minutes| format!(", {minutes} minutes in all:"));
+    let bar = ProgressBar::new(steps).with_prefix(format!("epoch {epoch}{end}"));
     bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 

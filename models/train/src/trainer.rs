@@ -6,7 +6,7 @@ use grasp_models::onnx::ModelProto;
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use tch::{TchError, Tensor, no_grad};
+use tch::{TchError, no_grad};
 use thiserror::Error;
 
 use crate::adam::Adam;
@@ -81,6 +81,9 @@ pub struct Trainer {
     epoch: u64,
     batch: u64,
     sums: LossSums,
+    /// Start of this part of the run, and the duration of the parts before it.
+    started: Instant,
+    seconds_before: f64,
 }
 
 impl Trainer {
@@ -112,6 +115,8 @@ impl Trainer {
             epoch: 0,
             batch: 0,
             sums: LossSums::default(),
+            started: Instant::now(),
+            seconds_before: 0.0,
         };
         trainer.update_scenes()?;
         Ok(trainer)
@@ -185,6 +190,17 @@ impl Trainer {
         self.adam.steps()
     }
 
+    /// Whether the time of the run is over.
+    #[must_use]
+    pub fn is_over(&self) -> bool {
+        self.settings.minutes.is_some_and(|limit| self.seconds() >= 60.0 * limit)
+    }
+
+    /// Duration of the run, with the parts before an interruption.
+    fn seconds(&self) -> f64 {
+        self.seconds_before + self.started.elapsed().as_secs_f64()
+    }
+
     /// Steps in an epoch.
     #[must_use]
     pub fn steps_per_epoch(&self) -> u64 {
@@ -219,6 +235,7 @@ impl Trainer {
             batch: self.batch,
             sums: self.sums.to_list(),
             scenes: self.dataset.sizes().into_iter().map(|size| size as u64).collect(),
+            seconds: self.seconds(),
             ..Checkpoint::default()
         };
         checkpoint.store(&self.executor, &self.adam, self.average.as_ref());
@@ -244,11 +261,12 @@ impl Trainer {
         self.epoch = checkpoint.epoch;
         self.batch = checkpoint.batch;
         self.sums = sums;
+        (self.started, self.seconds_before) = (Instant::now(), checkpoint.seconds);
         Ok(())
     }
 
-    /// Trains until the end of the epoch, or until `stop` is set. After every step it calls `report` with the number of
-    /// completed steps of the epoch and their mean loss.
+    /// Trains until the end of the epoch, until the time of the run is over, or until `stop` is set. After every step it
+    /// calls `report` with the number of completed steps of the epoch and their mean loss.
     ///
     /// # Errors
     /// [`TrainError`] when the network or the loss fails.
@@ -262,17 +280,19 @@ impl Trainer {
         // Moved out of `self`, because the steps borrow `self` mutably, and moved back below.
         let dataset = std::mem::replace(&mut self.dataset, Dataset::empty());
         let mut teacher = self.teacher.take();
+        let device = self.executor.device();
         let batch_teacher = teacher.as_mut();
         let done: Result<bool, TrainError> =
-            read_ahead(&dataset, &plan, origin, quality, batch_teacher, |mut batches| {
+            read_ahead(&dataset, &plan, origin, quality, device, batch_teacher, |batches| {
                 let mut remaining = plan.len();
-                while remaining > 0 {
+                while remaining > 0 && !(self.batch > 0 && self.is_over()) {
                     if stop.load(Ordering::Relaxed) {
                         return Ok(false);
                     }
                     let passes = accumulate.min(remaining);
-                    learning_rate = self.settings.learning_rate_at(self.steps(), self.steps_per_epoch());
-                    volumes += self.step(batches.by_ref().take(passes), passes, learning_rate)?;
+                    let minutes = self.seconds() / 60.0;
+                    learning_rate = self.settings.learning_rate_at(self.steps(), self.steps_per_epoch(), minutes);
+                    volumes += self.step((&mut *batches).take(passes), passes, learning_rate)?;
                     remaining -= passes;
                     self.batch += passes as u64;
                     report(self.batch.div_ceil(accumulate as u64), self.sums.loss());
@@ -305,7 +325,7 @@ impl Trainer {
     /// One step over `passes` batches, whose gradients are averaged. Returns the number of volumes.
     fn step(
         &mut self,
-        batches: impl Iterator<Item = Result<Batch, TeacherError>>,
+        batches: impl Iterator<Item = Result<Batch, TrainError>>,
         passes: usize,
         learning_rate: f64,
     ) -> Result<usize, TrainError> {
@@ -335,7 +355,8 @@ impl Trainer {
         let scenes: Vec<_> = self.validation.iter().map(|&scene| Example { scene, ..Example::default() }).collect();
         let TrainingSettings { batch, voxel_origin, quality, .. } = self.settings;
         let plan: Vec<&[Example]> = scenes.chunks(batch).collect();
-        read_ahead(&self.dataset, &plan, voxel_origin, quality, None, |batches| {
+        let device = self.executor.device();
+        read_ahead(&self.dataset, &plan, voxel_origin, quality, device, None, |batches| {
             let mut sums = LossSums::default();
             for batch in batches {
                 if let Some(loss) = no_grad(|| self.loss(&batch?))? {
@@ -372,12 +393,9 @@ impl Trainer {
         if batch.targets.is_empty() {
             return Ok(None);
         }
-        let edge = (batch.volumes.len() as f64 / batch.len as f64).cbrt().round() as i64;
-        let volumes = Tensor::f_from_slice(&batch.volumes)?.f_reshape([batch.len as i64, 1, edge, edge, edge])?;
-        let volumes = volumes.to_device(self.executor.device());
         let (trials, teacher_outputs) = (batch.targets.len(), batch.teacher_targets.len());
         let voxels = [batch.targets.voxels(), batch.teacher_targets.voxels()].concat();
-        let outputs = self.executor.forward_at(&volumes, &voxels)?;
+        let outputs = self.executor.forward_at(&batch.volumes, &voxels)?;
         let Loss { mut mean, sums } = self.checked(batch.targets.loss(&outputs.narrow(0, trials), &self.weights))?;
         if teacher_outputs > 0 {
             // Without class weights: the teacher was trained with its own.

@@ -31,6 +31,9 @@ impl QualityTarget {
 pub struct TrainingSettings {
     /// Number of epochs.
     pub epochs: u64,
+    /// Time after which the run ends, minutes; its last epoch is cut short. `None`: no limit.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub minutes: Option<f64>,
     /// Scenes per forward pass.
     pub batch: usize,
     /// Forward passes per step.
@@ -73,10 +76,11 @@ fn origin_name<S: serde::Serializer>(origin: &VoxelOrigin, serializer: S) -> Res
 }
 
 impl TrainingSettings {
-    /// The learning rate of step `step`, from 0: linear warm-up, then constant, or half a cosine to 0 (Loshchilov and
-    /// Hutter, "SGDR: Stochastic Gradient Descent with Warm Restarts", ICLR 2017, without restarts).
+    /// The learning rate of step `step`, from 0, `minutes` after the start: linear warm-up, then constant, or half
+    /// a cosine to 0 (Loshchilov and Hutter, "SGDR: Stochastic Gradient Descent with Warm Restarts", ICLR 2017, without
+    /// restarts). The cosine follows the time if the run has a time limit, otherwise the steps.
     #[must_use]
-    pub fn learning_rate_at(&self, step: u64, steps_per_epoch: u64) -> f64 {
+    pub fn learning_rate_at(&self, step: u64, steps_per_epoch: u64, minutes: f64) -> f64 {
         let Self { epochs, learning_rate, warmup, cosine, .. } = *self;
         if step < warmup {
             return learning_rate * (step + 1) as f64 / warmup as f64;
@@ -84,8 +88,13 @@ impl TrainingSettings {
         if !cosine {
             return learning_rate;
         }
-        let last = (epochs * steps_per_epoch).max(warmup + 1);
-        let progress = (step - warmup) as f64 / (last - warmup) as f64;
+        let progress = match self.minutes {
+            Some(limit) => minutes / limit,
+            None => {
+                let last = (epochs * steps_per_epoch).max(warmup + 1);
+                (step - warmup) as f64 / (last - warmup) as f64
+            }
+        };
         learning_rate * 0.5 * (1.0 + (std::f64::consts::PI * progress.min(1.0)).cos())
     }
 

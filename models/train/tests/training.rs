@@ -20,6 +20,7 @@ const EXECUTION: ExecutionOptions = ExecutionOptions { device: Device::Cpu, bf16
 
 fn settings() -> TrainingSettings {
     TrainingSettings {
+        minutes: None,
         epochs: 3,
         batch: 3,
         accumulate: 1,
@@ -128,6 +129,26 @@ fn weight_decay_reduces_the_weights() {
     };
     let (kept, decayed) = (norm(0.0), norm(1.0));
     assert!(decayed < 0.97 * kept, "{decayed} and {kept}");
+}
+
+#[test]
+fn a_run_with_a_time_limit_ends_in_the_middle_of_an_epoch() {
+    let settings = TrainingSettings { minutes: Some(1e-9), cosine: true, batch: 1, ..settings() };
+    let mut run = trainer(support::dataset(8, N), &settings, EXECUTION);
+    let record = epoch(&mut run);
+    assert!(run.is_over());
+    assert_eq!(record.steps, 1, "an epoch has at least one step");
+    assert!(record.loss.is_finite());
+
+    let mut resumed = trainer(support::dataset(8, N), &settings, EXECUTION);
+    resumed.resume(&Checkpoint { seconds: 60.0, ..run.checkpoint() }).unwrap();
+    assert!(resumed.is_over(), "the time before the interruption counts");
+
+    let settings = TrainingSettings { minutes: Some(10.0), warmup: 4, ..settings };
+    let rate = |step, minutes| settings.learning_rate_at(step, 1, minutes) / settings.learning_rate;
+    assert_eq!(rate(1, 9.0), 0.5, "the warm-up follows the steps");
+    assert!((rate(1000, 5.0) - 0.5).abs() < 1e-9, "half of the time");
+    assert!(rate(1000, 10.0) < 1e-9);
 }
 
 #[test]
