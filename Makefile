@@ -28,7 +28,7 @@ with_libtorch = LIBTORCH="$$($(PYTHON) deploy/native.py libtorch)" && export LIB
 	LD_LIBRARY_PATH="$$LIBTORCH/lib$${LD_LIBRARY_PATH:+:$$LD_LIBRARY_PATH}" && export LD_LIBRARY_PATH &&
 
 
-.PHONY: help demo build test fmt fmt-check lint doc deny test-rust test-train test-python test-faults fuzz bench-sim \
+.PHONY: help demo build test fmt fmt-check lint doc deny test-rust test-train test-python test-faults fuzz bench-sim bench-gpu \
 	bench-serve soak tables clean
 # The parts of `test` run in this order also under `make -j`: fast failures first.
 .NOTPARALLEL:

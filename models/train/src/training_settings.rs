@@ -29,7 +29,8 @@ impl QualityTarget {
 /// Settings of a run. Together with the initial network and the data they determine its result.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct TrainingSettings {
-    /// Number of epochs.
+    /// Number of epochs; `u64::MAX`: no limit.
+    #[serde(skip_serializing_if = "is_unlimited")]
     pub epochs: u64,
     /// Time after which the run ends, minutes; its last epoch is cut short. `None`: no limit.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -65,6 +66,11 @@ pub struct TrainingSettings {
     pub voxel_origin: VoxelOrigin,
     /// Whether convolutions and matrix products are computed in bf16.
     pub bf16: bool,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde requires a reference")]
+fn is_unlimited(epochs: &u64) -> bool {
+    *epochs == u64::MAX
 }
 
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde requires a reference")]
