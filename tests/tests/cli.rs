@@ -727,7 +727,9 @@ async fn objects_are_chosen_by_their_labels_and_own_grasps_are_scored() {
     assert!(scores.iter().all(|score| score["quality"].as_f64().unwrap() >= 0.0), "{scores:?}");
     let table = [&given[..], &["--grasps".to_owned(), mine]].concat();
     let printed = run(&server, &command(&["score"], &table));
-    assert!(text(&printed.stdout).contains("violations"), "{printed:?}");
+    for expected in ["violations", "m from the camera"] {
+        assert!(text(&printed.stdout).contains(expected), "{expected}: {printed:?}");
+    }
 }
 
 fn png_header(

@@ -39,7 +39,19 @@ pub(crate) fn detection(detection: &Detection) -> String {
         let reasons = reasons(dropped).map(|(reason, voxels)| format!("{} {voxels}", reason.replace('_', " ")));
         text += &format!("dropped: {}\n", reasons.join(", "));
     }
-    if let Some(table) = &detection.table {
+    text += &found(detection.table.as_ref(), &detection.depth_factors);
+    for warning in &detection.warnings {
+        text += &format!("warning: {}\n", warning.message);
+    }
+    let stages = stages(&detection.latency).map(|(stage, seconds)| format!("{stage} {:.2}", seconds * 1e3));
+    text += &format!("{} {}; in ms: {}", detection.model, detection.version, stages.join(", "));
+    text
+}
+
+/// The lines on the table that was found and on the correction of the depths, if there are any.
+fn found(table: Option<&FoundTable>, depth_factors: &[f64]) -> String {
+    let mut text = String::new();
+    if let Some(table) = table {
         text += &format!(
             "table: {:.3} m from the camera, {:.1}° from its optical axis, {:.0} % of the image\n",
             table.distance,
@@ -47,15 +59,10 @@ pub(crate) fn detection(detection: &Detection) -> String {
             table.share * 100.0
         );
     }
-    if !detection.depth_factors.is_empty() {
-        let factors = detection.depth_factors.iter().map(|factor| format!("{factor:.4}"));
+    if !depth_factors.is_empty() {
+        let factors = depth_factors.iter().map(|factor| format!("{factor:.4}"));
         text += &format!("depths multiplied by {}\n", factors.collect::<Vec<_>>().join(", "));
     }
-    for warning in &detection.warnings {
-        text += &format!("warning: {}\n", warning.message);
-    }
-    let stages = stages(&detection.latency).map(|(stage, seconds)| format!("{stage} {:.2}", seconds * 1e3));
-    text += &format!("{} {}; in ms: {}", detection.model, detection.version, stages.join(", "));
     text
 }
 
@@ -99,7 +106,7 @@ pub(crate) fn scores(scores: &Scores) -> String {
         let quality = format!("{:.3}", score.quality);
         table.add_row(right([(index + 1).to_string(), quality, open_width, object, violations(score).join(", ")]));
     }
-    let mut text = format!("{table}\n");
+    let mut text = format!("{table}\n") + &found(scores.table.as_ref(), &scores.depth_factors);
     for warning in &scores.warnings {
         text += &format!("warning: {}\n", warning.message);
     }
