@@ -7,8 +7,10 @@
 
 #[path = "serve/findings.rs"]
 mod findings;
+#[path = "serve/volume_file.rs"]
+mod volume_file;
 
-use std::fs::{self, File};
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Arc;
@@ -18,8 +20,6 @@ use anyhow::{Context, ensure};
 use grasp::Volume;
 use grasp_client::{Arrivals, Client, LocalServer, Options, Report, Until, load};
 use grasp_models::{Network, Options as Running, Precision, Provider, init};
-use nalgebra::Isometry3;
-use npyz::npz::NpzArchive;
 use tonic::Code;
 
 use crate::findings::{Aim, Findings, Table, milliseconds};
@@ -42,7 +42,7 @@ async fn main() -> anyhow::Result<()> {
     };
     let bench = Bench {
         graspd: PathBuf::from(graspd),
-        scene: Arc::new(volume(Path::new(scene))?),
+        scene: Arc::new(volume_file::read(Path::new(scene))?),
         provider: std::env::var("GRASPD_PROVIDER").map_or(Ok(Provider::Cuda), |name| name.parse())?,
         duration: Duration::from_secs_f64(seconds.parse()?),
     };
@@ -182,17 +182,4 @@ fn conditions() -> anyhow::Result<String> {
         cpu.trim_start_matches(['\t', ':', ' ']),
         init()?.version
     ))
-}
-
-/// The volume of a file of `grasp-sim label --format processed`.
-fn volume(path: &Path) -> anyhow::Result<Volume> {
-    let file = File::open(path).with_context(|| format!("cannot open {}", path.display()))?;
-    let mut archive = NpzArchive::new(file)?;
-    let grid = archive.by_name("grid")?.context("no array `grid`")?;
-    let values: Vec<f32> = match grid.dtype().num_bytes() {
-        Some(1) => grid.into_vec::<u8>()?.into_iter().map(|value| f32::from(value) / 255.0).collect(),
-        _ => grid.into_vec::<f32>()?,
-    };
-    let voxel_size = grasp::WORKSPACE_SIZE / grasp::RESOLUTION as f64;
-    Ok(Volume::new(grasp::RESOLUTION, voxel_size, Isometry3::identity(), values)?)
 }

@@ -1,4 +1,4 @@
-use std::fs::{self, File};
+use std::fs;
 use std::path::Path;
 use std::process::Command;
 
@@ -6,8 +6,8 @@ use anyhow::{Context, ensure};
 use grasp::Volume;
 use grasp_models::init;
 use grasp_tests::grasp_sim;
-use nalgebra::Isometry3;
-use npyz::npz::NpzArchive;
+
+use crate::volume_file;
 
 /// The measured network, with trained weights.
 pub(crate) const ZOO: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo/vgn-packed.onnx");
@@ -36,12 +36,5 @@ pub(crate) fn scene(folder: &Path) -> anyhow::Result<Volume> {
     let output = Command::new(grasp_sim()).args(label.split(' ')).arg(&out).output()?;
     ensure!(output.status.success(), "grasp-sim: {}", String::from_utf8_lossy(&output.stderr));
     let path = fs::read_dir(out.join("scenes"))?.next().context("a scene")??.path();
-    let mut archive = NpzArchive::new(File::open(path)?)?;
-    let grid = archive.by_name("grid")?.context("a grid")?;
-    let values: Vec<f32> = match grid.dtype().num_bytes() {
-        Some(1) => grid.into_vec::<u8>()?.into_iter().map(|value| f32::from(value) / 255.0).collect(),
-        _ => grid.into_vec::<f32>()?,
-    };
-    let voxel_size = grasp::WORKSPACE_SIZE / grasp::RESOLUTION as f64;
-    Ok(Volume::new(grasp::RESOLUTION, voxel_size, Isometry3::identity(), values)?)
+    volume_file::read(&path)
 }

@@ -16,6 +16,7 @@ mod findings;
 mod overload;
 mod peers;
 mod streams;
+mod volume_file;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
