@@ -28,8 +28,8 @@ with_libtorch = LIBTORCH="$$($(PYTHON) deploy/native.py libtorch)" && export LIB
 	LD_LIBRARY_PATH="$$LIBTORCH/lib$${LD_LIBRARY_PATH:+:$$LD_LIBRARY_PATH}" && export LD_LIBRARY_PATH &&
 
 
-.PHONY: help demo build test fmt fmt-check lint doc deny test-rust test-train test-python test-faults fuzz bench-sim bench-gpu \
-	bench-serve soak tables clean
+.PHONY: help demo build test fmt fmt-check lint doc deny test-rust test-train test-python test-faults fuzz bench-sim \
+	bench-gpu bench-serve soak tables clean
 # The parts of `test` run in this order also under `make -j`: fast failures first.
 .NOTPARALLEL:
 
@@ -84,7 +84,8 @@ bench-sim: ## measure how fast scenes are generated, rendered and labelled on on
 bench-gpu: ## measure latency and throughput of the server on an NVIDIA GPU, beside PyTorch (PYTORCH=python with torch and onnx)
 	$(CARGO) build --release $(WORKSPACE) --bins --example gpu
 	$(with_libtorch) $(CARGO) build --release $(TRAIN)
-	$(with_libtorch) $(RELEASE)/grasp-train init --network transformer --out $(CARGO_TARGET_DIR)/bench-gpu/transformer.onnx
+	$(with_libtorch) $(RELEASE)/grasp-train init --network transformer --orientation axes \
+		--out $(CARGO_TARGET_DIR)/bench-gpu/transformer.onnx
 	$(RELEASE)/grasp-sim label --scene packed --scenes 1 --points 1 --seed 51 --format processed \
 		--out $(CARGO_TARGET_DIR)/bench-gpu/scene
 	ORT_DYLIB_PATH="$$($(PYTHON) deploy/native.py onnxruntime-gpu)" $(RELEASE)/examples/gpu $(RELEASE)/graspd \

@@ -126,8 +126,8 @@ impl BatchSession {
     /// supports changing shapes; otherwise there is one per size of [`batch_sizes`].
     ///
     /// OpenVINO fuses the operators after the heads only for a known shape, which halves the time of VGN's network in
-    /// bf16. TensorRT would build a new engine for each size. CUDA searches the fastest convolutions for each new size,
-    /// which takes up to a second, so that batches are padded to sizes that were run when the model was loaded.
+    /// bf16. TensorRT would build a new engine for each size. CUDA searches the fastest convolutions for each new size
+    /// (`cudnn_conv_algo_search`, by default exhaustive), so that batches are padded to sizes that were run when the model was loaded.
     pub fn all(model: &ModelFile, backend: Backend, max_batch: usize) -> Result<Vec<Self>, LoadReason> {
         let fixed = matches!(backend.provider, Provider::OpenVino | Provider::TensorRt) && model.batch.is_some();
         let sizes = if fixed { batch_sizes(max_batch).map(Some).collect() } else { vec![None] };
