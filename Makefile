@@ -84,6 +84,7 @@ bench-sim: ## measure how fast scenes are generated, rendered and labelled on on
 bench-gpu: ## measure latency and throughput of the server on an NVIDIA GPU, beside PyTorch (PYTORCH=python with torch and onnx)
 	$(CARGO) build --release $(WORKSPACE) --bins --example gpu
 	$(with_libtorch) $(CARGO) build --release $(TRAIN)
+	mkdir -p $(CARGO_TARGET_DIR)/bench-gpu
 	$(with_libtorch) $(RELEASE)/grasp-train init --network transformer --orientation axes \
 		--out $(CARGO_TARGET_DIR)/bench-gpu/transformer.onnx
 	$(RELEASE)/grasp-sim label --scene packed --scenes 1 --points 1 --seed 51 --format processed \

@@ -6,9 +6,7 @@
 
 use std::collections::{HashMap, HashSet};
 
-use half::f16;
-
-use crate::onnx::{AttributeProto, DataType, GraphProto, ModelProto, NodeProto, TensorError, TensorProto};
+use crate::onnx::{DataType, GraphProto, ModelProto, NodeProto, TensorError, TensorProto};
 
 /// Suffix of the names of values in f16.
 const SUFFIX: &str = ".f16";
@@ -124,14 +122,17 @@ impl<'a> Conversion<'a> {
                     continue;
                 }
                 match self.weights.get(input.as_str()) {
-                    Some(weight) => weights.push(half_weight(weight)?),
-                    None => nodes.push(cast(input, &half_name(input), DataType::Float16)),
+                    Some(weight) => {
+                        let values = weight.to_f32()?;
+                        weights.push(TensorProto::from_f32_as_f16(&half_name(input), &weight.dims, &values));
+                    }
+                    None => nodes.push(NodeProto::cast(input, &half_name(input), DataType::Float16)),
                 }
             }
             node.output = node.output.iter().map(|name| half_name(name)).collect();
             nodes.push(node);
             let read = graph.node[index].output.iter().filter(|name| self.read_in_f32.contains(name.as_str()));
-            nodes.extend(read.map(|name| cast(&half_name(name), name, DataType::Float)));
+            nodes.extend(read.map(|name| NodeProto::cast(&half_name(name), name, DataType::Float)));
         }
         let mut initializer = graph.initializer.clone();
         initializer.extend(weights);
@@ -164,28 +165,6 @@ fn up_to_products(graph: &GraphProto) -> HashSet<usize> {
 
 fn half_name(name: &str) -> String {
     format!("{name}{SUFFIX}")
-}
-
-fn half_weight(weight: &TensorProto) -> Result<TensorProto, TensorError> {
-    let values = weight.to_f32()?;
-    Ok(TensorProto {
-        dims: weight.dims.clone(),
-        name: Some(half_name(weight.name())),
-        data_type: Some(DataType::Float16.into()),
-        raw_data: Some(values.iter().flat_map(|&value| f16::from_f32(value).to_le_bytes()).collect()),
-        ..TensorProto::default()
-    })
-}
-
-fn cast(from: &str, to: &str, data_type: DataType) -> NodeProto {
-    NodeProto {
-        op_type: Some("Cast".to_owned()),
-        name: Some(format!("{to}.cast")),
-        input: vec![from.to_owned()],
-        output: vec![to.to_owned()],
-        attribute: vec![AttributeProto::int("to", i64::from(i32::from(data_type)))],
-        ..NodeProto::default()
-    }
 }
 
 #[cfg(test)]

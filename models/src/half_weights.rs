@@ -4,9 +4,7 @@
 
 use std::collections::{HashMap, HashSet};
 
-use half::f16;
-
-use crate::onnx::{AttributeProto, DataType, GraphProto, ModelProto, NodeProto, TensorError, TensorProto};
+use crate::onnx::{DataType, GraphProto, ModelProto, NodeProto, TensorError, TensorProto};
 
 /// Suffix of the names of weights that are stored as f16.
 const SUFFIX: &str = ".f16";
@@ -33,19 +31,9 @@ pub fn with_half_weights(model: &ModelProto) -> Result<ModelProto, TensorError> 
         if !values.iter().all(|value| value.abs() <= F16_MAX) {
             continue;
         }
-        let (name, stored) = (weight.name().to_owned(), format!("{}{SUFFIX}", weight.name()));
-        weight.name = Some(stored.clone());
-        weight.data_type = Some(DataType::Float16.into());
-        weight.float_data.clear();
-        weight.raw_data = Some(values.iter().flat_map(|&value| f16::from_f32(value).to_le_bytes()).collect());
-        casts.push(NodeProto {
-            op_type: Some("Cast".to_owned()),
-            name: Some(format!("{name}.cast")),
-            input: vec![stored],
-            output: vec![name],
-            attribute: vec![AttributeProto::int("to", i64::from(i32::from(DataType::Float)))],
-            ..NodeProto::default()
-        });
+        let stored = format!("{}{SUFFIX}", weight.name());
+        casts.push(NodeProto::cast(&stored, weight.name(), DataType::Float));
+        *weight = TensorProto::from_f32_as_f16(&stored, &weight.dims, &values);
     }
     graph.node.splice(0..0, casts);
     Ok(model)

@@ -27,6 +27,19 @@ impl NodeProto {
     pub fn attribute(&self, name: &str) -> Option<&AttributeProto> {
         self.attribute.iter().find(|attribute| attribute.name() == name)
     }
+
+    /// A cast of the value `from` to another element type.
+    #[must_use]
+    pub fn cast(from: &str, to: &str, data_type: DataType) -> Self {
+        Self {
+            op_type: Some("Cast".to_owned()),
+            name: Some(format!("{to}.cast")),
+            input: vec![from.to_owned()],
+            output: vec![to.to_owned()],
+            attribute: vec![AttributeProto::int("to", i64::from(i32::from(data_type)))],
+            ..Self::default()
+        }
+    }
 }
 
 impl AttributeProto {

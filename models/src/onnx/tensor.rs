@@ -47,6 +47,13 @@ impl TensorProto {
         tensor
     }
 
+    /// A tensor of f16, rounded from f32. Values beyond the range of f16 become infinite.
+    #[must_use]
+    pub fn from_f32_as_f16(name: &str, dims: &[i64], values: &[f32]) -> Self {
+        let bytes = values.iter().flat_map(|&value| f16::from_f32(value).to_le_bytes()).collect();
+        Self::from_bytes(name, dims, DataType::Float16, bytes)
+    }
+
     /// A tensor of i64.
     #[must_use]
     pub fn from_i64(name: &str, dims: &[i64], values: &[i64]) -> Self {
