@@ -26,7 +26,8 @@ const VOXEL_SIZE: f64 = 0.3 / RESOLUTION as f64;
 fn request() -> impl Strategy<Value = pb::DetectGraspsRequest> {
     let model = prop_oneof![6 => Just(""), 3 => Just("mirror"), 1 => Just("vgn")];
     let version = prop_oneof![6 => Just(""), 2 => Just("1"), 1 => Just("9")];
-    let probability = || prop_oneof![6 => 0.01_f32..=1.0, 1 => any::<f32>(), 1 => Just(0.0), 1 => Just(f32::NAN)];
+    let percent = || (1..=100_u8).prop_map(|percent| f32::from(percent) / 100.0);
+    let probability = || prop_oneof![6 => percent(), 1 => any::<f32>(), 1 => Just(0.0), 1 => Just(f32::NAN)];
     (
         prop_oneof![5 => "[a-z]{0,8}", 1 => ".{0,300}"],
         proptest::option::weighted(0.98, volume()),
