@@ -66,7 +66,7 @@ fn planners() -> Vec<(&'static str, Box<dyn Planner>, DecodeParams)> {
     let proposals = NetworkPlanner::load(&zoo("vgn-packed.onnx"), &Options::default()).unwrap();
     let evaluated = Network::load(&zoo("vgn-packed.onnx"), &Options::default()).unwrap();
     let of_evaluated = Evaluator::decode_params(evaluated.metadata());
-    let evaluator = Evaluator::load(&zoo("evaluators/graspd-packed.onnx"), &Options::default()).unwrap();
+    let evaluator = Evaluator::load(&zoo("evaluators/graspd.onnx"), &Options::default()).unwrap();
     vec![
         ("network", Box::new(network), decode),
         ("evaluator", Box::new(NetworkPlanner::new(evaluated, Some(evaluator))), of_evaluated),

@@ -72,6 +72,9 @@ pub struct Condition {
     pub epsilon: u8,
     /// If no grasp reaches ε: whether the best grasp is executed if its quality is at least 0.5, or 0.1 with an evaluator.
     pub forced: bool,
+    /// Whether the scale of the depths is corrected by the table (`Workspace.correct_depth_scale`).
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub is_scale_corrected: bool,
 }
 
 impl Condition {
@@ -80,9 +83,13 @@ impl Condition {
         self.trained_on.as_ref().is_none_or(|trained_on| *trained_on == self.scenario)
     }
 
-    /// Whether it is the paper's: its view, its ε, `force`, and the test objects.
+    /// Whether it is the paper's: its view, its ε, `force`, the depths as measured, and the test objects.
     fn is_as_published(&self) -> bool {
-        self.objects == TEST_OBJECTS && self.views == VIEWS[0].0 && self.epsilon == EPSILON && self.forced
+        self.objects == TEST_OBJECTS
+            && self.views == VIEWS[0].0
+            && self.epsilon == EPSILON
+            && self.forced
+            && !self.is_scale_corrected
     }
 
     /// The same, in rapier.
@@ -159,6 +166,8 @@ impl Results {
         self.epsilons(&mut text);
         text.push_str("\n## Camera views\n\n");
         self.views(&mut text);
+        text.push_str("\n## Corrected depth scale\n\n");
+        self.corrected(&mut text);
         text.push_str("\n## Outcomes\n\n");
         self.endings(&mut text);
         text
@@ -227,34 +236,65 @@ impl Results {
 
     /// One table per other object set.
     fn other_objects(&self, text: &mut String) {
-        let others = || self.conditions.iter().filter(|(condition, _)| condition.objects != TEST_OBJECTS);
-        for objects in others().map(|(condition, _)| condition.objects.as_str()).collect::<BTreeSet<_>>() {
-            let _ = write!(text, "\n### Objects of `{objects}`\n\nGSR / DR in %, pooled.\n\n|");
-            let columns: Vec<_> = SCENARIOS
-                .into_iter()
-                .flat_map(|scenario| self.simulators().into_iter().map(move |simulator| (scenario, simulator)))
-                .collect();
-            columns.iter().for_each(|(scenario, simulator)| {
-                let _ = write!(text, " | {scenario}, {}", simulator.name());
+        let is_other = |condition: &Condition| condition.objects != TEST_OBJECTS && !condition.is_scale_corrected;
+        for objects in self.object_sets(is_other) {
+            let _ = write!(text, "\n### Objects of `{objects}`\n\nGSR / DR in %, pooled.\n\n");
+            self.by_simulator(text, |condition| is_other(condition) && condition.objects == objects, pooled_of);
+        }
+    }
+
+    /// One table per object set, each cell with the depths as measured and with a corrected scale.
+    fn corrected(&self, text: &mut String) {
+        text.push_str(
+            "GSR / DR in %, pooled, with the paper's view: with the depths as measured → with their scale corrected by the\n\
+             height of the table (`Workspace.correct_depth_scale`).\n",
+        );
+        for objects in self.object_sets(|condition| condition.is_scale_corrected) {
+            let _ = write!(text, "\n### Objects of `{objects}`, corrected\n\n");
+            let is_wanted = |condition: &Condition| condition.is_scale_corrected && condition.objects == objects;
+            self.by_simulator(text, is_wanted, |results, condition| {
+                let measured = Condition { is_scale_corrected: false, ..condition.clone() };
+                format!("{} → {}", pooled_of(results, &measured), pooled_of(results, condition))
             });
-            let _ = writeln!(text, " |\n|{}", "---|".repeat(1 + columns.len()));
-            let conditions = || others().filter(|(condition, _)| condition.objects == objects);
-            for method in in_order(conditions().map(|(condition, _)| condition.method.as_str())) {
-                let _ = write!(text, "| {method} |");
-                for &(scenario, simulator) in &columns {
-                    let is_it = |condition: &Condition| {
-                        (condition.method.as_str(), condition.scenario.as_str(), condition.simulator)
-                            == (method, scenario, simulator)
-                    };
-                    let summaries = conditions().find(|(condition, _)| is_it(condition));
-                    let _ = write!(
-                        text,
-                        " {} |",
-                        summaries.map_or_else(|| "–".to_owned(), |(_, summaries)| pooled(summaries))
-                    );
-                }
-                text.push('\n');
+        }
+    }
+
+    /// The object sets of these conditions.
+    fn object_sets(&self, is_wanted: impl Fn(&Condition) -> bool) -> BTreeSet<&str> {
+        self.conditions.keys().filter(|condition| is_wanted(condition)).map(|c| c.objects.as_str()).collect()
+    }
+
+    /// A table with a row for each method of these conditions, and a column for each scenario in each simulator.
+    fn by_simulator(
+        &self,
+        text: &mut String,
+        is_wanted: impl Fn(&Condition) -> bool,
+        cell: impl Fn(&Self, &Condition) -> String,
+    ) {
+        let columns: Vec<_> = SCENARIOS
+            .into_iter()
+            .flat_map(|scenario| self.simulators().into_iter().map(move |simulator| (scenario, simulator)))
+            .collect();
+        text.push('|');
+        columns.iter().for_each(|(scenario, simulator)| {
+            let _ = write!(text, " | {scenario}, {}", simulator.name());
+        });
+        let _ = writeln!(text, " |\n|{}", "---|".repeat(1 + columns.len()));
+        let conditions = || self.conditions.keys().filter(|condition| is_wanted(condition));
+        for method in in_order(conditions().map(|condition| condition.method.as_str())) {
+            let _ = write!(text, "| {method} |");
+            for &(scenario, simulator) in &columns {
+                let is_it = |condition: &&Condition| {
+                    (condition.method.as_str(), condition.scenario.as_str(), condition.simulator)
+                        == (method, scenario, simulator)
+                };
+                let _ = write!(
+                    text,
+                    " {} |",
+                    conditions().find(is_it).map_or_else(|| "–".to_owned(), |condition| cell(self, condition))
+                );
             }
+            text.push('\n');
         }
     }
 
@@ -328,11 +368,7 @@ impl Results {
         for condition in conditions.map(as_published).collect::<BTreeSet<_>>() {
             let _ = write!(text, "| {} on {} |", condition.method, condition.scenario);
             for cell in cells.clone() {
-                let figures = self
-                    .conditions
-                    .get(&cell(&condition))
-                    .map_or_else(|| "–".to_owned(), |summaries| pooled(summaries));
-                let _ = write!(text, " {figures} |");
+                let _ = write!(text, " {} |", pooled_of(self, &cell(&condition)));
             }
             text.push('\n');
         }
@@ -396,6 +432,11 @@ fn name(condition: &Condition) -> String {
 fn spread(summaries: &[Summary], figure: fn(&Summary) -> f64) -> String {
     let values: Vec<f64> = summaries.iter().map(figure).collect();
     Spread::of(&values).map_or_else(|| "–".to_owned(), |spread| spread.percent())
+}
+
+/// GSR and DR of a condition over all its seeds.
+fn pooled_of(results: &Results, condition: &Condition) -> String {
+    results.conditions.get(condition).map_or_else(|| "–".to_owned(), |summaries| pooled(summaries))
 }
 
 fn pooled(summaries: &[Summary]) -> String {

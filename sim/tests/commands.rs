@@ -395,6 +395,8 @@ fn conditions_of_the_tables_run_once() {
     for row in ["| shaf |", "| vgn |", "74.5 ± 1.3", "`vgn-packed.onnx` | 3,774 |", "| vgn on packed |"] {
         assert!(text.contains(row), "`{row}` is missing from:\n{text}");
     }
+    let (_, corrected) = text.split_once("### Objects of `test`, corrected\n").expect("a table with corrected depths");
+    assert!(corrected.lines().any(|row| row.starts_with("| vgn |") && row.matches(" → ").count() == 1), "{corrected}");
     assert_eq!(missing(&desk), (0, all));
     assert_eq!(fs::read_to_string(desk.path("out/tables.md")).unwrap(), text);
 

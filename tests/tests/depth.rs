@@ -350,7 +350,7 @@ async fn an_evaluator_scores_the_grasps_of_its_network() {
     let zoo = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo"));
     let evaluators = server.models().join("evaluators");
     std::fs::create_dir(&evaluators).unwrap();
-    std::fs::copy(zoo.join("evaluators/graspd-packed.onnx"), evaluators.join("graspd-packed.onnx")).unwrap();
+    std::fs::copy(zoo.join("evaluators/graspd.onnx"), evaluators.join("graspd.onnx")).unwrap();
     server.reload().unwrap();
     server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 1.0).await;
     let client = server.client().await;
@@ -363,7 +363,7 @@ async fn an_evaluator_scores_the_grasps_of_its_network() {
     std::fs::copy(zoo.join("vgn-packed.onnx"), &network).unwrap();
     server.reload().unwrap();
     server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
-    assert_eq!(names().await, ["mirror", "vgn-packed", "graspd-packed", "shaf"]);
+    assert_eq!(names().await, ["mirror", "vgn-packed", "graspd", "shaf"]);
     let models = client.list_models().await.unwrap();
     assert!(models[2].provenance["network"].starts_with("vgn-packed 4, sha256 "), "{:?}", models[2].provenance);
     assert_eq!((models[2].resolution, models[2].threshold), (40, 0.5));
@@ -373,7 +373,7 @@ async fn an_evaluator_scores_the_grasps_of_its_network() {
         let detect = DetectOptions { model: model.to_owned(), threshold: Some(0.01), ..DetectOptions::default() };
         client.detect_from_depth(&views, &Workspace::default(), with_options(detect)).await.unwrap()
     };
-    let Detection { grasps: evaluated, latency, .. } = detect("graspd-packed").await;
+    let Detection { grasps: evaluated, latency, .. } = detect("graspd").await;
     assert!(latency.evaluation > 0.0, "{latency:?}");
     let stages = [latency.queue, latency.preprocessing, latency.fusion, latency.inference, latency.postprocessing];
     assert!(stages.iter().sum::<f64>() + latency.evaluation <= latency.total, "{latency:?}");
@@ -384,7 +384,7 @@ async fn an_evaluator_scores_the_grasps_of_its_network() {
     assert!((server.metric(&series) - latency.evaluation).abs() < 1e-9);
     assert!(!evaluated.is_empty() && evaluated.is_sorted_by(|a, b| a.quality >= b.quality));
     assert_at_the_block(&evaluated[0]);
-    assert_same(&detect("graspd-packed").await.grasps, &evaluated);
+    assert_same(&detect("graspd").await.grasps, &evaluated);
     let qualities = |grasps: &[Proposal]| grasps.iter().map(|grasp| grasp.quality).collect::<Vec<_>>();
     let alone = detect("vgn-packed").await;
     assert_eq!(alone.latency.evaluation, 0.0, "no evaluator");
@@ -394,7 +394,7 @@ async fn an_evaluator_scores_the_grasps_of_its_network() {
     std::fs::remove_file(&network).unwrap();
     server.reload().unwrap();
     server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 2.0).await;
-    assert_eq!(names().await, ["mirror", "graspd-packed", "shaf"]);
+    assert_eq!(names().await, ["mirror", "graspd", "shaf"]);
 }
 
 #[tokio::test]

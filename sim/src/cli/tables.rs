@@ -85,6 +85,8 @@ struct Entry {
     method: String,
     trained_on: Option<&'static str>,
     planner: String,
+    /// Whether the grasps are those of a network, which tables of views, ε and the correction compare.
+    is_network: bool,
     /// SHA-256 of the planner's network.
     sha256: Option<String>,
 }
@@ -135,7 +137,11 @@ impl Tables {
     fn entries(&self) -> anyhow::Result<Vec<Entry>> {
         let entry = |method: &str, trained_on, planner: &str, file: Option<&Path>| {
             let sha256 = file.map(hash).transpose()?;
-            anyhow::Ok(Entry { method: method.to_owned(), trained_on, planner: planner.to_owned(), sha256 })
+            let (method, planner) = (method.to_owned(), planner.to_owned());
+            anyhow::Ok(Entry { method, trained_on, planner, is_network: false, sha256 })
+        };
+        let network = |method: &str, trained_on, planner: &str, file: &Path| {
+            anyhow::Ok(Entry { is_network: true, ..entry(method, trained_on, planner, Some(file))? })
         };
         let mut entries = vec![entry("random", None, "random", None)?, entry("shaf", None, "shaf", None)?];
         let classifier = self.models.join("classifiers/gpd.onnx");
@@ -154,24 +160,24 @@ impl Tables {
                 Some(scenario) => name.trim_end_matches(&format!("-{scenario}")).to_owned(),
                 None => format!("{name}{TRAINED_ON_BOTH}"),
             };
-            entries.push(entry(&method, scenario, &planner, Some(path))?);
+            entries.push(network(&method, scenario, &planner, path)?);
             if method == "vgn" {
                 entries.push(entry("shaf (proposals)", scenario, &format!("shaf:{planner}"), Some(path))?);
             }
         }
-        for (name, evaluator, network) in self.evaluators()? {
+        for (name, evaluator, proposals) in self.evaluators()? {
             let scenario = SCENARIOS.into_iter().find(|scenario| name.ends_with(&format!("-{scenario}")));
             let method = scenario.map_or(&*name, |scenario| name.trim_end_matches(&format!("-{scenario}")));
-            let planner = format!("{}:{}", evaluator.display(), network.display());
-            let mut evaluated = entry(method, scenario, &planner, Some(&evaluator))?;
-            evaluated.sha256 = evaluated.sha256.map(|sha256| anyhow::Ok(sha256 + &hash(&network)?)).transpose()?;
+            let planner = format!("{}:{}", evaluator.display(), proposals.display());
+            let mut evaluated = network(method, scenario, &planner, &evaluator)?;
+            evaluated.sha256 = evaluated.sha256.map(|sha256| anyhow::Ok(sha256 + &hash(&proposals)?)).transpose()?;
             entries.push(evaluated);
         }
         if let Some(folder) = &self.released {
             for scenario in SCENARIOS {
                 let path = folder.join(format!("vgn_{scenario}.onnx"));
                 let planner = path.display().to_string();
-                entries.push(entry(RELEASED, Some(scenario), &planner, Some(&path))?);
+                entries.push(network(RELEASED, Some(scenario), &planner, &path)?);
             }
         }
         Ok(entries)
@@ -207,9 +213,7 @@ impl Tables {
         for entry in entries {
             for scenario in SCENARIOS {
                 let crossed = entry.trained_on.is_some_and(|trained_on| trained_on != scenario);
-                let is_network = entry.trained_on.is_some() || entry.method.ends_with(TRAINED_ON_BOTH);
-                let of_proposals = entry.planner.starts_with("shaf:");
-                if crossed && of_proposals {
+                if crossed && !entry.is_network {
                     continue;
                 }
                 let as_published = Condition {
@@ -221,15 +225,19 @@ impl Tables {
                     views: VIEWS[0].0.to_owned(),
                     epsilon: EPSILON,
                     forced: true,
+                    is_scale_corrected: false,
                 };
-                let kind = entry.planner.split(':').next().filter(|_| !is_network || of_proposals);
+                let kind = entry.planner.split(':').next().filter(|_| !entry.is_network);
                 let mut add = |condition: Condition, of_objects: &str, seed, timed| {
-                    let Condition { views, epsilon, forced, .. } = &condition;
+                    let Condition { views, epsilon, forced, is_scale_corrected, .. } = &condition;
                     let scenes = if timed { self.timed } else { self.rounds };
                     let on = (scenario, views, epsilon, forced, seed, scenes, timed);
                     let simulator = pybullet_files.as_ref().filter(|_| condition.simulator == Simulator::PyBullet);
-                    let key =
-                        digest(&format!("{kind:?} {:?} {on:?} {fingerprint} {of_objects} {simulator:?}", entry.sha256));
+                    let corrected = if *is_scale_corrected { " corrected" } else { "" };
+                    let key = digest(&format!(
+                        "{kind:?} {:?} {on:?} {fingerprint} {of_objects} {simulator:?}{corrected}",
+                        entry.sha256
+                    ));
                     tasks.push(Task { key, condition, planner: entry.planner.clone(), seed, timed });
                 };
                 (self.seed..self.seed + self.seeds).for_each(|seed| add(as_published.clone(), "", seed, false));
@@ -237,7 +245,7 @@ impl Tables {
                     continue;
                 }
                 let mut more = Vec::new();
-                if is_network && !of_proposals {
+                if entry.is_network {
                     let other_views = VIEWS.into_iter().skip(1);
                     more.extend(
                         other_views.map(|(views, _)| Condition { views: views.to_owned(), ..as_published.clone() }),
@@ -254,8 +262,14 @@ impl Tables {
                 for (objects, hash) in std::iter::once(&test_objects).chain(&object_sets) {
                     for simulator in [Simulator::Rapier, Simulator::PyBullet] {
                         let condition = Condition { objects: objects.clone(), simulator, ..as_published.clone() };
-                        let is_new = condition != as_published;
-                        if is_new && (runs_in_pybullet || simulator == Simulator::Rapier) {
+                        if simulator == Simulator::PyBullet && !runs_in_pybullet {
+                            continue;
+                        }
+                        if entry.is_network {
+                            let corrected = Condition { is_scale_corrected: true, ..condition.clone() };
+                            add(corrected, hash, self.seed, false);
+                        }
+                        if condition != as_published {
                             add(condition, hash, self.seed, false);
                         }
                     }
@@ -285,7 +299,7 @@ impl Tables {
             objects,
             count: 5,
             views: parse_views(&condition.views).context("views of a table")?,
-            noise: DepthNoise::BENCHMARK,
+            noise: DepthNoise { is_scale_corrected: condition.is_scale_corrected, ..DepthNoise::BENCHMARK },
             rounds: self.rounds,
             seed,
         })
@@ -380,13 +394,13 @@ impl Tables {
         format!(
             "# The paper's tables\n\n\
              Tables 1–4 of *6-DoF Robotic Grasping with Transformer*, measured by `make tables`, with the published figures.\n\n\
-             - Scenes: {} per seed, seeds {} to {}, with five unseen procedural objects each. PyBullet, and views, ε and objects\n\
-             \x20 that are not in the paper, use only the first seed.\n\
+             - Scenes: {} per seed, seeds {} to {}, with five unseen procedural objects each. PyBullet, and views, ε, objects\n\
+             \x20 and corrections that are not in the paper, use only the first seed.\n\
              - Observation: one side view with depth noise. Grasps: ε = 0.9, out_th 0.1, the best grasp first. If no grasp\n\
              \x20 reaches ε, the best grasp is executed if its quality is at least 0.5 (`force`).\n\
              - GSR: share of the grasps that lifted an object. DR: share of the objects that were removed. Mean ± standard\n\
              \x20 deviation over the seeds.\n\
-             - VGN-R: VGN's released weights. graspd: vgn with its evaluator.\n\
+             - VGN-R: VGN's released weights. graspd: the evaluator with the grasps of vgn-packed, in both scenarios.\n\
              - Times: {} with {} cores, ONNX Runtime's CPU provider, one observation at a time. The paper's times are for an\n\
              \x20 RTX 3090.\n\
              - Simulator and decoding {}.{pybullet}\n\n",

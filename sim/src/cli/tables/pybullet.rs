@@ -88,6 +88,9 @@ impl PyBullet {
             command.args(["--planner", &format!("grpc:{address}"), "--model", &model.name]);
             command.args(["--threshold", threshold, "--force", &force]);
         }
+        if condition.is_scale_corrected {
+            command.arg("--correct-depth-scale");
+        }
         let jobs = available_parallelism().map_or(1, |n| n.get());
         command.args(["--rounds", &rounds.to_string(), "--seed", &seed.to_string(), "--jobs", &jobs.to_string()]);
         let output = command.output().with_context(|| format!("cannot run {}", self.python.display()))?;
