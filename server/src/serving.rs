@@ -5,6 +5,7 @@ pub(crate) mod cubes;
 pub(crate) mod detection;
 pub(crate) mod engine;
 pub(crate) mod job;
+mod lines;
 mod model_files;
 pub(crate) mod observation;
 pub(crate) mod queue;

@@ -1,12 +1,11 @@
-use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use grasp_models::batch_sizes;
-use grasp_proto::Priority;
 use prometheus::IntGauge;
 
-use crate::transport::caller::Caller;
+pub(crate) use super::lines::Ticket;
+use super::lines::{Lines, Place};
 
 /// A bounded queue of jobs for a model's sessions. Callers are served in turn, and the jobs of a caller in their order.
 /// If the queue is full, a job of a caller with few jobs displaces the newest job of the caller with the most.
@@ -20,37 +19,12 @@ pub(crate) struct Queue<T> {
 }
 
 struct State<T> {
-    /// The callers with waiting jobs, in the order in which they are served: with normal and with batch priority.
-    lines: [VecDeque<Line<T>>; 2],
-    /// Number of waiting jobs.
-    waiting: usize,
+    lines: Lines<T>,
+    /// Number of the next job.
     next: u64,
     /// Idle sessions. Each allows one job beyond the capacity, because it takes that job immediately.
     free: usize,
-    /// Normal jobs that were taken since the last batch job, while one was waiting.
-    overtaken: u32,
     closed: bool,
-}
-
-/// The waiting jobs of a caller, never empty.
-struct Line<T> {
-    caller: Caller,
-    jobs: VecDeque<Waiting<T>>,
-}
-
-struct Waiting<T> {
-    number: u64,
-    since: Instant,
-    job: T,
-}
-
-/// Whose job it is, and when it has to be done.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Ticket {
-    pub caller: Caller,
-    pub priority: Priority,
-    /// When the caller stops waiting.
-    pub deadline: Option<Instant>,
 }
 
 /// A slot in the queue. Dropping it removes its job, if no session has taken it yet.
@@ -93,95 +67,11 @@ pub(crate) enum Refused {
     TooLate(Duration),
 }
 
-/// After this many normal jobs, a waiting batch job is taken, so that batch jobs do not wait for ever.
-const OVERTAKING: u32 = 8;
-
-impl<T> State<T> {
-    fn is_full(&self, capacity: usize) -> bool {
-        // An idle session may not have woken up yet for a waiting job.
-        self.waiting >= capacity + self.free
-    }
-
-    /// Number of waiting jobs that are taken before a new job.
-    fn ahead_of(&self, ticket: Ticket) -> usize {
-        let ahead = |lines: &VecDeque<Line<T>>| {
-            let own = lines.iter().find(|line| line.caller == ticket.caller).map_or(0, |line| line.jobs.len());
-            let others = lines.iter().filter(|line| line.caller != ticket.caller);
-            own + others.map(|line| line.jobs.len().min(own + 1)).sum::<usize>()
-        };
-        let [normal, batch] = &self.lines;
-        match ticket.priority {
-            Priority::Normal => ahead(normal),
-            Priority::Batch => normal.iter().map(|line| line.jobs.len()).sum::<usize>() + ahead(batch),
-        }
-    }
-
-    /// The line whose newest job a new job displaces: that of the batch job of the caller with the most, or of a caller
-    /// that has at least two jobs more than this one. Its priority and place.
-    fn displaced_by(&self, ticket: Ticket) -> Option<(usize, usize)> {
-        let longest = |class: usize| {
-            let lines = self.lines[class].iter().enumerate();
-            lines.map(|(index, line)| (line.jobs.len(), index)).max_by_key(|(length, _)| *length)
-        };
-        let class = ticket.priority as usize;
-        let batch = Priority::Batch as usize;
-        if class < batch
-            && let Some((_, index)) = longest(batch)
-        {
-            return Some((batch, index));
-        }
-        let own = self.lines[class].iter().find(|line| line.caller == ticket.caller);
-        let own = own.map_or(0, |line| line.jobs.len());
-        longest(class).filter(|(length, _)| *length >= own + 2).map(|(_, index)| (class, index))
-    }
-
-    fn append(&mut self, ticket: Ticket, waiting: Waiting<T>) {
-        self.waiting += 1;
-        let lines = &mut self.lines[ticket.priority as usize];
-        match lines.iter_mut().find(|line| line.caller == ticket.caller) {
-            Some(line) => line.jobs.push_back(waiting),
-            None => lines.push_back(Line { caller: ticket.caller, jobs: VecDeque::from([waiting]) }),
-        }
-    }
-
-    /// Takes the next job: the oldest of the caller whose turn it is.
-    fn take(&mut self) -> Option<T> {
-        let [normal, batch] = &mut self.lines;
-        let is_batch = normal.is_empty() || !batch.is_empty() && self.overtaken >= OVERTAKING;
-        self.overtaken = if is_batch || batch.is_empty() { 0 } else { self.overtaken + 1 };
-        let lines = if is_batch { batch } else { normal };
-        let mut line = lines.pop_front()?;
-        let next = line.jobs.pop_front()?;
-        self.waiting -= 1;
-        if !line.jobs.is_empty() {
-            lines.push_back(line);
-        }
-        Some(next.job)
-    }
-
-    /// Removes the job at a place in a line.
-    fn remove(&mut self, class: usize, line: usize, index: usize) -> Option<T> {
-        let lines = &mut self.lines[class];
-        let removed = lines.get_mut(line)?.jobs.remove(index)?;
-        self.waiting -= 1;
-        if lines[line].jobs.is_empty() {
-            lines.remove(line);
-        }
-        Some(removed.job)
-    }
-
-    /// When the job that has waited longest arrived.
-    fn oldest(&self) -> Option<Instant> {
-        self.lines.iter().flatten().filter_map(|line| line.jobs.front()).map(|waiting| waiting.since).min()
-    }
-}
-
 impl<T> Queue<T> {
     /// A queue for this many sessions and `capacity` waiting jobs, which are counted in `gauge`. During a reload, the
     /// old and the new queue of a model share a gauge.
     pub fn new(sessions: usize, capacity: usize, gauge: IntGauge) -> Self {
-        let lines = [VecDeque::new(), VecDeque::new()];
-        let state = State { lines, waiting: 0, next: 0, free: sessions, overtaken: 0, closed: false };
+        let state = State { lines: Lines::new(), next: 0, free: sessions, closed: false };
         Self { state: Mutex::new(state), changed: Condvar::new(), sessions, capacity, gauge }
     }
 
@@ -194,16 +84,14 @@ impl<T> Queue<T> {
         service: Service,
     ) -> Result<(QueueSlot<T>, Option<T>), Refused> {
         let mut state = self.lock();
-        let now = Instant::now();
-        let displaced = self.place(&state, ticket, service, now)?;
-        let displaced = displaced.and_then(|(class, line)| {
-            let newest = state.lines[class][line].jobs.len() - 1;
+        let displaced = self.place(&state, ticket, service)?;
+        let displaced = displaced.and_then(|place| {
             self.gauge.dec();
-            state.remove(class, line, newest)
+            state.lines.remove(place)
         });
         let number = state.next;
         state.next += 1;
-        state.append(ticket, Waiting { number, since: now, job });
+        state.lines.append(ticket, number, job);
         self.gauge.inc();
         drop(state);
         self.changed.notify_one();
@@ -212,29 +100,25 @@ impl<T> Queue<T> {
 
     /// Whether [`push`](Self::push) would accept a job now.
     pub fn check(&self, ticket: Ticket, service: Service) -> Result<(), Refused> {
-        self.place(&self.lock(), ticket, service, Instant::now()).map(|_| ())
+        self.place(&self.lock(), ticket, service).map(|_| ())
     }
 
-    /// The line whose newest job a new job would displace, if the queue is full.
-    fn place(
-        &self,
-        state: &State<T>,
-        ticket: Ticket,
-        service: Service,
-        now: Instant,
-    ) -> Result<Option<(usize, usize)>, Refused> {
+    /// The job that a new job would displace, if the queue is full.
+    fn place(&self, state: &State<T>, ticket: Ticket, service: Service) -> Result<Option<Place>, Refused> {
         // An idle server accepts every job, so that its expectation cannot become wrong for ever.
         if let Some(deadline) = ticket.deadline
             && state.free == 0
         {
             let running = self.sessions as f64 / 2.0;
-            let turns = (state.ahead_of(ticket) as f64 + running) / self.sessions as f64;
+            let turns = (state.lines.ahead_of(ticket) as f64 + running) / self.sessions as f64;
             let estimate = service.mean.mul_f64(turns) + service.long;
-            if deadline < now + estimate {
+            if deadline < Instant::now() + estimate {
                 return Err(Refused::TooLate(estimate));
             }
         }
-        if state.is_full(self.capacity) { state.displaced_by(ticket).map(Some).ok_or(Refused::Full) } else { Ok(None) }
+        // An idle session may not have woken up yet for a waiting job.
+        let is_full = state.lines.len() >= self.capacity + state.free;
+        if is_full { state.lines.displaced_by(ticket).map(Some).ok_or(Refused::Full) } else { Ok(None) }
     }
 
     pub fn capacity(&self) -> usize {
@@ -243,23 +127,23 @@ impl<T> Queue<T> {
 
     /// Number of waiting jobs.
     pub fn waiting(&self) -> usize {
-        self.lock().waiting
+        self.lock().lines.len()
     }
 
     /// Waits for jobs and takes a batch; None when the queue is closed and empty. The session counts as busy until it
     /// calls [`free`](Self::free).
     pub fn take(&self, batching: Batching) -> Option<Vec<T>> {
         let mut state = self.lock();
-        let waiting = |state: &mut State<T>| state.waiting == 0 && !state.closed;
+        let waiting = |state: &mut State<T>| state.lines.is_empty() && !state.closed;
         state = self.changed.wait_while(state, waiting).unwrap_or_else(PoisonError::into_inner);
         if !batching.delay.is_zero() {
             state = self.gather(state, batching);
         }
         state.free -= 1;
-        let count = batching.fitting(state.waiting);
-        let jobs: Vec<T> = (0..count).map_while(|_| state.take()).collect();
+        let count = batching.fitting(state.lines.len());
+        let jobs: Vec<T> = (0..count).map_while(|_| state.lines.take()).collect();
         self.gauge.sub(jobs.len() as i64);
-        let (left, ended) = (state.waiting > 0, state.closed && jobs.is_empty());
+        let (left, ended) = (!state.lines.is_empty(), state.closed && jobs.is_empty());
         drop(state);
         if left {
             // `push` woke only this session.
@@ -271,7 +155,7 @@ impl<T> Queue<T> {
     /// Takes all jobs, without a session for them.
     pub fn take_all(&self) -> Vec<T> {
         let mut state = self.lock();
-        let jobs: Vec<T> = std::iter::from_fn(|| state.take()).collect();
+        let jobs: Vec<T> = std::iter::from_fn(|| state.lines.take()).collect();
         self.gauge.sub(jobs.len() as i64);
         jobs
     }
@@ -284,8 +168,8 @@ impl<T> Queue<T> {
 
     /// Waits until the batch is full, or the delay has passed since the arrival of its first job.
     fn gather<'a>(&self, mut state: MutexGuard<'a, State<T>>, batching: Batching) -> MutexGuard<'a, State<T>> {
-        while !state.closed && state.waiting < batching.max {
-            let Some(first) = state.oldest() else { break };
+        while !state.closed && state.lines.len() < batching.max {
+            let Some(first) = state.lines.oldest() else { break };
             let left = batching.delay.saturating_sub(first.elapsed());
             if left.is_zero() {
                 break;
@@ -303,15 +187,8 @@ impl<T> Queue<T> {
 
     fn remove(&self, number: u64) {
         let mut state = self.lock();
-        let place = state.lines.iter().enumerate().find_map(|(class, lines)| {
-            lines.iter().enumerate().find_map(|(line, Line { jobs, .. })| {
-                // Sorted by number, because jobs are appended in that order.
-                let index = jobs.binary_search_by_key(&number, |waiting| waiting.number).ok()?;
-                Some((class, line, index))
-            })
-        });
-        if let Some((class, line, index)) = place {
-            state.remove(class, line, index);
+        if let Some(place) = state.lines.find(number) {
+            state.lines.remove(place);
             self.gauge.dec();
         }
     }
@@ -332,7 +209,10 @@ impl<T> Drop for QueueSlot<T> {
 mod tests {
     use std::thread;
 
+    use grasp_proto::Priority;
+
     use super::*;
+    use crate::transport::caller::Caller;
 
     const CALLER: Caller = Caller::Unknown;
 
