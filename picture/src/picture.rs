@@ -1,73 +1,30 @@
 //! Shaded pictures of scenes and grasps.
 //!
-//! A few dozen lamps spread over the sky, most of them on one side, light the scene. Each lamp has a shadow map,
-//! rendered with the depth camera. Together they give soft shadows and ambient occlusion.
+//! A picture is rendered with the depth camera and shaded with the light of [`Light`].
 
 use std::collections::HashMap;
-use std::f64::consts::PI;
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
 use grasp::Intrinsics;
-use nalgebra::{Isometry3, Point3, Rotation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Point3, Vector3};
 use rayon::prelude::*;
 use thiserror::Error;
 
+use crate::color::{Color, PAPER, linear, srgb};
+use crate::light::Light;
 use crate::mesh::Mesh;
-use crate::raster::{Instance, View};
+use crate::raster::{Instance, View, toward};
 
 /// Subpixels along each side of a pixel.
 const SUPERSAMPLING: usize = 2;
-/// Lamps over the whole sky.
-const SKY: usize = 28;
-/// Lamps close together that act as the sun.
-const SUN: usize = 12;
-/// The sun's share of the light.
-const SUN_SHARE: f64 = 0.68;
-/// Pixels along each side of a lamp's shadow map.
-const SHADOW_MAP: usize = 768;
 /// Surfaces that meet at a smaller angle than this are shaded as one smooth surface, radians.
 const CREASE: f64 = 0.7;
 /// Item index of pixels without a surface.
 const BACKGROUND: u32 = u32::MAX;
 /// Item index of pixels that show the table.
 const TABLE: u32 = u32::MAX - 1;
-
-/// A colour: red, green and blue in sRGB, 0–255.
-pub type Color = [u8; 3];
-
-const PAPER: Color = [246, 246, 244];
-const TABLE_TOP: Color = [226, 224, 220];
-const GRID: Color = [196, 194, 190];
-const PALETTE: [Color; 12] = [
-    [214, 96, 77],
-    [67, 133, 190],
-    [240, 178, 66],
-    [90, 160, 108],
-    [150, 116, 180],
-    [232, 140, 100],
-    [88, 178, 190],
-    [222, 200, 150],
-    [190, 90, 120],
-    [120, 140, 90],
-    [236, 236, 230],
-    [110, 122, 150],
-];
-
-/// The colour of object `index` of a scene.
-pub fn object_color(index: usize) -> Color {
-    PALETTE[index % PALETTE.len()]
-}
-
-/// The colour of a quality: red at 0, yellow at 0.5, green at 1.
-pub fn quality_color(quality: f64) -> Color {
-    let q = quality.clamp(0.0, 1.0);
-    let mix = |low: f64, high: f64, t: f64| (low + (high - low) * t) as u8;
-    let (red, yellow, green) = ([205.0, 40.0, 40.0], [245.0, 195.0, 50.0], [40.0, 165.0, 75.0]);
-    let (from, to, t) = if q < 0.5 { (red, yellow, 2.0 * q) } else { (yellow, green, 2.0 * q - 1.0) };
-    std::array::from_fn(|i| mix(from[i], to[i], t))
-}
 
 /// A picture file could not be written.
 #[derive(Debug, Error)]
@@ -176,13 +133,13 @@ impl Picture {
         let mut view = View::new(&fine, &self.camera_from_task, 0.01, 100.0);
         let mut seen = vec![(BACKGROUND, 0); view.depth.len()];
         for (index, item) in self.items.iter().enumerate() {
-            view.draw(&item.instance(), |pixel, triangle| seen[pixel] = (index as u32, triangle as u32));
+            view.draw(&Instance::of(&item.mesh), |pixel, triangle| seen[pixel] = (index as u32, triangle as u32));
         }
         if let Some(height) = self.table {
             view.draw_table(height, |pixel| seen[pixel] = (TABLE, 0));
         }
 
-        let light = Light::over(&self.items, self.table);
+        let light = self.light();
         let task_from_camera = self.camera_from_task.inverse();
         let shade = |u: usize, v: usize| {
             let pixel = v * fine.width + u;
@@ -214,6 +171,12 @@ impl Picture {
             srgb(sum / (n * n) as f64)
         };
         (0..self.camera.width * self.camera.height).into_par_iter().flat_map_iter(pixel).collect()
+    }
+
+    /// The light over the items that cast shadows.
+    fn light(&self) -> Light {
+        let casters: Vec<_> = self.items.iter().filter(|item| !item.note).map(|item| &item.mesh).collect();
+        Light::over(&casters, self.table)
     }
 
     /// Renders the picture and writes it as a PNG.
@@ -263,10 +226,6 @@ fn write(path: &Path, width: usize, height: usize, pixels: &[u8]) -> Result<(), 
 }
 
 impl Item {
-    fn instance(&self) -> Instance<'_> {
-        Instance { mesh: &self.mesh, pose: Isometry3::identity(), scale: 1.0, id: 0 }
-    }
-
     /// The interpolated normal at a point of a triangle.
     fn normal(&self, triangle: usize, point: &Point3<f64>) -> Vector3<f64> {
         let [a, b, c] = self.mesh.corners(self.mesh.triangles[triangle]);
@@ -277,127 +236,6 @@ impl Item {
             .try_normalize(0.0)
             .unwrap_or_else(|| across.normalize())
     }
-}
-
-/// The lamps of a scene.
-struct Light {
-    lamps: Vec<Lamp>,
-    centre: Point3<f64>,
-    radius: f64,
-}
-
-struct Lamp {
-    direction: Vector3<f64>,
-    strength: f64,
-    camera: Intrinsics,
-    camera_from_task: Isometry3<f64>,
-    depth: Vec<f32>,
-}
-
-impl Light {
-    /// Lamps on a dome over the items that cast shadows.
-    fn over(items: &[Item], table: Option<f64>) -> Light {
-        let casters: Vec<_> = items.iter().filter(|item| !item.note).collect();
-        let boxes: Vec<_> = casters.iter().flat_map(|item| <[_; 2]>::from(item.mesh.bounds())).collect();
-        let (low, high) = Mesh { vertices: boxes, triangles: Vec::new() }.bounds();
-        let centre = nalgebra::center(&low, &high);
-        // A margin for the shadows beside the items.
-        let radius = (high - low).norm() / 2.0 + 0.05;
-
-        let spiral = |i: usize, n: usize, least: f64| {
-            let z = 1.0 - (1.0 - least) * (i as f64 + 0.5) / n as f64;
-            let (sin, cos) = (i as f64 * PI * (3.0 - 5f64.sqrt())).sin_cos();
-            let flat = (1.0 - z * z).sqrt();
-            Vector3::new(flat * cos, flat * sin, z)
-        };
-        let tilt = Rotation3::rotation_between(&Vector3::z(), &Vector3::new(-0.35, -0.75, 1.0)).unwrap_or_default();
-        let sky = (0..SKY).map(|i| (spiral(i, SKY, 0.12), (1.0 - SUN_SHARE) / SKY as f64 * 1.6));
-        let sun = (0..SUN).map(|i| (tilt * spiral(i, SUN, 0.985), SUN_SHARE / SUN as f64 * 1.25));
-        let directions: Vec<_> = sky.chain(sun).collect();
-        let lamp = |(direction, strength): (Vector3<f64>, f64)| {
-            Lamp::new(direction, strength, centre, radius, &casters, table)
-        };
-        Light { lamps: directions.into_par_iter().map(lamp).collect(), centre, radius }
-    }
-
-    /// Light at a point of a surface.
-    fn at(&self, point: &Point3<f64>, normal: &Vector3<f64>) -> f64 {
-        // The point is lifted off the surface by more than a pixel of the shadow map, so that the surface does not
-        // shade itself.
-        let lifted = point + normal * (self.radius * 3.5 / SHADOW_MAP as f64);
-        let from = |lamp: &Lamp| lamp.strength * normal.dot(&lamp.direction).max(0.0) * lamp.reaches(&lifted);
-        0.06 + self.lamps.iter().map(from).sum::<f64>()
-    }
-
-    /// Light on an annotation: without shadows and with a high ambient part.
-    fn unshaded(&self, normal: &Vector3<f64>) -> f64 {
-        0.55 + 0.45 * normal.dot(&self.lamps[SKY].direction).max(0.0)
-    }
-
-    /// Specular reflection of the sun.
-    fn gloss(&self, normal: &Vector3<f64>, toward_eye: &Vector3<f64>) -> f64 {
-        let sun = self.lamps[SKY].direction;
-        let halfway = (sun + toward_eye).normalize();
-        0.12 * normal.dot(&halfway).max(0.0).powi(40)
-    }
-
-    /// The colour of the table with its grid, which fades into the background far from the scene. `footprint` is the
-    /// size of a pixel on the table, metres.
-    fn table(&self, point: &Point3<f64>, footprint: f64) -> Vector3<f64> {
-        let to_line = |x: f64| (x / 0.05 - (x / 0.05).round()).abs() * 0.05;
-        let distance = to_line(point.x).min(to_line(point.y));
-        let line = (1.0 - distance / (0.0005 + footprint)).clamp(0.0, 1.0);
-        let ground = linear(TABLE_TOP).lerp(&linear(GRID), line);
-        let lit = ground * self.at(point, &Vector3::z());
-        let away = (point - self.centre).xy().norm() / self.radius;
-        lit.lerp(&linear(PAPER), ((away - 1.2) / 1.2).clamp(0.0, 1.0))
-    }
-}
-
-impl Lamp {
-    fn new(
-        direction: Vector3<f64>,
-        strength: f64,
-        centre: Point3<f64>,
-        radius: f64,
-        casters: &[&Item],
-        table: Option<f64>,
-    ) -> Lamp {
-        let distance = 6.0 * radius;
-        let camera_from_task = toward(centre + direction * distance, centre);
-        let focal = SHADOW_MAP as f64 / 2.0 * distance / (1.35 * radius);
-        let middle = SHADOW_MAP as f64 / 2.0;
-        let camera = Intrinsics { width: SHADOW_MAP, height: SHADOW_MAP, fx: focal, fy: focal, cx: middle, cy: middle };
-        let mut view = View::new(&camera, &camera_from_task, radius, 20.0 * radius);
-        for item in casters {
-            view.draw(&item.instance(), |_, _| ());
-        }
-        // The table also shades items below it.
-        if let Some(height) = table {
-            view.draw_table(height, |_| ());
-        }
-        let depth = view.depth;
-        Lamp { direction, strength, camera, camera_from_task, depth }
-    }
-
-    /// 1 if the lamp lights the point, 0 in shadow. Points outside the shadow map are lit.
-    fn reaches(&self, point: &Point3<f64>) -> f64 {
-        let p = self.camera_from_task * point;
-        let u = (self.camera.fx * p.x / p.z + self.camera.cx).round();
-        let v = (self.camera.fy * p.y / p.z + self.camera.cy).round();
-        let inside = |x: f64| x >= 0.0 && x < SHADOW_MAP as f64;
-        let lit = !(inside(u) && inside(v)) || p.z <= f64::from(self.depth[v as usize * SHADOW_MAP + u as usize]);
-        f64::from(u8::from(lit))
-    }
-}
-
-/// `T_camera_task` of a camera at `eye` that looks at `target`, with z up in its picture.
-fn toward(eye: Point3<f64>, target: Point3<f64>) -> Isometry3<f64> {
-    let forward = (target - eye).normalize();
-    // For a vertical view any up direction works.
-    let up = if forward.xy().norm() < 1e-6 { Vector3::y() } else { Vector3::z() };
-    // look_at_rh has y up and z backward; the optical frame has y down and z forward.
-    UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI) * Isometry3::look_at_rh(&eye, &target, &up)
 }
 
 /// The camera with [`SUPERSAMPLING`] times the pixels along each side.
@@ -446,16 +284,6 @@ fn smooth_normals(mesh: &Mesh) -> Vec<[Vector3<f64>; 3]> {
     triangles.map(|(face, &triangle)| mesh.corners(triangle).map(|corner| normal(face, corner))).collect()
 }
 
-/// Converts sRGB to linear light.
-fn linear(color: Color) -> Vector3<f64> {
-    Vector3::from(color.map(|c| (f64::from(c) / 255.0).powf(2.2)))
-}
-
-/// Converts linear light to sRGB.
-fn srgb(light: Vector3<f64>) -> Color {
-    light.map(|x| (x.clamp(0.0, 1.0).powf(1.0 / 2.2) * 255.0).round() as u8).into()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -488,7 +316,7 @@ mod tests {
     #[test]
     fn the_lamps_cast_a_shadow() {
         let picture = cube();
-        let light = Light::over(&picture.items, picture.table);
+        let light = picture.light();
         let (shade, open) = (Point3::new(0.02, 0.045, 0.0), Point3::new(-0.09, -0.09, 0.0));
         assert!(light.at(&shade, &Vector3::z()) < 0.7 * light.at(&open, &Vector3::z()));
     }
@@ -503,12 +331,5 @@ mod tests {
     fn a_file_that_cannot_be_written_is_named() {
         let error = cube().save(Path::new("/nowhere/at/all.png")).unwrap_err().to_string();
         assert!(error.contains("/nowhere/at/all.png"), "{error}");
-    }
-
-    #[test]
-    fn quality_goes_from_red_to_green() {
-        assert!(quality_color(0.0)[0] > quality_color(0.0)[1]);
-        assert!(quality_color(1.0)[1] > quality_color(1.0)[0]);
-        assert_eq!(quality_color(7.0), quality_color(1.0));
     }
 }

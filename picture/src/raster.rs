@@ -4,8 +4,10 @@
 //! pixel centres at whole coordinates. The depth of a pixel is that of the triangle's plane along the ray, so it is
 //! exact for the mesh.
 
+use std::f64::consts::PI;
+
 use grasp::Intrinsics;
-use nalgebra::{Isometry3, Point3, Vector3};
+use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 
 use crate::mesh::Mesh;
 
@@ -33,6 +35,13 @@ pub struct Instance<'a> {
     pub id: u16,
 }
 
+impl Instance<'_> {
+    /// A mesh in the task frame.
+    pub(crate) fn of(mesh: &Mesh) -> Instance<'_> {
+        Instance { mesh, pose: Isometry3::identity(), scale: 1.0, id: 0 }
+    }
+}
+
 /// The images of the camera, row by row from the top left.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
@@ -44,6 +53,15 @@ pub struct Frame {
     pub depth: Vec<f32>,
     /// The [`Instance::id`] of each pixel, [`TABLE`] or [`NOTHING`].
     pub ids: Vec<u16>,
+}
+
+/// `T_camera_task` of a camera at `eye` that looks at `target`, with z up in its picture.
+pub(crate) fn toward(eye: Point3<f64>, target: Point3<f64>) -> Isometry3<f64> {
+    let forward = (target - eye).normalize();
+    // For a vertical view any up direction works.
+    let up = if forward.xy().norm() < 1e-6 { Vector3::y() } else { Vector3::z() };
+    // look_at_rh has y up and z backward; the optical frame has y down and z forward.
+    UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI) * Isometry3::look_at_rh(&eye, &target, &up)
 }
 
 /// Renders the instances, and optionally the infinite horizontal plane at the height `table` (task frame, metres),
