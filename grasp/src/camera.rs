@@ -112,9 +112,11 @@ impl<'a> DepthImage<'a> {
         if sample.is_empty() {
             return Unit::Metres;
         }
-        let middle = sample.len() / 2;
+        let (middle, count) = (sample.len() / 2, sample.len());
+        // Beyond 20 m, some renderers have pixels without a surface; then others are nearer.
+        let is_far = sample.iter().filter(|depth| **depth <= 20.0).count() * 20 < count;
         match sample.select_nth_unstable_by(middle, f32::total_cmp).1 {
-            median if *median > 20.0 => Unit::Millimetres,
+            median if *median > 20.0 && is_far => Unit::Millimetres,
             median if *median < 0.02 => Unit::Thousandths,
             _ => Unit::Metres,
         }

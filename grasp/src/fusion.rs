@@ -245,6 +245,8 @@ impl Fusion {
         const FEWEST: usize = 100;
         /// Distance in front of a surface from which space counts as free, metres: beyond the noise of depth cameras.
         const FREE: f32 = 0.024;
+        // With small voxels no distance is as large.
+        let free = FREE.min(0.8 * self.truncation);
         let size = self.voxel_size * self.resolution as f64;
         // Odd, so that the sampled pixels are not in few columns.
         let every = (image.depth().len() / SAMPLES) | 1;
@@ -258,7 +260,7 @@ impl Fusion {
             // Rounding may reach the upper side of the cube.
             let Some(voxel) = self.voxels.get(index).filter(|voxel| voxel.weight > 0.0) else { continue };
             compared += 1;
-            contradicted += usize::from(voxel.distance * self.truncation > FREE);
+            contradicted += usize::from(voxel.distance * self.truncation > free);
         }
         (compared >= FEWEST).then(|| contradicted as f64 / compared as f64)
     }

@@ -15,7 +15,7 @@ pub struct Hand {
     pub depth: f64,
     /// Breadth of the fingers along x, centred on 0 (GPD: `hand_height`).
     pub height: f64,
-    /// Box of the palm: smallest and largest coordinates.
+    /// Box of the palm: smallest and largest coordinates. Both are the same for a hand without a palm.
     pub palm: [[f64; 3]; 2],
 }
 
@@ -88,13 +88,16 @@ impl Hand {
     /// The hand with boxes that are larger by `margin` on every side.
     #[must_use]
     pub fn grown(self, margin: f64) -> Self {
-        let [lower, upper] = self.palm;
+        let palm = match self.palm {
+            [lower, upper] if lower == upper => self.palm,
+            [lower, upper] => [lower.map(|c| c - margin), upper.map(|c| c + margin)],
+        };
         Self {
             finger_width: self.finger_width + 2.0 * margin,
             outer_diameter: self.outer_diameter + 2.0 * margin,
             depth: self.depth + margin,
             height: self.height + 2.0 * margin,
-            palm: [lower.map(|c| c - margin), upper.map(|c| c + margin)],
+            palm,
         }
     }
 
@@ -196,6 +199,14 @@ mod tests {
         assert!(hand.palm_meets(&Point3::new(0.03, 0.09, -0.05)));
         assert!(hand.meets(&Point3::new(0.005, 0.045, -0.05), 0.05) && !hand.meets(&Point3::new(0.0, 0.0, 0.03), 0.05));
         assert!(hand.meets(&Point3::new(0.0, 0.0, -0.13), 0.05) && !hand.meets(&Point3::new(0.0, 0.0, -0.13), 0.04));
+    }
+
+    #[test]
+    fn a_hand_without_a_palm_gets_none_by_a_margin() {
+        let hand = Hand::new(0.1, 0.06, 0.01, 0.02, Default::default()).unwrap().grown(0.02);
+        let between_the_fingers = Point3::new(0.0, 0.0, 0.01);
+        assert!(!hand.meets(&between_the_fingers, 0.05));
+        assert!(Hand::PANDA.grown(0.02).meets(&between_the_fingers, 0.05));
     }
 
     #[test]

@@ -43,23 +43,26 @@ impl ObjectMap {
         self.wanted.iter().flatten().copied().find(|label| !observed.contains(label))
     }
 
-    /// The object between the open fingers of a hand at `pose`: the one with the most cells; `None` if there is none.
+    /// The object between the open fingers of a hand at `pose`: the one that fills the largest part of the space between
+    /// them; `None` if there is none.
     #[must_use]
     pub fn object(&self, pose: &Isometry3<f64>, hand: &Hand) -> Option<u16> {
+        /// Most steps between the points along an axis. It bounds the time for large hands; the Panda's has 11.
+        const STEPS: f64 = 16.0;
         let map_from_hand = self.map_from_frame * pose;
         let range = |from: f64, to: f64| {
-            let steps = ((to - from) / CELL).ceil();
+            let steps = ((to - from) / CELL).ceil().clamp(1.0, STEPS);
             (0..=steps as u32).map(move |step| from + (to - from) * f64::from(step) / steps)
         };
-        let mut cells = BTreeSet::new();
+        let mut votes = BTreeMap::new();
         for x in range(-hand.height / 2.0, hand.height / 2.0) {
             for y in range(-hand.half_opening(), hand.half_opening()) {
-                cells.extend(range(0.0, hand.depth).map(|z| cell(&(map_from_hand * Point3::new(x, y, z)))));
+                for z in range(0.0, hand.depth) {
+                    if let Some(label) = self.cells.get(&cell(&(map_from_hand * Point3::new(x, y, z)))) {
+                        *votes.entry(*label).or_default() += 1;
+                    }
+                }
             }
-        }
-        let mut votes = BTreeMap::new();
-        for label in cells.iter().filter_map(|cell| self.cells.get(cell)) {
-            *votes.entry(*label).or_default() += 1;
         }
         most(votes)
     }
@@ -74,6 +77,9 @@ impl ObjectMap {
     /// The grasps, best first, without those beyond the best `limit` of their object.
     #[must_use]
     pub fn limited(&self, grasps: Vec<Grasp>, hand: &Hand, limit: usize) -> Vec<Grasp> {
+        if limit >= grasps.len() {
+            return grasps;
+        }
         let mut counts = BTreeMap::<Option<u16>, usize>::new();
         let mut is_within = |grasp: &Grasp| {
             let count = counts.entry(self.object(&grasp.pose, hand)).or_default();

@@ -13,6 +13,13 @@ impl Tile {
     /// one: of grasps within 5 cm of a side, more than half were bad.
     pub const MARGIN: f64 = 0.05;
 
+    /// The number of cubes that [`cover`](Self::cover) returns. It is not an integer type, because it may be huge if
+    /// `margin` is almost half of `size`.
+    #[must_use]
+    pub fn count(extent: [f64; 2], size: f64, margin: f64) -> f64 {
+        extent.map(|extent| count(extent, size, margin)).iter().product()
+    }
+
     /// The cubes with an edge of `size` that cover a workspace from (0, 0) to `extent`. Their inner parts are at least
     /// `margin` from their sides, so the outer cubes extend beyond the workspace. `margin` is less than half of `size`.
     #[must_use]
@@ -31,11 +38,16 @@ struct Interval {
     inner: [f64; 2],
 }
 
-/// The fewest evenly spaced intervals of `size` whose inner parts cover those from 0 to `extent`.
-fn intervals(extent: f64, size: f64, margin: f64) -> Vec<Interval> {
+/// The number of [`intervals`].
+fn count(extent: f64, size: f64, margin: f64) -> f64 {
     let length = size - 2.0 * margin;
     // The tolerance keeps an extent of exactly n parts from needing n + 1.
-    let count = (extent / length - 1e-9).ceil().max(1.0);
+    (extent / length - 1e-9).ceil().max(1.0)
+}
+
+/// The fewest evenly spaced intervals of `size` whose inner parts cover those from 0 to `extent`.
+fn intervals(extent: f64, size: f64, margin: f64) -> Vec<Interval> {
+    let count = count(extent, size, margin);
     let part = extent / count;
     let interval = |index: u32| {
         let inner = [f64::from(index), f64::from(index + 1)].map(|i| i * part);
@@ -65,5 +77,7 @@ mod tests {
         }
         assert_eq!(Tile::cover([0.9, 0.6], 0.3, Tile::MARGIN).len(), 15);
         assert_eq!(Tile::cover([0.2, 0.2], 0.3, Tile::MARGIN).len(), 1);
+        assert_eq!(Tile::count([0.9, 0.6], 0.3, Tile::MARGIN), 15.0);
+        assert!(Tile::count([2.0, 2.0], 0.1001, Tile::MARGIN) > 1e8);
     }
 }

@@ -78,6 +78,12 @@ pub enum RuntimeError {
         /// Name of the model.
         model: String,
     },
+    /// The scores of a classifier are not numbers.
+    #[error("the model `{model}` computes NaN; use another --precision or --provider, or train it again")]
+    Nan {
+        /// Name of the model.
+        model: String,
+    },
     /// ONNX Runtime failed.
     #[error("the model `{model}`: {reason}")]
     Run {

@@ -47,7 +47,7 @@ impl HandFit {
     pub(crate) fn of(scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Self, PlanError> {
         let volume = &scene.volume;
         let size = volume.resolution() as f64 * volume.voxel_size();
-        let table = params.table.unwrap_or(0.0);
+        let table = params.table.unwrap_or(f64::NEG_INFINITY);
         let points = match &scene.points {
             Some(points) => Cow::Borrowed(points),
             None => Cow::Owned(Fusion::of(volume).surface()),

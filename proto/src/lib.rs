@@ -37,7 +37,7 @@ pub use options::{Collision, DetectParams, TABLE_HEIGHT};
 pub use pb::Priority;
 pub use png::grey_png;
 pub use pose::pose;
-pub use views::{MAX_VIEWS, Points, check_count, cloud_view, depth_view};
+pub use views::{MAX_VIEWS, Points, check_count, check_png, cloud_view, depth_view};
 pub use volume::{encode, resolution};
 pub use workspace::Workspace;
 

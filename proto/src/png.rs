@@ -5,8 +5,17 @@ use png::{BitDepth, ColorType, Decoder, Limits, Transformations};
 /// Most pixels of an image that is sent as PNG. A small file can contain a large image.
 const MAX_PIXELS: usize = 1 << 24;
 
-/// The grey values of a PNG file of `width` × `height` pixels, row by row; the error says what is wrong.
+/// The 16-bit grey values of a PNG file of `width` × `height` pixels, row by row; the error says what is wrong.
+pub(crate) fn deep_grey(file: &[u8], width: usize, height: usize) -> Result<Vec<u16>, String> {
+    decoded(file, width, height, &[BitDepth::Sixteen])
+}
+
+/// The 8-bit or 16-bit grey values of a PNG file, as [`deep_grey`].
 pub(crate) fn grey(file: &[u8], width: usize, height: usize) -> Result<Vec<u16>, String> {
+    decoded(file, width, height, &[BitDepth::Eight, BitDepth::Sixteen])
+}
+
+fn decoded(file: &[u8], width: usize, height: usize, depths: &[BitDepth]) -> Result<Vec<u16>, String> {
     let pixels = width * height;
     if pixels > MAX_PIXELS {
         return Err(format!("an image of {width} × {height} pixels is too large for PNG, at most {MAX_PIXELS} in all"));
@@ -21,11 +30,12 @@ pub(crate) fn grey(file: &[u8], width: usize, height: usize) -> Result<Vec<u16>,
         return Err(format!("the PNG has {w} × {h} pixels, the camera has {width} × {height}"));
     }
     let (color, depth) = reader.output_color_type();
-    let size = match (color, depth) {
-        (ColorType::Grayscale, BitDepth::Eight) => 1,
-        (ColorType::Grayscale, BitDepth::Sixteen) => 2,
-        _ => return Err(format!("the PNG has the type {color:?} of {depth:?} bits, must be grey of 8 or 16 bits")),
-    };
+    if color != ColorType::Grayscale || !depths.contains(&depth) {
+        let bits: Vec<String> = depths.iter().map(|depth| (*depth as u8).to_string()).collect();
+        let (depth, bits) = (depth as u8, bits.join(" or "));
+        return Err(format!("the PNG has the type {color:?} of {depth} bits, must be grey of {bits} bits"));
+    }
+    let size = depth as usize / 8;
     let mut data = vec![0; pixels * size];
     reader.next_frame(&mut data).map_err(not_png)?;
     Ok(match size {

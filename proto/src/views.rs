@@ -48,6 +48,30 @@ pub fn check_count(views: usize) -> Result<(), FieldError> {
     Err(FieldError::new("views", format_args!("a list of {views}"), format_args!("must have from 1 to {MAX_VIEWS}")))
 }
 
+/// Checks the size of the images that are sent as PNG, before they are decoded: a small file can contain a large image.
+///
+/// # Errors
+/// [`FieldError`] if all of them together have too many pixels.
+pub fn check_png(views: &[pb::DepthView]) -> Result<(), FieldError> {
+    /// 128 MiB of depths in f32: 109 images of 640 × 480 pixels.
+    const MAX_PIXELS: u64 = 1 << 25;
+    let pixels = |view: &pb::DepthView| {
+        let labels = view.labels.as_ref().map(pb::Labels::r#type);
+        let images =
+            u64::from(view.unit() == pb::DepthUnit::PngMillimetres) + u64::from(labels == Some(pb::LabelType::Png));
+        // Fits: the edges have 32 bits, and a message of views has far fewer than 2³² of them.
+        view.camera
+            .as_ref()
+            .map_or(0, |camera| images.saturating_mul(u64::from(camera.width) * u64::from(camera.height)))
+    };
+    let sum = views.iter().map(pixels).fold(0, u64::saturating_add);
+    if sum <= MAX_PIXELS {
+        return Ok(());
+    }
+    let needed = format_args!("must have at most {MAX_PIXELS}; send fewer or smaller images");
+    Err(FieldError::new("views", format_args!("PNG images with {sum} pixels in all"), needed))
+}
+
 /// Converts depth view `index`: depth in metres, row by row, and the camera pose in the task frame.
 ///
 /// # Errors
@@ -103,7 +127,7 @@ pub(crate) fn image(view: &pb::DepthView) -> Result<(Intrinsics, Vec<f32>), Fiel
             view.data.as_chunks().0.iter().map(|&bytes| f32::from(u16::from_le_bytes(bytes)) * 1e-3).collect()
         }
         pb::DepthUnit::PngMillimetres => {
-            let values = png::grey(&view.data, intrinsics.width, intrinsics.height);
+            let values = png::deep_grey(&view.data, intrinsics.width, intrinsics.height);
             let values = values.map_err(|reason| FieldError::refused("data", reason))?;
             values.into_iter().map(|value| f32::from(value) * 1e-3).collect()
         }
@@ -111,6 +135,10 @@ pub(crate) fn image(view: &pb::DepthView) -> Result<(Intrinsics, Vec<f32>), Fiel
     };
     let image = DepthImage::new(intrinsics, &depth).map_err(|error| FieldError::refused("camera", error))?;
     match (image.unit(), view.unit()) {
+        (DepthUnit::Millimetres, pb::DepthUnit::U16Millimetres | pb::DepthUnit::PngMillimetres) => {
+            let needed = "is farther than depth cameras measure: send 0 for pixels without a reading";
+            return Err(FieldError::new("data", "in millimetres, with a median above 20,000", needed));
+        }
         (DepthUnit::Millimetres, _) => {
             let needed = "must be metres but looks like millimetres: send u16 with DEPTH_UNIT_U16_MILLIMETRES, or divide \
                           by 1000";
@@ -269,6 +297,38 @@ mod tests {
             "views[1].data: the PNG has 3 × 4 pixels, the camera has 4 × 3"
         );
         assert!(refused(|view| view.unit = unit).starts_with("views[1].data: not a valid PNG file"));
+    }
+
+    #[test]
+    fn png_images_of_a_request_are_limited_together() {
+        let image = |edge: u32| pb::DepthView {
+            unit: pb::DepthUnit::PngMillimetres.into(),
+            camera: Some(pb::Camera { width: edge, height: edge, k: Vec::new() }),
+            ..view()
+        };
+        assert!(check_png(&[image(4096), image(4096)]).is_ok());
+        let r#type = pb::LabelType::Png.into();
+        let labelled = pb::DepthView { labels: Some(pb::Labels { r#type, ..Default::default() }), ..image(4096) };
+        assert_eq!(
+            check_png(&[image(4096), labelled]).unwrap_err().to_string(),
+            "views is PNG images with 50331648 pixels in all, must have at most 33554432; send fewer or smaller images"
+        );
+        let raw = pb::DepthView { unit: pb::DepthUnit::U16Millimetres.into(), ..image(u32::MAX) };
+        assert!(check_png(&[raw]).is_ok(), "its size is that of the message");
+        assert!(check_png(&[image(u32::MAX), image(u32::MAX)]).is_err());
+    }
+
+    #[test]
+    fn a_depth_in_8_bits_is_refused() {
+        let mut file = Vec::new();
+        let mut encoder = ::png::Encoder::new(&mut file, 4, 3);
+        encoder.set_color(::png::ColorType::Grayscale);
+        encoder.write_header().unwrap().write_image_data(&[200; 12]).unwrap();
+        let unit = pb::DepthUnit::PngMillimetres.into();
+        assert_eq!(
+            refused(|view| *view = pb::DepthView { data: file.clone().into(), unit, ..view.clone() }),
+            "views[1].data: the PNG has the type Grayscale of 8 bits, must be grey of 16 bits"
+        );
     }
 
     #[test]

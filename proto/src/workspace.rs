@@ -63,7 +63,7 @@ impl TryFrom<pb::Workspace> for Workspace {
 
 impl Workspace {
     /// Finds the table in the first of the request's views, if the request asks for it, and sets the pose of the
-    /// workspace. The table is at `height` in it, metres.
+    /// workspace. The table is at `height` in it, and a workspace without an extent is a cube with this `edge`, metres.
     ///
     /// # Errors
     /// [`FieldError`] if the view is invalid or shows no table.
@@ -71,11 +71,12 @@ impl Workspace {
         &mut self,
         views: &mut [pb::DepthView],
         height: f64,
+        edge: f64,
     ) -> Result<Option<pb::FoundTable>, FieldError> {
         let is_only = views.len() == 1;
         match views.first_mut() {
             Some(first) if self.find_table => {
-                let found = self.find_table_in(first, is_only, height);
+                let found = self.find_table_in(first, is_only, height, edge);
                 found.map(Some).map_err(|error| error.inside("views[0]"))
             }
             _ => Ok(None),
@@ -92,6 +93,7 @@ impl Workspace {
         view: &mut pb::DepthView,
         is_only: bool,
         height: f64,
+        edge: f64,
     ) -> Result<pb::FoundTable, FieldError> {
         if is_only && view.extrinsics.is_none() {
             view.extrinsics = Some(Extrinsics::FrameFromCamera((&Isometry3::identity()).into()));
@@ -104,7 +106,8 @@ impl Workspace {
         let frame_from_camera = pose::decode(pose, &FRAME_FROM_CAMERA)?;
         let (intrinsics, depth) = image(view)?;
         let image = DepthImage::new(intrinsics, &depth).map_err(|error| FieldError::refused("camera", error))?;
-        self.place_on_table(&image, &frame_from_camera, height).map_err(|error| FieldError::refused("data", error))
+        let found = self.place_on_table(&image, &frame_from_camera, height, edge);
+        found.map_err(|error| FieldError::refused("data", error))
     }
 
     /// Finds the table in the first of the request's point clouds, if the request asks for it, and sets the pose of the
@@ -116,10 +119,11 @@ impl Workspace {
         &mut self,
         views: &[pb::CloudView],
         height: f64,
+        edge: f64,
     ) -> Result<Option<pb::FoundTable>, FieldError> {
         match views.first() {
             Some(first) if self.find_table => {
-                let found = self.find_table_in_cloud(first, height);
+                let found = self.find_table_in_cloud(first, height, edge);
                 found.map(Some).map_err(|error| error.inside("views[0]"))
             }
             _ => Ok(None),
@@ -130,7 +134,12 @@ impl Workspace {
     ///
     /// # Errors
     /// [`FieldError`] names the field of the view.
-    pub fn find_table_in_cloud(&mut self, view: &pb::CloudView, height: f64) -> Result<pb::FoundTable, FieldError> {
+    pub fn find_table_in_cloud(
+        &mut self,
+        view: &pb::CloudView,
+        height: f64,
+        edge: f64,
+    ) -> Result<pb::FoundTable, FieldError> {
         let Points { points, eye, .. } = try_cloud_view(view, &Isometry3::identity())?;
         let seen = overview(&points, &eye).ok_or_else(|| {
             let value = format_args!("({}, {}, {})", eye.x, eye.y, eye.z);
@@ -138,7 +147,7 @@ impl Workspace {
         })?;
         let image = DepthImage::new(seen.intrinsics, &seen.depth);
         let image = image.map_err(|error| FieldError::refused("points", error))?;
-        let found = self.place_on_table(&image, &seen.camera_from_task.inverse(), height);
+        let found = self.place_on_table(&image, &seen.camera_from_task.inverse(), height, edge);
         found.map_err(|error| FieldError::refused("points", format!("seen from camera_position, {error}")))
     }
 
@@ -148,11 +157,12 @@ impl Workspace {
         image: &DepthImage,
         frame_from_camera: &Isometry3<f64>,
         height: f64,
+        edge: f64,
     ) -> Result<pb::FoundTable, NoTabletop> {
         let gravity = self.gravity.map(|gravity| frame_from_camera.rotation.inverse() * gravity);
         let found = Tabletop::find(image, gravity, height)?;
-        // A larger workspace has its middle over that of the cube which was found.
-        let corner = self.extent.map_or([0.0; 2], |extent| extent.map(|length| (WORKSPACE_SIZE - length) / 2.0));
+        // The workspace has its middle over that of the cube which was found.
+        let corner = self.extent.unwrap_or([edge; 2]).map(|length| (WORKSPACE_SIZE - length) / 2.0);
         let in_cube = Translation3::new(corner[0], corner[1], 0.0);
         self.frame_from_task = frame_from_camera * found.camera_from_task * in_cube;
         let Tabletop { distance, angle, share, deviation, tilt, .. } = found;

@@ -12,7 +12,7 @@ use axum::routing::get;
 use axum::{Json, Router};
 use serde_json::{Value, json};
 use tokio::net::TcpListener;
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 use tokio_stream::wrappers::WatchStream;
 use tokio_stream::{Stream, StreamExt};
 
@@ -26,12 +26,23 @@ use crate::transport::http_connections::{self, HttpConfig};
 /// Maximum number of open connections.
 pub(crate) const CONNECTIONS: usize = 128;
 
+/// Maximum number of pages that are told about new requests, so that connections remain for probes and Prometheus.
+const PAGES: usize = 32;
+
 /// State shared by the HTTP handlers.
 #[derive(Clone)]
 pub(crate) struct HttpState {
     pub metrics: Arc<Metrics>,
     pub models: Arc<ModelRegistry>,
     pub recent: Arc<RecentRequests>,
+    /// Permits of the pages that are told about new requests.
+    pub pages: Arc<Semaphore>,
+}
+
+impl HttpState {
+    pub fn new(metrics: Arc<Metrics>, models: Arc<ModelRegistry>, recent: Arc<RecentRequests>) -> Self {
+        Self { metrics, models, recent, pages: Arc::new(Semaphore::new(PAGES)) }
+    }
 }
 
 /// Serves `/metrics` for Prometheus, the probes `/healthz` and `/readyz`, and the web page with its API. `hosts` are
@@ -131,9 +142,17 @@ async fn models(Shared(pages): Shared<HttpState>) -> Json<Value> {
 }
 
 /// Server-sent events: the number of the latest request, on each new request.
-async fn events(Shared(pages): Shared<HttpState>) -> Sse<impl Stream<Item = Result<Event, Infallible>>> {
-    let numbers = WatchStream::new(pages.recent.last());
-    Sse::new(numbers.map(|number| Ok(Event::default().data(number.to_string())))).keep_alive(KeepAlive::default())
+async fn events(
+    Shared(pages): Shared<HttpState>,
+) -> Result<Sse<impl Stream<Item = Result<Event, Infallible>>>, (StatusCode, &'static str)> {
+    let permit = Arc::clone(&pages.pages).try_acquire_owned();
+    let permit = permit.map_err(|_| (StatusCode::SERVICE_UNAVAILABLE, "too many pages are open; close others\n"))?;
+    let numbers = WatchStream::new(pages.recent.last()).map(move |number| {
+        // Released when the page is closed.
+        let _permit = &permit;
+        Ok(Event::default().data(number.to_string()))
+    });
+    Ok(Sse::new(numbers).keep_alive(KeepAlive::default()))
 }
 
 #[cfg(test)]

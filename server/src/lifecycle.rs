@@ -160,13 +160,15 @@ async fn serve(
     let state = readiness.subscribe();
     let models = Arc::new(ModelRegistry::default());
     let recent = Arc::new(RecentRequests::new(config.recent));
-    let pages = HttpState { metrics: Arc::clone(metrics), models: Arc::clone(&models), recent: Arc::clone(&recent) };
+    let pages = HttpState::new(Arc::clone(metrics), Arc::clone(&models), Arc::clone(&recent));
     let Config { tls, tokens, limits, max_tracked, track_timeout, queue, .. } = config;
     let budget = metrics.receiving(config.max_receiving_bytes);
     let http_config = HttpConfig { connections: crate::http::CONNECTIONS, tls: None, budget: Arc::clone(&budget) };
     let http = tokio::spawn(crate::http::serve(http, config.http_hosts.clone(), pages, http_config, state.clone()));
     let calls = Calls::new(Arc::clone(metrics), recent, state.clone());
-    let (folder, control) = ModelFolder::new(config, Arc::clone(&models), Arc::clone(sessions), Arc::clone(metrics));
+    let (folder, control) =
+        ModelFolder::new(config, Arc::clone(&models), Arc::clone(sessions), Arc::clone(metrics), state.clone());
+    let loads = folder.loads();
     let inference = InferenceRpc::new(Arc::clone(&models), calls.clone(), Arc::clone(metrics), control);
     let tracked_volumes = TrackedVolumes::new(*max_tracked, *track_timeout, metrics.tracked());
     let at_once = config.workers * config.batching.max;
@@ -191,12 +193,11 @@ async fn serve(
         .inference_timeout
         .map(|timeout| tokio::spawn(Arc::clone(sessions).watch(Arc::clone(&models), timeout, is_able)));
     let entries = config.store.entries().to_vec();
-    let mut loading = tokio::task::spawn_blocking(move || folder.load(&entries, &state).map(|()| folder));
+    let mut loading = tokio::task::spawn_blocking(move || folder.load(&entries).map(|()| folder));
     let loaded = tokio::select! {
         loaded = &mut loading => Some(loaded),
         () = signals.next() => None,
     };
-    let is_loading = loaded.is_none();
     if let Some(folder) = loaded {
         tokio::spawn(folder.context("the thread that loads the models panicked")??.watch(hangup, config.watch));
         readiness.serving(true);
@@ -218,9 +219,7 @@ async fn serve(
             let _ = rest.await;
         }
         // ONNX Runtime may crash if the process exits while a model is loaded. The models after it are not loaded.
-        if is_loading {
-            let _ = loading.await;
-        }
+        let _ = tokio::task::spawn_blocking(move || loads.wait()).await;
         ended
     };
     tokio::select! {

@@ -1,4 +1,5 @@
 use grasp_proto::oip::grpc_inference_service_server::SERVICE_NAME as INFERENCE;
+use grasp_proto::on_a_line;
 use grasp_proto::pb::grasp_service_server::SERVICE_NAME;
 use tokio::sync::watch;
 use tokio_stream::StreamExt;
@@ -60,7 +61,8 @@ impl health_server::Health for Health {
         let service = request.into_inner().service;
         if !is_known(&service) {
             return Err(Status::not_found(format!(
-                "service `{service}` not found; available: `{SERVICE_NAME}`, `{INFERENCE}`"
+                "service `{}` not found; available: `{SERVICE_NAME}`, `{INFERENCE}`",
+                on_a_line(&service)
             )));
         }
         Ok(Response::new(response(serving_status(*self.0.borrow()))))

@@ -133,7 +133,8 @@ async fn check_access(State(rest): State<Rest>, mut request: Request, next: Next
         }
         Err(status) => {
             rest.metrics.ended("", status.code());
-            discard(request.into_body(), rest.limits).await;
+            let (parts, body) = request.into_parts();
+            discard(body, &parts, rest.limits).await;
             Err(status.into())
         }
     }
@@ -256,7 +257,12 @@ async fn infer(
     let (parts, body) = request.into_parts();
     let header_length = parts.headers.get(HEADER_LENGTH).cloned();
     let body = read(body, &parts, rest.limits).await.inspect_err(|status| rest.metrics.ended("", status.code()))?;
-    let parsed = rest.convert(move || InferRequest::parse(&body.bytes, header_length.as_ref())).await?;
+    let parse = move || {
+        // The whole body, so that it is dropped when it is parsed, and no longer counts as being received.
+        let body = body;
+        InferRequest::parse(&body.bytes, header_length.as_ref())
+    };
+    let parsed = rest.convert(parse).await?;
     let parsed = parsed.inspect_err(|status| rest.metrics.ended("", status.code()))?;
     let (message, binary) = parsed.into_message(model, version);
     let (_, message, extensions) = rest.inference.model_infer(grpc(parts, message)).await?.into_parts();

@@ -17,3 +17,4 @@ pub(crate) mod session;
 pub(crate) mod session_threads;
 pub(crate) mod stamps;
 pub(crate) mod tracking;
+pub(crate) mod turns;

@@ -740,6 +740,7 @@ class PackageTest(ServerTest):
             (graspd.Model, grasp_pb2.Model),
             (graspd.GeometryWarning, grasp_pb2.GeometryWarning),
             (graspd.FoundTable, grasp_pb2.FoundTable),
+            (graspd.Candidate, grasp_pb2.Candidate),
             (graspd.Score, grasp_pb2.Score),
             (graspd.Scores, grasp_pb2.ScoreGraspsResponse),
             (graspd.Workspace, grasp_pb2.Workspace),
@@ -752,6 +753,10 @@ class WireTest(unittest.TestCase):
     def test_absent_values_are_none_and_zero_is_not(self):
         for azimuth in [None, 0.0, -90.0]:
             self.assertEqual(wire.model(grasp_pb2.Model(camera_azimuth=azimuth)).camera_azimuth, azimuth)
+
+    def test_values_that_only_a_newer_server_knows_are_numbers(self):
+        self.assertEqual(wire.score(grasp_pb2.Score(violations=[99])).violations, ("99",))
+        self.assertEqual(wire.warning(grasp_pb2.GeometryWarning(code=99)).code, "99")
 
     def test_errors_in_streams_name_the_field(self):
         for field in [None, "options.model"]:

@@ -209,11 +209,11 @@ async fn the_memory_of_incomplete_messages_is_bounded_and_shared() {
 
     let mut flood = connect(&server).await;
     let mut calls = Vec::new();
-    for _ in 0..32 {
+    for method in ["DetectGrasps", "DetectGraspsStream"].into_iter().cycle().take(32) {
         let mut flood = flood.clone();
-        calls.push(tokio::spawn(async move {
-            call("1M", &mut flood, "DetectGrasps", &[incomplete], Duration::ZERO, false).await
-        }));
+        calls.push(tokio::spawn(
+            async move { call("1M", &mut flood, method, &[incomplete], Duration::ZERO, false).await },
+        ));
     }
     let used = server.wait_until("graspd_receiving_bytes", |bytes| bytes > MESSAGE as f64).await;
     assert!(used <= (BUDGET / 2) as f64, "{used} bytes on one connection");

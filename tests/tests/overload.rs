@@ -7,7 +7,7 @@ use grasp::Volume;
 use grasp_client::{Access, Client, DetectOptions, Error, Options, Retry, Workspace};
 use grasp_proto::Priority;
 use grasp_proto::pb::grasp_service_client::GraspServiceClient;
-use grasp_proto::pb::{CollisionCheck, DetectGraspsRequest, collision_check};
+use grasp_proto::pb::{CollisionCheck, DetectGraspsFromDepthRequest, DetectGraspsRequest, collision_check};
 use grasp_tests::scene::{camera, view};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
 use nalgebra::Isometry3;
@@ -271,6 +271,35 @@ async fn one_caller_with_many_calls_leaves_room_for_another() {
         assert!(latency.queue < 6.0 * latency.inference, "{latency:?}");
     }
     assert!(server.metric("graspd_refusals_total{model=\"slow 1\",reason=\"displaced\"}") > 0.0);
+    many.shutdown().await;
+}
+
+#[tokio::test]
+async fn one_caller_with_many_images_leaves_room_for_another() {
+    let server = Server::run(&[TestModel::new("mirror")], &["--queue", "8"]);
+    let other = Endpoint::from_shared(format!("http://{}", server.grpc())).unwrap();
+    let other = other.local_address(Some([127, 0, 0, 2].into())).connect().await.unwrap();
+    let views: Vec<_> = (0..24).map(|index| view(&camera(40.0, 15.0 * f64::from(index)))).collect();
+    let request = DetectGraspsFromDepthRequest { views: views.iter().map(Into::into).collect(), ..Default::default() };
+    let mut many = JoinSet::new();
+    for _ in 0..32 {
+        let (mut client, request) = (GraspServiceClient::new(other.clone()), request.clone());
+        // Calls again when it is answered or refused.
+        many.spawn(async move {
+            loop {
+                match client.detect_grasps_from_depth(request.clone()).await {
+                    Err(status) if status.code() != Code::ResourceExhausted => panic!("{status}"),
+                    _ => {}
+                }
+            }
+        });
+    }
+    server.wait_until("graspd_refusals_total{model=\"mirror 1\",reason=\"full\"}", |refused| refused > 0.0).await;
+    let client = server.client().await;
+    for _ in 0..10 {
+        client.detect_from_depth(&views[..1], &Workspace::default(), Options::default()).await.unwrap();
+    }
+    assert!(server.metric("graspd_refusals_total{model=\"mirror 1\",reason=\"displaced\"}") > 0.0);
     many.shutdown().await;
 }
 

@@ -18,6 +18,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 use tokio_rustls::TlsConnector;
+use tokio_rustls::client::TlsStream;
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::pki_types::{CertificateDer, ServerName};
 use tokio_rustls::rustls::{self, ClientConfig, RootCertStore};
@@ -67,6 +68,18 @@ impl Authority {
         self.file(name).to_str().unwrap().to_owned()
     }
 
+    /// A connection over TLS.
+    async fn connect(&self, address: SocketAddr) -> std::io::Result<TlsStream<TcpStream>> {
+        let mut roots = RootCertStore::empty();
+        roots.add(CertificateDer::from_pem_slice(self.issuer.pem().as_bytes()).unwrap()).unwrap();
+        let config = ClientConfig::builder_with_provider(Arc::new(rustls::crypto::ring::default_provider()));
+        let config = config.with_safe_default_protocol_versions().unwrap();
+        let config = config.with_root_certificates(roots).with_no_client_auth();
+        let stream = TcpStream::connect(address).await?;
+        let name = ServerName::try_from("localhost").unwrap();
+        TlsConnector::from(Arc::new(config)).connect(name, stream).await
+    }
+
     fn access(&self) -> Access {
         Access { ca: Some(Certificate::from_pem(self.issuer.pem())), ..Access::default() }
     }
@@ -79,14 +92,7 @@ async fn detects(server: &Server, access: Access) -> Result<usize, Error> {
 
 /// The status of an HTTP request over TLS, with these lines in its header.
 async fn https(authority: &Authority, address: SocketAddr, path: &str, header: &str) -> std::io::Result<u16> {
-    let mut roots = RootCertStore::empty();
-    roots.add(CertificateDer::from_pem_slice(authority.issuer.pem().as_bytes()).unwrap()).unwrap();
-    let config = ClientConfig::builder_with_provider(Arc::new(rustls::crypto::ring::default_provider()));
-    let config = config.with_safe_default_protocol_versions().unwrap();
-    let config = config.with_root_certificates(roots).with_no_client_auth();
-    let stream = TcpStream::connect(address).await?;
-    let name = ServerName::try_from("localhost").unwrap();
-    let mut stream = TlsConnector::from(Arc::new(config)).connect(name, stream).await?;
+    let mut stream = authority.connect(address).await?;
     let request = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n{header}\r\n");
     stream.write_all(request.as_bytes()).await?;
     let mut response = String::new();
@@ -139,6 +145,25 @@ async fn tls_needs_the_ca_of_the_server() {
         .output()
         .unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+#[tokio::test]
+async fn a_client_that_is_silent_after_the_tls_handshake_is_disconnected() {
+    let authority = Authority::new();
+    authority.sign("server");
+    let (cert, key) = (authority.path("server.pem"), authority.path("server.key"));
+    let server =
+        Server::run(&[TestModel::new("mirror")], &["--tls-cert", &cert, "--tls-key", &key, "--stall-timeout", "0.5"]);
+    let mut silent = [authority.connect(server.grpc()).await.unwrap(), authority.connect(server.grpc()).await.unwrap()];
+    silent[1].write_all(b"PRI * HTTP/2.0").await.unwrap();
+    server.wait_for("graspd_connections", 2.0).await;
+    server.wait_for("graspd_connections", 0.0).await;
+    // After the preface a connection may stay idle.
+    let client = Client::connect_with(server.grpc().to_string(), authority.access()).await.unwrap();
+    client.health().await.unwrap();
+    tokio::time::sleep(Duration::from_millis(900)).await;
+    assert_eq!(server.metric("graspd_connections"), 1.0);
+    client.health().await.unwrap();
 }
 
 #[tokio::test]

@@ -170,3 +170,24 @@ async fn tracked_volumes_are_limited_and_expire() {
     let mut tracking = client.track(Workspace::default()).await.unwrap();
     assert!(tracking.add(&views, low()).await.is_ok(), "the slot of the expired volume is free");
 }
+
+#[tokio::test]
+async fn each_cube_of_a_tracked_workspace_counts() {
+    let server = Server::run(&[TestModel::new("mirror")], &["--max-tracked", "9"]);
+    let client = server.client().await;
+    let views = [view(&camera(40.0, -90.0))];
+    let of = |extent| Workspace { extent: Some(extent), ..Workspace::default() };
+    let mut large = client.track(of([0.4, 0.4])).await.unwrap();
+    large.add(&views, low()).await.unwrap();
+    assert_eq!(server.metric(TRACKED), 4.0);
+
+    let mut second = client.track(of([0.6, 0.4])).await.unwrap();
+    let (status, message) = code(second.add(&views, low()).await);
+    assert!(status == Code::ResourceExhausted && message.contains("--max-tracked"), "{message}");
+    assert_eq!(server.metric(TRACKED), 5.0, "a stream without a volume has one place");
+    let mut third = client.track(of([0.4, 0.4])).await.unwrap();
+    third.add(&views, low()).await.unwrap();
+    assert_eq!(server.metric(TRACKED), 9.0);
+    drop(large);
+    server.wait_for(TRACKED, 5.0).await;
+}

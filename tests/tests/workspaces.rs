@@ -101,6 +101,43 @@ async fn a_large_workspace_has_the_grasps_of_all_objects() {
 }
 
 #[tokio::test]
+async fn cubes_that_margins_fill_are_refused_before_they_need_memory() {
+    let (_server, client) = server(&[]).await;
+    let refused = async |size: f64, margin: f64| {
+        let workspace = Workspace { size: Some(size), extent: Some([2.0, 2.0]), ..Workspace::default() };
+        let model = "shaf".to_owned();
+        let detect = DetectOptions { model, margin: Some(margin), ..DetectOptions::default() };
+        refusal(client.detect_from_depth(&views(), &workspace, options(detect)).await)
+    };
+    for (size, margin) in [(0.1, 0.0), (0.02, 0.0), (0.2, 0.1)] {
+        let message = refused(size, margin).await;
+        assert!(message.starts_with("workspace.extent is given") && message.contains("options.margin"), "{message}");
+    }
+    let message = refused(0.1001, 0.0).await;
+    assert!(message.contains("which needs 400") && message.contains("at most 100"), "{message}");
+}
+
+#[tokio::test]
+async fn a_cube_of_another_size_has_its_middle_over_the_objects_too() {
+    let (_server, client) = server(&[]).await;
+    let camera = camera_at(Point3::new(0.36, 0.25, 0.08), 0.6, 30.0, -90.0);
+    let of_camera = Extrinsics::FrameFromCamera(Isometry3::identity());
+    let view = DepthView { extrinsics: of_camera, ..labelled(&BOXES[1..2], &camera) };
+    let mut middles = Vec::new();
+    for size in [None, Some(0.5)] {
+        let workspace = Workspace { size, find_table: Some(FindTable::default()), ..Workspace::default() };
+        let model = "shaf".to_owned();
+        let detect = DetectOptions { model, ..DetectOptions::default() };
+        let views = std::slice::from_ref(&view);
+        let table = client.detect_from_depth(views, &workspace, options(detect)).await.unwrap().table.unwrap();
+        let half = size.unwrap_or(0.3) / 2.0;
+        let pose = grasp_proto::pose(table.workspace.as_ref().unwrap(), "workspace").unwrap();
+        middles.push(pose * Point3::new(half, half, TABLE));
+    }
+    assert!((middles[0] - middles[1]).norm() < 1e-6, "{middles:?}");
+}
+
+#[tokio::test]
 async fn a_large_workspace_is_placed_over_the_table_that_was_found() {
     let (_server, client) = server(&[]).await;
     let camera = camera_at(Point3::new(0.45, 0.25, 0.08), 0.8, 30.0, -90.0);

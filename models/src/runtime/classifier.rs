@@ -137,6 +137,9 @@ impl Classifier {
             let logits = self.run(batch, pixels).map_err(|error| run_error(&self.name, &error))?;
             let logits = logits.chunks_exact(logits.len() / batch).take(images);
             scores.extend(logits.map(|logits| self.calibration.apply(log_odds(logits))));
+            if scores.iter().any(|score| score.is_nan()) {
+                return Err(RuntimeError::Nan { model: self.name.clone() });
+            }
         }
         Ok(scores)
     }

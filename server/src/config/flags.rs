@@ -176,8 +176,9 @@ pub(super) struct Flags {
     #[arg(long, env = "GRASPD_MAX_CONNECTIONS", value_name = "N", default_value = "16384")]
     pub max_connections: NonZeroUsize,
 
-    /// Maximum number of concurrent TrackGrasps streams, each with one volume. Further streams are refused.
-    #[arg(long, env = "GRASPD_MAX_TRACKED", value_name = "N", default_value = "64", value_parser = count())]
+    /// Maximum number of volumes that open TrackGrasps streams keep: each has one, or one for each cube of its workspace.
+    /// Further ones are refused.
+    #[arg(long, env = "GRASPD_MAX_TRACKED", value_name = "N", default_value = "256", value_parser = count())]
     pub max_tracked: u16,
 
     /// Time without a request after which a TrackGrasps stream ends and its volume is dropped, seconds.
@@ -186,7 +187,7 @@ pub(super) struct Flags {
         env = "GRASPD_TRACK_TIMEOUT",
         value_name = "SECONDS",
         default_value = "60",
-        value_parser = seconds,
+        value_parser = positive_seconds,
     )]
     pub track_timeout: Duration,
 

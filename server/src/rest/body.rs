@@ -5,7 +5,7 @@ use std::pin::Pin;
 use std::time::{Duration, Instant};
 
 use axum::body::{Body, Bytes};
-use axum::http::header::{CONTENT_ENCODING, CONTENT_LENGTH};
+use axum::http::header::{CONTENT_ENCODING, CONTENT_LENGTH, EXPECT};
 use axum::http::request::Parts;
 use http_body::{Body as _, Frame};
 use tokio::time::timeout;
@@ -26,14 +26,17 @@ pub(super) struct Message {
 pub(super) async fn read(mut body: Body, parts: &Parts, limits: Limits) -> Result<Message, Status> {
     let message = receive(&mut body, parts, limits).await;
     if message.as_ref().is_err_and(|status| status.code() != Code::DeadlineExceeded) {
-        discard(body, limits).await;
+        discard(body, parts, limits).await;
     }
     message
 }
 
 /// Reads the rest of a body whose request is refused: a client that is still sending would not read the response, and see
-/// only a broken connection.
-pub(super) async fn discard(mut body: Body, limits: Limits) {
+/// only a broken connection. A client that asks first (`Expect: 100-continue`) sends nothing when it is refused.
+pub(super) async fn discard(mut body: Body, parts: &Parts, limits: Limits) {
+    if parts.headers.contains_key(EXPECT) {
+        return;
+    }
     let _ = timeout(limits.stall, async { while let Some(Ok(_)) = next(&mut body).await {} }).await;
 }
 

@@ -210,9 +210,7 @@ impl Call {
     ) -> Result<PendingReply, Refusal> {
         engine.check_cubes(scenes.len())?;
         let ticket = self.ticket(params.priority);
-        self.queue(engine, scenes, params, origin, observed, |scene| {
-            engine.detect(scene, ticket, self.span.clone()).map_err(Refusal::from)
-        })
+        self.queue(engine, scenes, params, origin, observed, |scenes| engine.detect(scenes, ticket, &self.span))
     }
 
     /// Queues a scene whose candidates are to be scored.
@@ -226,8 +224,8 @@ impl Call {
     ) -> Result<PendingReply<Vec<Score>>, Refusal> {
         let params = scene.params.clone();
         let ticket = self.ticket(params.priority);
-        self.queue(engine, vec![scene], params, origin, observed, |scene| {
-            engine.score(scene, candidates.to_vec(), ticket, self.span.clone()).map_err(Refusal::from)
+        self.queue(engine, vec![scene], params, origin, observed, |scenes| {
+            engine.score(scenes, candidates, ticket, &self.span)
         })
     }
 
@@ -239,13 +237,12 @@ impl Call {
         params: DetectParams,
         origin: FrameStamp,
         mut observed: Observed,
-        push: impl Fn(CubeScene) -> Result<Reply<T>, Refusal>,
+        push: impl FnOnce(Vec<CubeScene>) -> Result<Vec<Reply<T>>, EngineError>,
     ) -> Result<PendingReply<T>, Refusal> {
         observed.warnings.extend(params.table.and_then(|expected| table_warning(&scenes, expected)));
         let preprocessing = self.started.elapsed().saturating_sub(observed.fusion.unwrap_or_default());
         let threshold = params.decode_params(engine.source.decode_params()).threshold;
-        let replies = scenes.into_iter().map(push).collect::<Result<_, _>>()?;
-        Ok(PendingReply { replies, params, threshold, preprocessing, observed, origin })
+        Ok(PendingReply { replies: push(scenes)?, params, threshold, preprocessing, observed, origin })
     }
 
     /// Waits for the session's result, and records the outcome in the log and the metrics.
@@ -309,8 +306,8 @@ impl Call {
         refusal
     }
 
-    pub fn span(&self) -> Span {
-        self.span.clone()
+    pub fn span(&self) -> &Span {
+        &self.span
     }
 
     /// Waits for the session's scores, and records the outcome in the log and the metrics.

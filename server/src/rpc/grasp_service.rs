@@ -8,17 +8,16 @@ use grasp_proto::pb::find_table_request::Observation as Seen;
 use grasp_proto::pb::grasp_service_server::GraspService;
 use grasp_proto::pb::recording::{Answer, Request as Recorded};
 use grasp_proto::{
-    Candidate, DetectParams, FieldError, Priority, TABLE_HEIGHT, Workspace, candidates, check_count, cloud_view,
-    depth_view, pb, resolution,
+    Candidate, DetectParams, FieldError, Priority, TABLE_HEIGHT, Workspace, candidates, check_count, check_png,
+    cloud_view, depth_view, pb, resolution,
 };
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::timeout_at;
 use tonic::codegen::BoxStream;
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::rpc::call::{Call, CallContext, Calls, FrameStamp, Observed, PendingReply};
 use crate::rpc::refusal::Refusal;
-use crate::serving::cubes::{CubeScene, Cubes};
+use crate::serving::cubes::{CubeScene, Cubes, edge};
 use crate::serving::detection::Score;
 use crate::serving::engine::Engine;
 use crate::serving::job::EngineError;
@@ -26,6 +25,7 @@ use crate::serving::observation::Observation;
 use crate::serving::queue::Ticket;
 use crate::serving::registry::{ModelRegistry, check_voxel_size};
 use crate::serving::tracking::TrackedVolumes;
+use crate::serving::turns::{NoTurn, Turn, Turns};
 use crate::telemetry::recorder::{Pending, Recorder};
 use crate::transport::deadline::Deadline;
 use grasp_planner::Scene;
@@ -43,11 +43,8 @@ pub(crate) struct GraspRpc {
     pub(super) recorder: Recorder,
     /// Requests of one stream that are queued behind the current one.
     pub(super) read_ahead: usize,
-    /// One permit per CPU. A request holds one while it is converted and fused.
-    fusion_permits: Arc<Semaphore>,
-    /// One permit per CPU and per place in a model's queue. A request holds one while it waits for a fusion permit and
-    /// is fused, which bounds the memory of waiting requests.
-    conversion_permits: Arc<Semaphore>,
+    /// The requests that are converted and fused, one for each CPU.
+    conversions: Arc<Turns>,
 }
 
 /// What the cameras saw, and the table that determined the workspace.
@@ -89,10 +86,8 @@ impl GraspRpc {
     ) -> Self {
         let read_ahead = at_once.min(queue / 2).max(1);
         let processors = thread::available_parallelism().map_or(1, NonZero::get);
-        let semaphore = |permits: usize| Arc::new(Semaphore::new(permits.min(Semaphore::MAX_PERMITS)));
-        let (fusion_permits, conversion_permits) = (semaphore(processors), semaphore(processors.saturating_add(queue)));
-        let tracked_volumes = Arc::new(tracked_volumes);
-        Self { models, calls, tracked_volumes, recorder, read_ahead, fusion_permits, conversion_permits }
+        let (tracked_volumes, conversions) = (Arc::new(tracked_volumes), Turns::new(processors, queue));
+        Self { models, calls, tracked_volumes, recorder, read_ahead, conversions }
     }
 
     /// Opens a call and submits its request. [`PendingCall::finish`] returns both results and refusals.
@@ -140,9 +135,10 @@ impl GraspRpc {
             engine.check_capacity(ticket)?;
             Volume::try_from(&volume)?
         } else {
-            let permits = (self.conversion_permit(&engine, ticket)?, self.fusion_permit(call).await?);
             engine.check_capacity(ticket)?;
-            blocking(permits, move || Ok(Volume::try_from(&volume)?)).await?
+            let turn = self.conversion(&engine, ticket).await?;
+            engine.check_capacity(ticket)?;
+            blocking(turn, call.deadline, move |_| Ok(Volume::try_from(&volume)?)).await?
         };
         check_voxel_size(&checked, &engine)?;
         let mut params = params.clone();
@@ -177,7 +173,7 @@ impl GraspRpc {
         workspace: Option<pb::Workspace>,
         options: Option<pb::Options>,
         call: &mut Call,
-        place: impl FnOnce(&mut Workspace, f64) -> Result<Placed, FieldError> + Send + 'static,
+        place: impl FnOnce(&mut Workspace, f64, f64) -> Result<Placed, FieldError> + Send + 'static,
     ) -> Result<PendingReply, Refusal> {
         let params = DetectParams::try_from(&options.unwrap_or_default())?;
         let (engine, (scenes, observed), origin) = self.of_views(count, workspace, &params, call, place).await?;
@@ -185,14 +181,14 @@ impl GraspRpc {
     }
 
     /// Selects the model for `count` views and fuses them. `place` converts the views and sets the pose of the
-    /// workspace, in which the table is at the given height, metres.
+    /// workspace, in which the table is at the given height and the cubes have the given edge, metres.
     async fn of_views(
         &self,
         count: usize,
         workspace: Option<pb::Workspace>,
         params: &DetectParams,
         call: &mut Call,
-        place: impl FnOnce(&mut Workspace, f64) -> Result<Placed, FieldError> + Send + 'static,
+        place: impl FnOnce(&mut Workspace, f64, f64) -> Result<Placed, FieldError> + Send + 'static,
     ) -> Result<(Arc<Engine>, Fused, FrameStamp), Refusal> {
         check_count(count)?;
         let mut workspace = Workspace::try_from(workspace.unwrap_or_default())?;
@@ -201,12 +197,14 @@ impl GraspRpc {
         let engine = self.models.select(&params.model, &params.version, None)?;
         call.set_model(&engine);
         let ticket = call.ticket(params.priority);
-        let permits = (self.conversion_permit(&engine, ticket)?, self.fusion_permit(call).await?);
+        engine.check_capacity(ticket)?;
+        let turn = self.conversion(&engine, ticket).await?;
         engine.check_capacity(ticket)?;
         let (selected, params) = (Arc::clone(&engine), params.clone());
-        let fused = blocking(permits, move || {
-            let (observation, table) = place(&mut workspace, params.table.unwrap_or(TABLE_HEIGHT))?;
-            fuse(&selected, &params, &workspace, observation, table)
+        let fused = blocking(turn, call.deadline, move |is_wanted| {
+            let edge = edge(&selected.source, workspace.size);
+            let (observation, table) = place(&mut workspace, params.table.unwrap_or(TABLE_HEIGHT), edge)?;
+            fuse(&selected, &params, &workspace, observation, table, is_wanted)
         });
         Ok((engine, fused.await?, origin))
     }
@@ -271,20 +269,20 @@ impl GraspRpc {
         let origin = FrameStamp::checked("workspace.frame_id", frame_id, workspace.stamp)?;
         // The retry hint of a refusal is that of the default model.
         let engine = self.models.select("", "", None)?;
-        let ticket = call.ticket(Priority::Normal);
-        let permits = (self.conversion_permit(&engine, ticket)?, self.fusion_permit(call).await?);
-        let find = move || {
+        let turn = self.conversion(&engine, call.ticket(Priority::Normal)).await?;
+        let edge = workspace.size.unwrap_or(WORKSPACE_SIZE);
+        let find = move |_: &dyn Fn() -> bool| {
             let found = match observation {
                 Seen::View(mut view) => {
-                    workspace.find_table_in(&mut view, true, height).map_err(|error| error.inside("view"))
+                    workspace.find_table_in(&mut view, true, height, edge).map_err(|error| error.inside("view"))
                 }
                 Seen::Cloud(cloud) => {
-                    workspace.find_table_in_cloud(&cloud, height).map_err(|error| error.inside("cloud"))
+                    workspace.find_table_in_cloud(&cloud, height, edge).map_err(|error| error.inside("cloud"))
                 }
             };
             Ok(Some(found?))
         };
-        let table = blocking(permits, find).await?;
+        let table = blocking(turn, call.deadline, find).await?;
         let FrameStamp { frame_id, stamp } = origin;
         Ok(pb::FindTableResponse { request_id: call.id.clone(), frame_id, stamp, table })
     }
@@ -296,29 +294,26 @@ impl GraspRpc {
         call.end(refusal).status(&id)
     }
 
-    /// Takes a conversion permit. Refuses immediately if none is left or the model's queue is full.
-    fn conversion_permit(&self, engine: &Engine, ticket: Ticket) -> Result<OwnedSemaphorePermit, Refusal> {
-        engine.check_capacity(ticket)?;
-        let permit = Arc::clone(&self.conversion_permits).try_acquire_owned();
-        Ok(permit.map_err(|_| engine.overloaded("too many requests are waiting for fusion".to_owned()))?)
-    }
-
-    /// Waits for a fusion permit until the call's deadline.
-    pub(super) async fn fusion_permit(&self, call: &Call) -> Result<OwnedSemaphorePermit, Refusal> {
-        let permit = Arc::clone(&self.fusion_permits).acquire_owned();
-        let permit = match call.deadline {
-            None => permit.await,
-            Some(Deadline(deadline)) => timeout_at(deadline.into(), permit).await.map_err(|_| EngineError::Expired)?,
+    /// Waits for a turn to convert and fuse, at most until the deadline. Refuses immediately if too many requests wait,
+    /// with the retry hint of a model.
+    pub(super) async fn conversion(&self, engine: &Engine, ticket: Ticket) -> Result<Turn, Refusal> {
+        let turn = self.conversions.take(ticket);
+        let turn = match ticket.deadline {
+            None => turn.await,
+            Some(deadline) => timeout_at(deadline.into(), turn).await.map_err(|_| EngineError::Expired)?,
         };
-        // Cannot fail: the semaphore is never closed.
-        permit.map_err(|_| EngineError::SessionEnded.into())
+        turn.map_err(|reason| match reason {
+            NoTurn::Full => engine.full("too many requests wait for fusion".to_owned()).into(),
+            NoTurn::Displaced => engine.displaced("too many requests wait for fusion".to_owned()).into(),
+        })
     }
 }
 
 /// Converts depth images, and finds the table if the workspace asks for it.
-fn depth(mut views: Vec<pb::DepthView>) -> impl FnOnce(&mut Workspace, f64) -> Result<Placed, FieldError> {
-    move |workspace, table| {
-        let table = workspace.find_table(&mut views, table)?;
+fn depth(mut views: Vec<pb::DepthView>) -> impl FnOnce(&mut Workspace, f64, f64) -> Result<Placed, FieldError> {
+    move |workspace, table, edge| {
+        check_png(&views)?;
+        let table = workspace.find_table(&mut views, table, edge)?;
         let views = views.iter().enumerate();
         let views = views.map(|(index, view)| depth_view(view, index, &workspace.frame_from_task));
         Ok((Observation::Depth(views.collect::<Result<_, _>>()?), table))
@@ -326,9 +321,9 @@ fn depth(mut views: Vec<pb::DepthView>) -> impl FnOnce(&mut Workspace, f64) -> R
 }
 
 /// Converts point clouds, and finds the table if the workspace asks for it.
-fn clouds(views: Vec<pb::CloudView>) -> impl FnOnce(&mut Workspace, f64) -> Result<Placed, FieldError> {
-    move |workspace, table| {
-        let table = workspace.find_table_in_clouds(&views, table)?;
+fn clouds(views: Vec<pb::CloudView>) -> impl FnOnce(&mut Workspace, f64, f64) -> Result<Placed, FieldError> {
+    move |workspace, table, edge| {
+        let table = workspace.find_table_in_clouds(&views, table, edge)?;
         let views = views.iter().enumerate();
         let views = views.map(|(index, view)| cloud_view(view, index, &workspace.frame_from_task));
         Ok((Observation::Clouds(views.collect::<Result<_, _>>()?), table))
@@ -343,35 +338,42 @@ fn inside(message: &str, refusal: Refusal) -> Refusal {
     }
 }
 
-/// Fuses views into the scenes of a workspace.
+/// Fuses views into the scenes of a workspace. Stops when `is_wanted` returns false.
 fn fuse(
     engine: &Engine,
     params: &DetectParams,
     workspace: &Workspace,
     mut observation: Observation,
     table: Option<pb::FoundTable>,
+    is_wanted: &dyn Fn() -> bool,
 ) -> Result<Fused, Refusal> {
     let started = Instant::now();
     params.check_objects(observation.is_labelled())?;
     let mut cubes = Cubes::of(&engine.source, workspace, &observation.cameras(), params.margin)?;
-    let integrated = cubes.integrate(&mut observation, params.table)?;
+    let integrated = cubes.integrate(&mut observation, params.table, is_wanted)?;
     let (warnings, depth_factors) = (integrated.warnings.clone(), integrated.depth_factors.clone());
     let objects = observation.objects(cubes.frame_from_task(), &params.objects)?;
     let scenes = cubes.scenes(integrated, objects.as_ref(), params)?;
     Ok((scenes, Observed { fusion: Some(started.elapsed()), warnings, table, depth_factors }))
 }
 
-/// Runs `work` on a thread for blocking tasks, to keep the async runtime's threads free.
+/// Runs `work` on a thread for blocking tasks, to keep the async runtime's threads free. It is passed a function that
+/// returns whether its result is still wanted: the call was not cancelled, and the deadline has not passed.
 pub(super) async fn blocking<T: Send + 'static>(
     permits: impl Send + 'static,
-    work: impl FnOnce() -> Result<T, Refusal> + Send + 'static,
+    deadline: Option<Deadline>,
+    work: impl FnOnce(&dyn Fn() -> bool) -> Result<T, Refusal> + Send + 'static,
 ) -> Result<T, Refusal> {
+    // Dropped with this future, if the call is cancelled.
+    let call = Arc::new(());
+    let weak = Arc::downgrade(&call);
     // Holds the permits until the work is done, even if the call is cancelled before.
     let work = move || {
         let _permits = permits;
-        work()
+        work(&|| weak.strong_count() > 0 && !deadline.is_some_and(Deadline::has_passed))
     };
     let done = tokio::task::spawn_blocking(work).await;
+    drop(call);
     done.unwrap_or_else(|panic| Err(EngineError::Panic(panic.to_string()).into()))
 }
 

@@ -127,6 +127,7 @@ impl InferenceRpc {
         check_parameters(request)?;
         let engine = self.network(&request.model_name, &request.model_version)?;
         call.set_model(&engine);
+        engine.check_capacity(call.ticket(Priority::Normal))?;
         let network = engine.source.network().map(|entry| &entry.metadata);
         let (n, voxel_size) = network.map_or((0, 0.0), |metadata| (metadata.resolution, metadata.voxel_size));
         for output in &request.outputs {
@@ -147,10 +148,7 @@ impl InferenceRpc {
             })
         };
         let volumes = batch.chunks_exact(n.pow(3)).map(volume).collect::<Result<Vec<_>, _>>()?;
-        // If the queue is full for one volume, the volumes before it leave the queue when their replies are dropped.
-        let ticket = call.ticket(Priority::Normal);
-        let replies = volumes.into_iter().map(|volume| engine.maps(volume, ticket, call.span()));
-        let replies = replies.collect::<Result<Vec<_>, _>>()?;
+        let replies = engine.maps(volumes, call.ticket(Priority::Normal), call.span())?;
         Ok(Queued { engine, replies, permit })
     }
 }
@@ -170,9 +168,9 @@ fn one_repository(name: &str) -> Result<(), FieldError> {
 }
 
 /// Runs `work` on a thread for blocking tasks, because it copies megabytes.
-async fn copying<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, Status> {
+async fn copying<T: Send + 'static>(id: &str, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Status> {
     let copied = spawn_blocking(work).await;
-    copied.map_err(|panic| Status::internal(EngineError::Panic(panic.to_string()).to_string()))
+    copied.map_err(|panic| Refusal::from(EngineError::Panic(panic.to_string())).status(id))
 }
 
 /// The response: the maps of all volumes, concatenated to one tensor per requested output.
@@ -281,7 +279,7 @@ impl GrpcInferenceService for InferenceRpc {
         let (mut call, checked) = self.calls.open(request.id.clone(), context);
         let id = call.id.clone();
         let inference = self.clone();
-        let (call, request, queued) = copying(move || {
+        let (call, request, queued) = copying(&id, move || {
             let queued = checked.and_then(|()| inference.submit(&request, &mut call));
             (call, request, queued)
         })
@@ -291,7 +289,7 @@ impl GrpcInferenceService for InferenceRpc {
             Err(refusal) => Err(call.end(refusal)),
         };
         let (engine, permit, (maps, timings)) = outcome.map_err(|refusal| refusal.status(&id))?;
-        let mut response = Response::new(copying(move || response(request, &engine, &maps, &timings)).await?);
+        let mut response = Response::new(copying(&id, move || response(request, &engine, &maps, &timings)).await?);
         response.extensions_mut().insert(permit);
         Ok(response)
     }

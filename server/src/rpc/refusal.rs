@@ -22,8 +22,10 @@ pub(crate) enum Refusal {
     Starting(Duration),
     #[error("the server is shutting down; retry on another replica")]
     Draining,
-    #[error("all {0} TrackGrasps streams are in use; close a stream, or raise --max-tracked")]
-    TooManyTracked(usize),
+    #[error(
+        "not enough of the {limit} tracked volumes are free for {needed} more; close a stream, or raise --max-tracked"
+    )]
+    TooManyTracked { needed: usize, limit: usize },
     #[error("no request for {0:?} (--track-timeout), the volume was dropped; open a new stream")]
     TrackExpired(Duration),
     #[error("loading and unloading of models is not allowed; start the server with --allow-model-control")]
@@ -54,7 +56,7 @@ impl Refusal {
         match self {
             Self::Field(_) => Code::InvalidArgument,
             Self::UnknownModel { .. } => Code::NotFound,
-            Self::Overloaded(_) | Self::TooManyTracked(_) => Code::ResourceExhausted,
+            Self::Overloaded(_) | Self::TooManyTracked { .. } => Code::ResourceExhausted,
             Self::Starting(_) | Self::Draining => Code::Unavailable,
             Self::TrackExpired(_) => Code::Aborted,
             Self::NoModelControl => Code::PermissionDenied,
@@ -79,7 +81,7 @@ impl Refusal {
         match self {
             Self::Overloaded(overloaded) => Some(overloaded.retry_after),
             Self::Starting(retry_after) => Some(*retry_after),
-            Self::TooManyTracked(_) => Some(STREAMS_IN_USE),
+            Self::TooManyTracked { .. } => Some(STREAMS_IN_USE),
             Self::Field(_)
             | Self::UnknownModel { .. }
             | Self::Draining

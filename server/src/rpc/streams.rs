@@ -16,7 +16,7 @@ use crate::readiness::draining;
 use crate::rpc::call::{Call, CallContext, PendingReply};
 use crate::rpc::grasp_service::{GraspRpc, PendingCall, blocking};
 use crate::rpc::refusal::Refusal;
-use crate::serving::tracking::{Start, Track};
+use crate::serving::tracking::{Start, Track, TrackPermit};
 use crate::telemetry::recorder::Pending;
 
 /// The responses of a stream.
@@ -70,8 +70,8 @@ impl GraspRpc {
             return Err(Status::internal("cannot reserve a slot in a new channel"));
         };
         tokio::spawn(async move {
-            // Released when the stream ends, with the volume.
-            let _permit = permit;
+            // Released when the stream ends, with the volumes.
+            let mut permit = permit;
             let mut track = None;
             let ended = loop {
                 let next = async {
@@ -94,7 +94,8 @@ impl GraspRpc {
                 };
                 let id = std::mem::take(&mut request.request_id);
                 let result = async {
-                    let submit = async |call: &mut Call| service.submit_track(request, &mut track, call).await;
+                    let submit =
+                        async |call: &mut Call| service.submit_track(request, &mut track, &mut permit, call).await;
                     // A request cannot be repeated without those before it.
                     let pending = service.begin(id, context.clone(), Pending::none(), submit).await;
                     let id = pending.call.id.clone();
@@ -118,6 +119,7 @@ impl GraspRpc {
         &self,
         request: pb::TrackGraspsRequest,
         track: &mut Option<Track>,
+        volumes: &mut TrackPermit,
         call: &mut Call,
     ) -> Result<PendingReply, Refusal> {
         let pb::TrackGraspsRequest { mut views, workspace, options, half_life, .. } = request;
@@ -128,14 +130,21 @@ impl GraspRpc {
         };
         let engine = self.models.select(&params.model, &params.version, None)?;
         call.set_model(&engine);
-        // No conversion permit is needed: --max-tracked already limits the streams.
-        let permit = self.fusion_permit(call).await?;
+        let start = workspace.map(|workspace| Start::checked(workspace, half_life)).transpose()?;
+        let turn = self.conversion(&engine, call.ticket(params.priority)).await?;
+        if let Some(start) = &start {
+            // Not fewer: if the request fails, the stream keeps its volumes.
+            let needed = start.volumes(&engine, &params)?.max(volumes.count());
+            self.tracked_volumes.resize(volumes, needed)?;
+        }
         let (selected, old, of_request) = (Arc::clone(&engine), track.take(), params.clone());
-        let start = workspace.map(|workspace| Start { workspace, half_life });
         // The volume is returned in any case, so an invalid view does not lose it.
-        let (new, fused) =
-            blocking(permit, move || Ok(Track::integrate(old, &selected, of_request, start, &mut views))).await?;
+        let (new, fused) = blocking(turn, call.deadline, move |is_wanted| {
+            Ok(Track::integrate(old, &selected, of_request, start, &mut views, is_wanted))
+        })
+        .await?;
         *track = new;
+        self.tracked_volumes.resize(volumes, track.as_ref().map_or(1, Track::volumes))?;
         let (scenes, origin, observed) = fused?;
         call.submit(&engine, scenes, params, origin, observed)
     }

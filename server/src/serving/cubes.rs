@@ -5,8 +5,10 @@ use grasp_planner::{Scene, Source};
 use grasp_proto::{DetectParams, FieldError, Workspace};
 use nalgebra::{Isometry3, Point3};
 
+use super::job::EngineError;
 use super::observation::{Observation, at};
 use super::scene::{FusionGrid, PointSampler, empty, sees_nothing};
+use crate::rpc::refusal::Refusal;
 
 /// The cubes that cover a workspace: one, or several overlapping ones for a workspace with an extent.
 pub(crate) struct Cubes {
@@ -66,6 +68,7 @@ impl Cubes {
     ) -> Result<Self, FieldError> {
         let Workspace { frame_from_task, size, extent, correct_depth_scale, .. } = *workspace;
         let edge = edge(source, size);
+        Self::count(source, workspace, margin)?;
         let cube = |[x, y]: [f64; 2], inner| {
             let task_from_cube = Isometry3::translation(x, y, 0.0);
             let cameras: Vec<_> = cameras.iter().map(|camera| task_from_cube.inverse() * camera).collect();
@@ -76,11 +79,6 @@ impl Cubes {
             None => vec![cube([0.0; 2], None)?],
             Some(extent) => {
                 let tiles = Tile::cover(extent, edge, margin.max(Tile::MARGIN));
-                if tiles.len() > MAX_CUBES {
-                    let value = format_args!("{} × {} m, which needs {} cubes", extent[0], extent[1], tiles.len());
-                    let needed = format_args!("must need at most {MAX_CUBES}; reduce it or options.margin");
-                    return Err(FieldError::new("workspace.extent", value, needed));
-                }
                 tiles.iter().map(|tile| cube(tile.corner, Some(tile.inner))).collect::<Result<_, _>>()?
             }
         };
@@ -92,6 +90,33 @@ impl Cubes {
             extent: extent.unwrap_or([edge; 2]),
             corrects_depth_scale: correct_depth_scale,
         })
+    }
+
+    /// The number of cubes that a planner requires for a workspace.
+    pub fn count(source: &Source, workspace: &Workspace, margin: f64) -> Result<usize, FieldError> {
+        let Workspace { frame_from_task, size, extent, .. } = *workspace;
+        // Checks the size of the request.
+        FusionGrid::of(source, &frame_from_task, size, &[])?;
+        let Some(extent) = extent else { return Ok(1) };
+        let (edge, margin) = (edge(source, size), margin.max(Tile::MARGIN));
+        if edge <= 2.0 * margin {
+            let value = format_args!("given, for cubes with an edge of {edge} m");
+            let needed =
+                format_args!("needs an edge above {} m, twice options.margin or the smallest one", 2.0 * margin);
+            return Err(FieldError::new("workspace.extent", value, needed));
+        }
+        let count = Tile::count(extent, edge, margin);
+        if count > MAX_CUBES as f64 {
+            let value = format_args!("{} × {} m, which needs {count} cubes", extent[0], extent[1]);
+            let needed = format_args!("must need at most {MAX_CUBES}; reduce it or options.margin");
+            return Err(FieldError::new("workspace.extent", value, needed));
+        }
+        Ok(count as usize)
+    }
+
+    /// Number of cubes.
+    pub fn len(&self) -> usize {
+        self.cubes.len()
     }
 
     /// The cubes, whose fields forget with this half-life, views.
@@ -113,14 +138,20 @@ impl Cubes {
     }
 
     /// Integrates views, each of which must see a part of the workspace. `table` is the height of the table in it,
-    /// metres, to which the scale of the depths is corrected, if the workspace asks for it.
-    pub fn integrate(&mut self, observation: &mut Observation, table: Option<f64>) -> Result<Integrated, FieldError> {
+    /// metres, to which the scale of the depths is corrected, if the workspace asks for it. Stops when `is_wanted` returns
+    /// false.
+    pub fn integrate(
+        &mut self,
+        observation: &mut Observation,
+        table: Option<f64>,
+        is_wanted: &dyn Fn() -> bool,
+    ) -> Result<Integrated, Refusal> {
         let (depth_factors, mut warnings) = match (self.corrects_depth_scale, table) {
             (false, _) => Default::default(),
             (true, Some(table)) => observation.correct_depth_scale(table, self.extent),
             (true, None) => {
                 let needed = "must be false without a table, which a negative collision.table_height means";
-                return Err(FieldError::new("workspace.correct_depth_scale", true, needed));
+                return Err(FieldError::new("workspace.correct_depth_scale", true, needed).into());
             }
         };
         let mut samplers: Vec<_> =
@@ -131,13 +162,16 @@ impl Cubes {
             }
             let (mut is_seen, mut refusal, mut disagreement) = (false, None, None);
             for (cube, sampler) in self.cubes.iter_mut().zip(&mut samplers) {
+                if !is_wanted() {
+                    return Err(EngineError::Expired.into());
+                }
                 match cube.integrate(observation, index, sampler.as_mut(), &mut disagreement) {
                     Ok(()) => is_seen = true,
                     Err(error) => refusal = refusal.or(Some(error)),
                 }
             }
             if let Some(refusal) = refusal.filter(|_| !is_seen) {
-                return Err(refusal);
+                return Err(refusal.into());
             }
             warnings.extend(disagreement);
         }

@@ -1,8 +1,10 @@
 //! The results of a session for a scene, in the terms of the reply.
 
+use std::collections::HashMap;
+
 use grasp::{Constraints, Decoded, Dropped, Grasp, Obstacles, Volume};
 use grasp_proto::{Candidate, Collision, DetectParams, pb};
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector3};
 use pb::score::Violation as Reason;
 
 /// The grasps in a scene.
@@ -40,6 +42,32 @@ pub(crate) struct Score {
 /// Distance within which a better grasp of another cube suppresses a grasp, metres: half of the window of VGN's
 /// non-maximum suppression.
 const SUPPRESSION: f64 = 0.015;
+
+/// The positions of the grasps of a merged detection and their cubes, by cells with an edge of [`SUPPRESSION`].
+#[derive(Default)]
+struct Kept(HashMap<[i64; 3], Vec<(Vector3<f64>, usize)>>);
+
+impl Kept {
+    fn cell(at: &Vector3<f64>) -> [i64; 3] {
+        // Saturates far outside of every workspace.
+        at.map(|c| (c / SUPPRESSION).floor() as i64).into()
+    }
+
+    fn add(&mut self, at: Vector3<f64>, cube: usize) {
+        self.0.entry(Self::cell(&at)).or_default().push((at, cube));
+    }
+
+    /// Whether a grasp of another cube is near a position.
+    fn is_near(&self, at: &Vector3<f64>, cube: usize) -> bool {
+        let [x, y, z] = Self::cell(at);
+        let around = |c: i64| c.saturating_sub(1)..=c.saturating_add(1);
+        let mut cells = around(x).flat_map(|x| around(y).flat_map(move |y| around(z).map(move |z| [x, y, z])));
+        cells.any(|cell| {
+            let grasps = self.0.get(&cell);
+            grasps.into_iter().flatten().any(|(other, of)| *of != cube && (other - at).norm() < SUPPRESSION)
+        })
+    }
+}
 
 impl Detection {
     /// The requested number of grasps, with what was requested about each.
@@ -85,24 +113,21 @@ impl Detection {
         let forced = all.iter().position(is_forced).map_or(0, |first| all.len() - first.max(1));
         all.truncate(all.len() - forced);
         merged.dropped.suppressed += forced;
-        let mut kept: Vec<(usize, Detected)> = Vec::new();
+        let mut kept = Kept::default();
+        let mut of_objects = HashMap::<_, usize>::new();
         for (cube, detected) in all {
             let at = detected.grasp.pose.translation.vector;
-            let is_near = |(other, better): &(usize, Detected)| {
-                *other != cube && (better.grasp.pose.translation.vector - at).norm() < SUPPRESSION
-            };
-            let of_object = |(_, other): &&(usize, Detected)| other.object == detected.object;
-            if kept.iter().any(is_near) {
+            let of_object = of_objects.entry(detected.object).or_default();
+            if kept.is_near(&at, cube) {
                 merged.dropped.suppressed += 1;
-            } else if kept.len() == params.max_grasps
-                || kept.iter().filter(of_object).count() >= params.max_grasps_per_object
-            {
+            } else if merged.grasps.len() == params.max_grasps || *of_object >= params.max_grasps_per_object {
                 merged.over_limit += 1;
             } else {
-                kept.push((cube, detected));
+                *of_object += 1;
+                kept.add(at, cube);
+                merged.grasps.push(detected);
             }
         }
-        merged.grasps = kept.into_iter().map(|(_, detected)| detected).collect();
         merged
     }
 

@@ -13,7 +13,7 @@ use tracing::{Span, info};
 use super::cubes::CubeScene;
 use super::detection::{Detection, Score};
 use super::job::{EngineError, Job, Reply, Sender, Task, Tensors};
-use super::queue::{Batching, Queue, QueueSlot, Refused, Ticket};
+use super::queue::{Batching, Queue, Refused, Ticket};
 use super::retries::Retries;
 use super::session::{ServiceTime, Session, warm_up};
 use super::session_threads::{Running, SessionThreads};
@@ -108,36 +108,34 @@ impl Engine {
         Ok(engine)
     }
 
-    /// Queues a scene for grasp detection. Refuses immediately if the queue is full.
+    /// Queues the scenes of a request for grasp detection. Refuses all of them immediately if the queue is full.
     pub fn detect(
         &self,
-        CubeScene { scene, params }: CubeScene,
+        scenes: Vec<CubeScene>,
         ticket: Ticket,
-        span: Span,
-    ) -> Result<Reply<Detection>, EngineError> {
-        let (sender, receiver) = Sender::new();
-        let slot = self.push(scene, Task::Grasps(Box::new(params), sender), ticket, span)?;
-        Ok(Reply::new(receiver, slot))
+        span: &Span,
+    ) -> Result<Vec<Reply<Detection>>, EngineError> {
+        let scenes = scenes.into_iter().map(|CubeScene { scene, params }| (scene, Box::new(params)));
+        self.push(scenes, Task::Grasps, ticket, span)
     }
 
-    /// Queues a scene whose candidates are to be scored. Refuses immediately if the queue is full.
+    /// Queues the scenes of a request, whose candidates are to be scored. Refuses all of them immediately if the queue is
+    /// full.
     pub fn score(
         &self,
-        CubeScene { scene, params }: CubeScene,
-        candidates: Vec<Candidate>,
+        scenes: Vec<CubeScene>,
+        candidates: &[Candidate],
         ticket: Ticket,
-        span: Span,
-    ) -> Result<Reply<Vec<Score>>, EngineError> {
-        let (sender, receiver) = Sender::new();
-        let slot = self.push(scene, Task::Scores(Box::new(params), candidates, sender), ticket, span)?;
-        Ok(Reply::new(receiver, slot))
+        span: &Span,
+    ) -> Result<Vec<Reply<Vec<Score>>>, EngineError> {
+        let scenes = scenes.into_iter().map(|CubeScene { scene, params }| (scene, Box::new(params)));
+        self.push(scenes, |params, sender| Task::Scores(params, candidates.to_vec(), sender), ticket, span)
     }
 
-    /// Queues a volume for the network's raw output. Refuses immediately if the queue is full.
-    pub fn maps(&self, volume: Volume, ticket: Ticket, span: Span) -> Result<Reply<Tensors>, EngineError> {
-        let (sender, receiver) = Sender::new();
-        let slot = self.push(Scene { volume, points: None }, Task::Maps(sender), ticket, span)?;
-        Ok(Reply::new(receiver, slot))
+    /// Queues the volumes of a request for the network's raw output. Refuses all of them immediately if the queue is full.
+    pub fn maps(&self, volumes: Vec<Volume>, ticket: Ticket, span: &Span) -> Result<Vec<Reply<Tensors>>, EngineError> {
+        let scenes = volumes.into_iter().map(|volume| (Scene { volume, points: None }, ()));
+        self.push(scenes, |(), sender| Task::Maps(sender), ticket, span)
     }
 
     /// The labels of the served model in the metrics.
@@ -180,38 +178,47 @@ impl Engine {
         self.queue.check(ticket, self.service_time.get()).map_err(|refused| self.refused(&refused).into())
     }
 
-    fn push(&self, scene: Scene, task: Task, ticket: Ticket, span: Span) -> Result<QueueSlot<Job>, EngineError> {
+    /// Queues the scenes of a request. `task` says what to compute from one of them, for the receiver of its result.
+    fn push<P, T: Send + 'static>(
+        &self,
+        scenes: impl Iterator<Item = (Scene, P)>,
+        task: impl Fn(P, Sender<T>) -> Task,
+        ticket: Ticket,
+        span: &Span,
+    ) -> Result<Vec<Reply<T>>, EngineError> {
         if self.is_hanging() {
             return Err(EngineError::NoSession);
         }
-        let job = Job { scene, task, deadline: ticket.deadline.map(Deadline), span, submitted: Instant::now() };
+        let deadline = ticket.deadline.map(Deadline);
+        let job = |(scene, params)| {
+            let (sender, receiver) = Sender::new();
+            let task = task(params, sender);
+            (Job { scene, task, deadline, span: span.clone(), submitted: Instant::now() }, receiver)
+        };
+        let (jobs, receivers): (Vec<_>, Vec<_>) = scenes.map(job).unzip();
         // The queue is open: only dropping the engine closes it.
-        match self.queue.push(job, ticket, self.service_time.get()) {
-            Ok((slot, displaced)) => {
-                self.queued[ticket.priority as usize].inc();
-                if let Some(job) = displaced {
-                    job.task.fail(self.displaced().into());
-                }
-                Ok(slot)
-            }
-            Err(refused) => Err(self.refused(&refused).into()),
-        }
+        let pushed = self.queue.push(jobs, ticket, self.service_time.get());
+        let (slots, displaced) = pushed.map_err(|refused| self.refused(&refused))?;
+        self.queued[ticket.priority as usize].inc_by(slots.len() as u64);
+        displaced.into_iter().for_each(|job| job.task.fail(self.displaced(self.queue_is_full()).into()));
+        Ok(receivers.into_iter().zip(slots).map(|(receiver, slot)| Reply::new(receiver, slot)).collect())
     }
 
     fn refused(&self, refused: &Refused) -> Overloaded {
         match refused {
-            Refused::Full => self.full(),
+            Refused::Full => self.full(self.queue_is_full()),
             Refused::TooLate(estimate) => self.too_late(*estimate),
         }
     }
 
-    fn full(&self) -> Overloaded {
+    fn queue_is_full(&self) -> String {
+        format!("the queue of the model `{}` is full ({} requests)", self.source.name(), self.capacity())
+    }
+
+    /// The refusal of a request for which there is no place, for this reason.
+    pub fn full(&self, reason: String) -> Overloaded {
         self.refused.full.inc();
-        self.overloaded(format!(
-            "the queue of the model `{}` is full ({} requests)",
-            self.source.name(),
-            self.capacity()
-        ))
+        self.overloaded(reason)
     }
 
     fn too_late(&self, estimate: Duration) -> Overloaded {
@@ -223,12 +230,11 @@ impl Engine {
         ))
     }
 
-    fn displaced(&self) -> Overloaded {
+    /// The refusal of a request whose place another one has taken, because there are no others for this reason.
+    pub fn displaced(&self, reason: String) -> Overloaded {
         self.refused.displaced.inc();
         self.overloaded(format!(
-            "the queue of the model `{}` is full, and a request of a caller with fewer requests in it, or with a higher \
-             priority, has taken this one's place",
-            self.source.name()
+            "{reason}, and a request of a caller with fewer of them, or with a higher priority, has taken this one's place"
         ))
     }
 

@@ -97,6 +97,26 @@ impl<T> Lines<T> {
         longest(class).filter(|(length, _)| *length >= own + 2).and_then(|(_, index)| self.newest(class, index))
     }
 
+    /// Whether `count` new jobs of a caller, after `before` that need no place of another, can all [displace
+    /// one](Self::displaced_by).
+    pub fn can_displace(&self, ticket: Ticket, before: usize, count: usize) -> bool {
+        let class = ticket.priority as usize;
+        let lengths = |class: usize| self.of_class[class].iter().map(|line| (line.caller, line.jobs.len()));
+        let is_own = |&(caller, _): &(Caller, usize)| caller == ticket.caller;
+        let own = before + lengths(class).find(is_own).map_or(0, |(_, length)| length);
+        let mut others: Vec<usize> = lengths(class).filter(|line| !is_own(line)).map(|(_, length)| length).collect();
+        let mut of_batch: usize = match ticket.priority {
+            Priority::Normal => lengths(Priority::Batch as usize).map(|(_, length)| length).sum(),
+            Priority::Batch => 0,
+        };
+        (own..own + count).all(|own| {
+            let longest = others.iter_mut().max();
+            let displaced =
+                if of_batch > 0 { Some(&mut of_batch) } else { longest.filter(|length| **length >= own + 2) };
+            displaced.map(|length| *length -= 1).is_some()
+        })
+    }
+
     /// The newest job of a line.
     fn newest(&self, class: usize, line: usize) -> Option<Place> {
         let job = self.of_class[class][line].jobs.len().checked_sub(1)?;

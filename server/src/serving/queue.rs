@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 use grasp_models::batch_sizes;
 use prometheus::IntGauge;
 
+use super::lines::Lines;
 pub(crate) use super::lines::Ticket;
-use super::lines::{Lines, Place};
 
 /// A bounded queue of jobs for a model's sessions. Callers are served in turn, and the jobs of a caller in their order.
 /// If the queue is full, a job of a caller with few jobs displaces the newest job of the caller with the most.
@@ -75,50 +75,61 @@ impl<T> Queue<T> {
         Self { state: Mutex::new(state), changed: Condvar::new(), sessions, capacity, gauge }
     }
 
-    /// Appends a job, or refuses it immediately. `service` is the expected time of one job. The second value is a job
-    /// that the new one displaces. Must not be called after [`close`](Self::close).
+    /// Appends the jobs of a request, or refuses all of them immediately. `service` is the expected time of one job. The
+    /// second value are the jobs that the new ones displace. Must not be called after [`close`](Self::close).
     pub fn push(
         self: &Arc<Self>,
-        job: T,
+        jobs: Vec<T>,
         ticket: Ticket,
         service: Service,
-    ) -> Result<(QueueSlot<T>, Option<T>), Refused> {
+    ) -> Result<(Vec<QueueSlot<T>>, Vec<T>), Refused> {
         let mut state = self.lock();
-        let displaced = self.place(&state, ticket, service)?;
-        let displaced = displaced.and_then(|place| {
-            self.gauge.dec();
-            state.lines.remove(place)
-        });
-        let number = state.next;
-        state.next += 1;
-        state.lines.append(ticket, number, job);
-        self.gauge.inc();
+        self.admit(&state, jobs.len(), ticket, service)?;
+        let (mut slots, mut displaced) = (Vec::with_capacity(jobs.len()), Vec::new());
+        for job in jobs {
+            if self.places(&state) == 0
+                && let Some(place) = state.lines.displaced_by(ticket)
+            {
+                displaced.extend(state.lines.remove(place));
+                self.gauge.dec();
+            }
+            let number = state.next;
+            state.next += 1;
+            state.lines.append(ticket, number, job);
+            self.gauge.inc();
+            slots.push(QueueSlot { queue: Arc::clone(self), number });
+        }
         drop(state);
-        self.changed.notify_one();
-        Ok((QueueSlot { queue: Arc::clone(self), number }, displaced))
+        slots.iter().for_each(|_| self.changed.notify_one());
+        Ok((slots, displaced))
     }
 
-    /// Whether [`push`](Self::push) would accept a job now.
+    /// Whether [`push`](Self::push) would accept one job now.
     pub fn check(&self, ticket: Ticket, service: Service) -> Result<(), Refused> {
-        self.place(&self.lock(), ticket, service).map(|_| ())
+        self.admit(&self.lock(), 1, ticket, service)
     }
 
-    /// The job that a new job would displace, if the queue is full.
-    fn place(&self, state: &State<T>, ticket: Ticket, service: Service) -> Result<Option<Place>, Refused> {
+    /// Whether there are places for all jobs of a request, and time.
+    fn admit(&self, state: &State<T>, jobs: usize, ticket: Ticket, service: Service) -> Result<(), Refused> {
         // An idle server accepts every job, so that its expectation cannot become wrong for ever.
         if let Some(deadline) = ticket.deadline
             && state.free == 0
         {
             let running = self.sessions as f64 / 2.0;
-            let turns = (state.lines.ahead_of(ticket) as f64 + running) / self.sessions as f64;
+            let ahead = state.lines.ahead_of(ticket) + jobs.saturating_sub(1);
+            let turns = (ahead as f64 + running) / self.sessions as f64;
             let estimate = service.mean.mul_f64(turns) + service.long;
             if deadline < Instant::now() + estimate {
                 return Err(Refused::TooLate(estimate));
             }
         }
-        // An idle session may not have woken up yet for a waiting job.
-        let is_full = state.lines.len() >= self.capacity + state.free;
-        if is_full { state.lines.displaced_by(ticket).map(Some).ok_or(Refused::Full) } else { Ok(None) }
+        let free = self.places(state).min(jobs);
+        if state.lines.can_displace(ticket, free, jobs - free) { Ok(()) } else { Err(Refused::Full) }
+    }
+
+    /// Number of free places. An idle session may not have woken up yet for a waiting job.
+    fn places(&self, state: &State<T>) -> usize {
+        (self.capacity + state.free).saturating_sub(state.lines.len())
     }
 
     pub fn capacity(&self) -> usize {
@@ -224,9 +235,9 @@ mod tests {
 
     /// Pushes a job that does not displace another.
     fn push(queue: &Arc<Queue<u32>>, job: u32) -> Result<QueueSlot<u32>, Refused> {
-        let (slot, displaced) = queue.push(job, ticket(CALLER, Priority::Normal), Service::default())?;
-        assert_eq!(displaced, None);
-        Ok(slot)
+        let (mut slots, displaced) = queue.push(vec![job], ticket(CALLER, Priority::Normal), Service::default())?;
+        assert!(displaced.is_empty());
+        Ok(slots.remove(0))
     }
 
     fn queue(sessions: usize, capacity: usize) -> (Arc<Queue<u32>>, IntGauge) {
@@ -336,7 +347,7 @@ mod tests {
         let (queue, _) = queue(1, 16);
         let slots: Vec<_> = [(1, 10), (1, 11), (1, 12), (1, 13), (2, 20), (2, 21), (3, 30)]
             .map(|(number, job)| {
-                queue.push(job, ticket(caller(number), Priority::Normal), Service::default()).ok().unwrap()
+                queue.push(vec![job], ticket(caller(number), Priority::Normal), Service::default()).ok().unwrap()
             })
             .into();
         assert_eq!(queue.take(Batching { max: 8, ..ONE }).unwrap(), [10, 20, 30, 11]);
@@ -348,14 +359,15 @@ mod tests {
     #[test]
     fn in_a_full_queue_a_caller_with_few_jobs_displaces_the_newest_of_the_caller_with_the_most() {
         let (queue, gauge) = queue(0, 4);
-        let push = |number: u8, job: u32| queue.push(job, ticket(caller(number), Priority::Normal), Service::default());
+        let push =
+            |number: u8, job: u32| queue.push(vec![job], ticket(caller(number), Priority::Normal), Service::default());
         let mut slots: Vec<_> = (0..4).map(|job| push(1, job).ok().unwrap()).collect();
         assert_eq!(push(1, 4).err(), Some(Refused::Full));
         for (job, displaced) in [(20, 3), (21, 2)] {
             assert!(queue.check(ticket(caller(2), Priority::Normal), Service::default()).is_ok());
             let (slot, job) = push(2, job).ok().unwrap();
-            assert_eq!(job, Some(displaced));
-            slots.push((slot, None));
+            assert_eq!(job, [displaced]);
+            slots.push((slot, Vec::new()));
         }
         assert_eq!(queue.check(ticket(caller(2), Priority::Normal), Service::default()), Err(Refused::Full));
         assert_eq!(push(2, 22).err(), Some(Refused::Full), "both have two");
@@ -367,14 +379,32 @@ mod tests {
     }
 
     #[test]
+    fn the_jobs_of_a_request_are_all_accepted_or_none_and_then_displace_none() {
+        let (queue, gauge) = queue(0, 6);
+        let push = |number: u8, jobs: std::ops::Range<u32>, priority| {
+            queue.push(jobs.collect(), ticket(caller(number), priority), Service::default())
+        };
+        let mut slots =
+            vec![push(1, 0..4, Priority::Normal).ok().unwrap(), push(1, 4..6, Priority::Batch).ok().unwrap()];
+        assert_eq!(push(2, 20..25, Priority::Normal).err(), Some(Refused::Full), "two batch jobs and one of the four");
+        assert_eq!((gauge.get(), queue.waiting()), (6, 6));
+        let (accepted, displaced) = push(2, 20..23, Priority::Normal).ok().unwrap();
+        assert_eq!((accepted.len(), displaced), (3, vec![5, 4, 3]));
+        slots.push((accepted, Vec::new()));
+        assert_eq!(push(2, 23..24, Priority::Normal).err(), Some(Refused::Full), "both have three");
+        assert_eq!(push(3, 30..33, Priority::Normal).err(), Some(Refused::Full), "with two it has as many as they");
+        assert_eq!((gauge.get(), queue.waiting()), (6, 6));
+    }
+
+    #[test]
     fn batch_jobs_wait_for_normal_ones_and_are_displaced_by_them_but_not_for_ever() {
         let (queue, _) = queue(1, 12);
-        let push = |job: u32, priority| queue.push(job, ticket(CALLER, priority), Service::default());
+        let push = |job: u32, priority| queue.push(vec![job], ticket(CALLER, priority), Service::default());
         let mut slots: Vec<_> = (0..3).map(|job| push(100 + job, Priority::Batch).ok().unwrap()).collect();
         slots.extend((0..10).map(|job| push(job, Priority::Normal).ok().unwrap()));
         assert_eq!(push(103, Priority::Batch).err(), Some(Refused::Full));
         let (slot, displaced) = push(10, Priority::Normal).ok().unwrap();
-        assert_eq!(displaced, Some(102));
+        assert_eq!(displaced, [102]);
         let taken: Vec<u32> = (0..13).map(|_| queue.take(ONE).inspect(|_| queue.free()).unwrap()[0]).collect();
         assert_eq!(taken, [0, 1, 2, 3, 4, 5, 6, 7, 100, 8, 9, 10, 101]);
         drop((slots, slot));
@@ -386,7 +416,7 @@ mod tests {
         let service = Service { mean: Duration::from_secs(10), long: Duration::from_secs(10) };
         let push = |number: u8, seconds: u64| {
             let deadline = Some(Instant::now() + Duration::from_secs(seconds));
-            queue.push(0, Ticket { deadline, ..ticket(caller(number), Priority::Normal) }, service)
+            queue.push(vec![0], Ticket { deadline, ..ticket(caller(number), Priority::Normal) }, service)
         };
         let mut slots = vec![push(1, 5).ok().unwrap()];
         assert_eq!(queue.take(ONE), Some(vec![0]));

@@ -48,10 +48,29 @@ pub(crate) struct ModelFolder {
     /// Names of the models that clients have unloaded.
     unloaded: Mutex<BTreeSet<String>>,
     commands: Option<mpsc::Receiver<Command>>,
+    state: watch::Receiver<State>,
+    loads: Loads,
+    /// Held while the registry is changed, so that an earlier reload cannot overwrite a later one.
+    replacing: Mutex<()>,
     serving: Serving,
     models: Arc<ModelRegistry>,
     sessions: Arc<SessionThreads>,
     metrics: Arc<Metrics>,
+}
+
+/// Held while a model is loaded.
+#[derive(Clone, Default)]
+pub(crate) struct Loads(Arc<Mutex<()>>);
+
+impl Loads {
+    /// Waits until no model is being loaded.
+    pub fn wait(&self) {
+        drop(self.begin());
+    }
+
+    fn begin(&self) -> MutexGuard<'_, ()> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 impl ModelFolder {
@@ -61,6 +80,7 @@ impl ModelFolder {
         models: Arc<ModelRegistry>,
         sessions: Arc<SessionThreads>,
         metrics: Arc<Metrics>,
+        state: watch::Receiver<State>,
     ) -> (Self, ModelControl) {
         let (control, commands) = ModelControl::new(config.allow_model_control);
         let Config { workers, threads, provider, precision, queue, batching, .. } = *config;
@@ -78,6 +98,9 @@ impl ModelFolder {
             completed: AtomicU64::new(0),
             unloaded: Mutex::default(),
             commands: Some(commands),
+            state,
+            loads: Loads::default(),
+            replacing: Mutex::default(),
             serving,
             models,
             sessions,
@@ -86,22 +109,31 @@ impl ModelFolder {
         (folder, control)
     }
 
+    /// The models that are being loaded.
+    pub fn loads(&self) -> Loads {
+        self.loads.clone()
+    }
+
     /// Loads the networks `entries` and the planners of the subfolders, and serves them. Returns early
     /// when the server is draining.
-    pub fn load(&self, entries: &[Entry], state: &watch::Receiver<State>) -> anyhow::Result<()> {
+    pub fn load(&self, entries: &[Entry]) -> anyhow::Result<()> {
         let mut engines = Vec::new();
         let files = ModelFiles::with_networks(&self.directory, entries.to_vec(), self.max_bytes)?;
         if let Some(error) = files.rejected.into_iter().next() {
             return Err(error.into());
         }
         for source in files.sources {
-            if *state.borrow() == State::Draining {
+            if self.is_draining() {
                 return Ok(());
             }
             engines.push(self.start(source)?);
         }
-        self.replace(engines);
+        self.replace(engines, self.default().as_deref());
         Ok(())
+    }
+
+    fn is_draining(&self) -> bool {
+        *self.state.borrow() == State::Draining
     }
 
     /// Reloads the folder at SIGHUP, when a client loads or unloads a model, and when its files have changed and were
@@ -265,6 +297,7 @@ impl ModelFolder {
                 return self.metrics.reloaded(Err(()));
             }
         };
+        let default = self.default();
         let served = self.models.now();
         let unloaded = self.unloaded().clone();
         let reason = "a client has unloaded it";
@@ -291,28 +324,37 @@ impl ModelFolder {
                 engines.push(Arc::clone(engine));
                 continue;
             }
+            if self.is_draining() {
+                return warn!("the server is shutting down; the models after it are not loaded");
+            }
             let (path, name) = (source.path().map(Path::to_owned), source.name().to_owned());
             match self.start(source) {
                 Ok(engine) => engines.push(engine),
                 Err(error) => reject(path.as_deref().unwrap_or(&self.directory), Some(&name), format!("{error:#}")),
             }
         }
+        let _replacing = self.replacing.lock().unwrap_or_else(PoisonError::into_inner);
         if number != self.latest.load(Ordering::Relaxed) {
             warn!("a reload ended after a later one had begun; it changes nothing");
             return self.metrics.superseded();
         }
-        let is_rejected = |path: &Path| rejected.iter().any(|rejected| rejected == path);
-        let kept = served.iter().filter(|engine| engine.source.path().is_some_and(is_rejected));
-        for kept in kept.cloned().collect::<Vec<_>>() {
-            let is_unloaded = unloaded.contains(kept.source.name());
-            if !is_unloaded && !engines.iter().any(|engine| engine.label == kept.label) {
-                engines.push(kept);
+        // A client may have been told meanwhile that a model could not be unloaded: it remains served.
+        let still_unloaded = self.unloaded().clone();
+        let is_kept = |engine: &&Arc<Engine>| {
+            let is_rejected = engine.source.path().is_some_and(|path| rejected.iter().any(|rejected| rejected == path));
+            let name = engine.source.name();
+            !still_unloaded.contains(name) && (is_rejected || unloaded.contains(name))
+        };
+        for kept in served.iter().filter(is_kept) {
+            if !engines.iter().any(|engine| engine.label == kept.label) {
+                engines.push(Arc::clone(kept));
             }
         }
+        unavailable.retain(|model| !unloaded.contains(&model.name) || still_unloaded.contains(&model.name));
         if engines.iter().all(|engine| engine.source.network().is_none()) {
             warn!("the model folder contains no network that can be served; the served models are unchanged");
         } else {
-            self.replace(engines);
+            self.replace(engines, default.as_deref());
         }
         self.models.set_unavailable(unavailable);
         self.completed.store(number, Ordering::Relaxed);
@@ -321,18 +363,23 @@ impl ModelFolder {
     }
 
     fn start(&self, source: Source) -> anyhow::Result<Arc<Engine>> {
+        let _loading = self.loads.begin();
         Engine::start(source, &self.serving, &self.metrics, &self.sessions).map(Arc::new)
     }
 
-    fn replace(&self, engines: Vec<Arc<Engine>>) {
+    /// The name of the default model, if it is set.
+    fn default(&self) -> Option<String> {
+        self.default_model.clone().or_else(|| default_of(&self.directory))
+    }
+
+    fn replace(&self, engines: Vec<Arc<Engine>>, default: Option<&str>) {
         let before = self.models.now();
-        let default = self.default_model.clone().or_else(|| default_of(&self.directory));
-        if default.as_deref().is_some_and(|name| engines.iter().all(|engine| engine.source.name() != name)) {
+        if default.is_some_and(|name| engines.iter().all(|engine| engine.source.name() != name)) {
             // The name is not logged: if the file `default` is a link to another file, it is that file's content.
             let setting = if self.default_model.is_some() { "--default-model" } else { "the file `default`" };
             warn!("the model named by {setting} is not served; the first network by name is the default instead");
         }
-        self.models.replace(engines, default.as_deref());
+        self.models.replace(engines, default);
         let now = self.models.now();
         let labels = |engines: &[Arc<Engine>]| engines.iter().map(|engine| engine.labels()).collect::<Vec<_>>();
         self.metrics.replaced(&labels(&before), &labels(&now));

@@ -29,8 +29,15 @@ pub(super) struct Session {
     pub service_time: Arc<ServiceTime>,
 }
 
-/// Mean time per scene and its mean deviation, in which the latest batches count most.
-pub(super) struct ServiceTime(Mutex<Mean>);
+/// Mean times of a scene and of a batch, in which the latest batches count most.
+pub(super) struct ServiceTime(Mutex<Times>);
+
+struct Times {
+    /// The time of a batch divided by its number of scenes: how fast the queue advances.
+    scene: Mean,
+    /// How long a scene takes, because it is done with its batch.
+    batch: Mean,
+}
 
 /// A mean, the mean deviation from it, and the number of the values.
 #[derive(Clone, Copy)]
@@ -43,6 +50,19 @@ struct Mean {
 /// Number of values that the mean of the service time remembers.
 const MEMORY: f64 = 8.0;
 
+impl Mean {
+    /// Adds a value. The first replaces the initial one.
+    fn add(&mut self, seconds: f64) {
+        self.values = (self.values + 1.0).min(MEMORY);
+        let difference = seconds - self.seconds;
+        // The difference from the initial value is no deviation.
+        if self.values > 1.0 {
+            self.deviation += (difference.abs() - self.deviation) / self.values;
+        }
+        self.seconds += difference / self.values;
+    }
+}
+
 /// A batch that a session computes. The session counts as busy in its queue until it sends its first result, so that a
 /// client that has received one finds a slot for its next request.
 struct Batch<'a> {
@@ -53,11 +73,21 @@ struct Batch<'a> {
     /// Its number of scenes.
     scenes: u32,
     service_time: &'a ServiceTime,
+    running: &'a Running,
     /// None when the session counts as idle again.
     queue: Option<&'a Queue<Job>>,
 }
 
 impl Batch<'_> {
+    /// Counts the time of the batch although its result is not sent, if it is longer than expected: otherwise nothing
+    /// would be learnt from batches whose jobs all expire. The time of an inference that hung says nothing about the next.
+    fn note_delay(&self) {
+        let time = self.taken.elapsed();
+        if time > self.service_time.get().long && !self.running.is_hanging() {
+            self.service_time.add(time, self.scenes);
+        }
+    }
+
     fn free(&mut self) {
         if let Some(queue) = self.queue.take() {
             queue.free();
@@ -72,31 +102,28 @@ impl Drop for Batch<'_> {
 }
 
 impl ServiceTime {
+    /// The time of one scene in a batch of its own.
     pub fn new(duration: Duration) -> Self {
-        Self(Mutex::new(Mean { seconds: duration.as_secs_f64(), deviation: 0.0, values: 0.0 }))
+        let mean = Mean { seconds: duration.as_secs_f64(), deviation: 0.0, values: 0.0 };
+        Self(Mutex::new(Times { scene: mean, batch: mean }))
     }
 
-    /// Adds the time of a scene. The first replaces the initial time.
-    pub fn add(&self, duration: Duration) {
-        let mut mean = self.mean();
-        mean.values = (mean.values + 1.0).min(MEMORY);
-        let difference = duration.as_secs_f64() - mean.seconds;
-        // The difference from the initial time is no deviation.
-        if mean.values > 1.0 {
-            mean.deviation += (difference.abs() - mean.deviation) / mean.values;
-        }
-        mean.seconds += difference / mean.values;
+    /// Adds the time of a batch.
+    pub fn add(&self, duration: Duration, scenes: u32) {
+        let mut times = self.times();
+        times.scene.add(duration.as_secs_f64() / f64::from(scenes));
+        times.batch.add(duration.as_secs_f64());
     }
 
-    /// The mean is at least one millisecond, the unit of the retry hint. Two mean deviations above it are, for a normal
-    /// distribution, exceeded by one in twenty.
+    /// The mean is at least one millisecond, the unit of the retry hint. Two mean deviations above that of a batch are,
+    /// for a normal distribution, exceeded by one in twenty.
     pub fn get(&self) -> Service {
-        let Mean { seconds, deviation, .. } = *self.mean();
-        let mean = Duration::from_secs_f64(seconds).max(Duration::from_millis(1));
-        Service { mean, long: mean + Duration::from_secs_f64(2.0 * deviation) }
+        let Times { scene, batch } = *self.times();
+        let mean = Duration::from_secs_f64(scene.seconds).max(Duration::from_millis(1));
+        Service { mean, long: mean.max(Duration::from_secs_f64(batch.seconds + 2.0 * batch.deviation)) }
     }
 
-    fn mean(&self) -> MutexGuard<'_, Mean> {
+    fn times(&self) -> MutexGuard<'_, Times> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -121,9 +148,10 @@ impl Session {
             }
             self.batch.observe(jobs.len() as f64);
             let Self { planner, defaults, queue, running, service_time, .. } = &mut self;
-            let _running = running.begin(&jobs);
+            let _ended = running.begin(&jobs);
             let scenes = u32::try_from(jobs.len()).unwrap_or(u32::MAX);
-            let batch = Batch { taken: now, inference: Duration::ZERO, scenes, service_time, queue: Some(queue) };
+            let batch =
+                Batch { taken: now, inference: Duration::ZERO, scenes, service_time, running, queue: Some(queue) };
             match planner {
                 Loaded::Network(network) => infer(network, *defaults, jobs, batch),
                 Loaded::Single(planner) => {
@@ -145,6 +173,7 @@ fn infer(network: &mut NetworkPlanner, defaults: DecodeParams, jobs: Vec<Job>, m
     for (index, Job { scene, task, deadline, span, submitted }) in jobs.into_iter().enumerate() {
         if task.is_closed() || deadline.is_some_and(Deadline::has_passed) {
             // Skips the decoding, so that the other jobs of the batch finish earlier.
+            batch.note_delay();
             batch.free();
             task.fail(EngineError::Expired);
             continue;
@@ -230,10 +259,10 @@ fn send_result<T: Send + 'static>(
     });
     drop(span);
     let Batch { taken, inference, scenes, service_time, .. } = *batch;
-    // The time per scene, including decoding. Set before the reply, so that the next refusal already has it. The time of
+    // The time including decoding. Set before the reply, so that the next refusal already has it. The time of
     // a request that was cancelled, or failed because its inference hung, says nothing about the next one.
     if !reply.is_closed() {
-        service_time.add(taken.elapsed() / scenes);
+        service_time.add(taken.elapsed(), scenes);
     }
     let queue = taken.duration_since(submitted);
     let postprocessing = started.elapsed().saturating_sub(evaluation.unwrap_or_default());
@@ -280,6 +309,15 @@ fn caught<T>(work: impl FnOnce() -> Result<T, EngineError>) -> Result<T, EngineE
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_scene_takes_as_long_as_its_batch() {
+        let times = ServiceTime::new(Duration::from_millis(5));
+        assert_eq!(times.get(), Service { mean: Duration::from_millis(5), long: Duration::from_millis(5) });
+        (0..20).for_each(|_| times.add(Duration::from_millis(800), 8));
+        let Service { mean, long } = times.get();
+        assert_eq!((mean.as_millis(), long.as_millis()), (100, 800));
+    }
 
     #[test]
     fn a_panic_becomes_an_error_with_its_message() {

@@ -2,18 +2,20 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use grasp_proto::{DetectParams, FieldError, MAX_VIEWS, TABLE_HEIGHT, Workspace, check_count, depth_view, pb};
+use grasp_proto::{
+    DetectParams, FieldError, MAX_VIEWS, TABLE_HEIGHT, Workspace, check_count, check_png, depth_view, pb,
+};
 use nalgebra::Isometry3;
 use prometheus::IntGauge;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use crate::rpc::call::{FrameStamp, Observed};
 use crate::rpc::refusal::Refusal;
-use crate::serving::cubes::{CubeScene, Cubes};
+use crate::serving::cubes::{CubeScene, Cubes, edge};
 use crate::serving::engine::Engine;
 use crate::serving::observation::Observation;
 
-/// Limits on TrackGrasps streams: their number, and the time without a request.
+/// Limits on TrackGrasps streams: the number of their volumes, and the time without a request.
 pub(crate) struct TrackedVolumes {
     permits: Arc<Semaphore>,
     limit: usize,
@@ -21,9 +23,9 @@ pub(crate) struct TrackedVolumes {
     gauge: IntGauge,
 }
 
-/// The permit of one stream.
+/// The permit of one stream, for its volumes: one for each cube of its workspace, and at least one.
 pub(crate) struct TrackPermit {
-    _permit: OwnedSemaphorePermit,
+    volumes: OwnedSemaphorePermit,
     gauge: IntGauge,
 }
 
@@ -34,11 +36,28 @@ impl TrackedVolumes {
 
     /// Takes a permit, or refuses immediately.
     pub fn acquire(&self) -> Result<TrackPermit, Refusal> {
-        let Ok(permit) = Arc::clone(&self.permits).try_acquire_owned() else {
-            return Err(Refusal::TooManyTracked(self.limit));
-        };
-        self.gauge.inc();
-        Ok(TrackPermit { _permit: permit, gauge: self.gauge.clone() })
+        let volumes = self.take(1)?;
+        Ok(TrackPermit { volumes, gauge: self.gauge.clone() })
+    }
+
+    /// Changes the number of a stream's volumes, or refuses immediately.
+    pub fn resize(&self, permit: &mut TrackPermit, volumes: usize) -> Result<(), Refusal> {
+        let held = permit.count();
+        if let Some(surplus) = held.checked_sub(volumes) {
+            self.gauge.sub(surplus as i64);
+            drop(permit.volumes.split(surplus));
+        } else {
+            permit.volumes.merge(self.take(volumes - held)?);
+        }
+        Ok(())
+    }
+
+    fn take(&self, volumes: usize) -> Result<OwnedSemaphorePermit, Refusal> {
+        let count = u32::try_from(volumes).unwrap_or(u32::MAX);
+        let permit = Arc::clone(&self.permits).try_acquire_many_owned(count);
+        let permit = permit.map_err(|_| Refusal::TooManyTracked { needed: volumes, limit: self.limit })?;
+        self.gauge.add(volumes as i64);
+        Ok(permit)
     }
 
     /// Returns after the timeout, with the refusal that ends the stream.
@@ -48,9 +67,16 @@ impl TrackedVolumes {
     }
 }
 
+impl TrackPermit {
+    /// Number of volumes.
+    pub fn count(&self) -> usize {
+        self.volumes.num_permits()
+    }
+}
+
 impl Drop for TrackPermit {
     fn drop(&mut self) {
-        self.gauge.dec();
+        self.gauge.sub(self.count() as i64);
     }
 }
 
@@ -64,9 +90,30 @@ pub(crate) struct Track {
 
 /// The start of a new field.
 pub(crate) struct Start {
-    pub workspace: pb::Workspace,
+    workspace: Workspace,
+    origin: FrameStamp,
     /// Half-life of the measurements, views.
-    pub half_life: Option<f64>,
+    half_life: Option<f64>,
+}
+
+impl Start {
+    pub fn checked(workspace: pb::Workspace, half_life: Option<f64>) -> Result<Self, Refusal> {
+        if let Some(half_life) = half_life
+            && !HALF_LIFE.contains(&half_life)
+        {
+            let needed = format_args!("must be from {} to {} views", HALF_LIFE.start(), HALF_LIFE.end());
+            return Err(FieldError::new("half_life", half_life, needed).into());
+        }
+        let mut workspace = Workspace::try_from(workspace)?;
+        let frame_id = std::mem::take(&mut workspace.frame_id);
+        let origin = FrameStamp::checked("workspace.frame_id", frame_id, workspace.stamp)?;
+        Ok(Self { workspace, origin, half_life })
+    }
+
+    /// The number of volumes that the field of a planner has.
+    pub fn volumes(&self, engine: &Engine, params: &DetectParams) -> Result<usize, FieldError> {
+        Cubes::count(&engine.source, &self.workspace, params.margin)
+    }
 }
 
 /// The scenes, frame and stamp, and what the fusion showed.
@@ -77,13 +124,14 @@ const HALF_LIFE: RangeInclusive<f64> = 0.5..=10_000.0;
 
 impl Track {
     /// Adds views to the field, or to a new one if a workspace is given. An invalid view is an error; views before it
-    /// in the request may already be integrated.
+    /// in the request may already be integrated. Stops when `is_wanted` returns false.
     pub fn integrate(
         track: Option<Self>,
         engine: &Engine,
         params: DetectParams,
         start: Option<Start>,
         views: &mut [pb::DepthView],
+        is_wanted: &dyn Fn() -> bool,
     ) -> (Option<Self>, Result<Fused, Refusal>) {
         match (track, start) {
             (None, None) => {
@@ -92,12 +140,13 @@ impl Track {
             }
             (Some(mut track), None) => {
                 let views = converted(views, track.cubes.frame_from_task());
-                let fused = views.map_err(Refusal::from).and_then(|views| track.add(engine, params, views, None));
+                let fused = views.map_err(Refusal::from);
+                let fused = fused.and_then(|views| track.add(engine, params, views, None, is_wanted));
                 (Some(track), fused)
             }
             (track, Some(start)) => match Self::start(engine, &params, start, views) {
                 Ok((mut track, views, table)) => {
-                    let fused = track.add(engine, params, views, table);
+                    let fused = track.add(engine, params, views, table, is_wanted);
                     (Some(track), fused)
                 }
                 Err(refusal) => (track, Err(refusal)),
@@ -109,21 +158,14 @@ impl Track {
     fn start(
         engine: &Engine,
         params: &DetectParams,
-        Start { workspace, half_life }: Start,
+        Start { mut workspace, origin, half_life }: Start,
         views: &mut [pb::DepthView],
     ) -> Result<(Self, Observation, Option<pb::FoundTable>), Refusal> {
-        if let Some(half_life) = half_life
-            && !HALF_LIFE.contains(&half_life)
-        {
-            let needed = format_args!("must be from {} to {} views", HALF_LIFE.start(), HALF_LIFE.end());
-            return Err(FieldError::new("half_life", half_life, needed).into());
-        }
-        let mut workspace = Workspace::try_from(workspace)?;
-        let origin =
-            FrameStamp::checked("workspace.frame_id", std::mem::take(&mut workspace.frame_id), workspace.stamp)?;
         // The rotation of the grid may depend on the camera positions.
         check_count(views.len())?;
-        let table = workspace.find_table(views, params.table.unwrap_or(TABLE_HEIGHT))?;
+        check_png(views)?;
+        let edge = edge(&engine.source, workspace.size);
+        let table = workspace.find_table(views, params.table.unwrap_or(TABLE_HEIGHT), edge)?;
         let views = converted(views, &workspace.frame_from_task)?;
         let cubes = Cubes::of(&engine.source, &workspace, &views.cameras(), params.margin)?;
         let cubes = match half_life {
@@ -133,17 +175,23 @@ impl Track {
         Ok((Self { cubes, origin, params: params.clone() }, views, table))
     }
 
+    /// Number of volumes.
+    pub fn volumes(&self) -> usize {
+        self.cubes.len()
+    }
+
     fn add(
         &mut self,
         engine: &Engine,
         params: DetectParams,
         mut views: Observation,
         table: Option<pb::FoundTable>,
+        is_wanted: &dyn Fn() -> bool,
     ) -> Result<Fused, Refusal> {
         let started = Instant::now();
         self.cubes.check(&engine.source)?;
         params.check_objects(views.is_labelled())?;
-        let integrated = self.cubes.integrate(&mut views, params.table)?;
+        let integrated = self.cubes.integrate(&mut views, params.table, is_wanted)?;
         let (warnings, depth_factors) = (integrated.warnings.clone(), integrated.depth_factors.clone());
         let objects = views.objects(self.cubes.frame_from_task(), &params.objects)?;
         // Without points: those of earlier views are not stored.
@@ -159,6 +207,7 @@ fn converted(views: &[pb::DepthView], frame_from_task: &Isometry3<f64>) -> Resul
         let needed = format_args!("must have at most {MAX_VIEWS}");
         return Err(FieldError::new("views", format_args!("a list of {}", views.len()), needed));
     }
+    check_png(views)?;
     let views = views.iter().enumerate().map(|(index, view)| depth_view(view, index, frame_from_task));
     Ok(Observation::Depth(views.collect::<Result<_, _>>()?))
 }

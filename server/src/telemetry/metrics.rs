@@ -163,7 +163,10 @@ impl Metrics {
                 "When the certificate of --tls-cert expires, seconds since 1970; 0 without TLS.",
             ),
             ready: gauge("graspd_ready", "1 while the server accepts requests, 0 during startup and shutdown."),
-            tracked: gauge("graspd_tracked_volumes", "Open TrackGrasps streams, each with one volume."),
+            tracked: gauge(
+                "graspd_tracked_volumes",
+                "Volumes that open TrackGrasps streams keep, one for each cube of their workspaces.",
+            ),
             hanging: gauges(
                 "graspd_hanging_sessions",
                 "Sessions whose inference takes longer than --inference-timeout.",

@@ -162,15 +162,15 @@ impl Files {
 
     fn remove_oldest(&mut self) -> io::Result<()> {
         while self.bytes > self.capacity
-            && let Some((oldest, bytes)) = self.known.front()
+            && let Some((oldest, bytes)) = self.known.pop_front()
         {
+            // Also if it cannot be removed: the next one is then removed instead.
+            self.bytes -= bytes;
             match fs::remove_file(oldest) {
                 // Someone else has removed it.
                 Err(error) if error.kind() == io::ErrorKind::NotFound => {}
                 removed => removed?,
             }
-            self.bytes -= bytes;
-            self.known.pop_front();
         }
         Ok(())
     }

@@ -51,7 +51,8 @@ impl Address {
             }
             Self::Unix(path) => {
                 let is_socket = std::fs::symlink_metadata(path).is_ok_and(|file| file.file_type().is_socket());
-                if is_socket && UnixStream::connect(path).await.is_err() {
+                let is_refused = |error: io::Error| error.kind() == io::ErrorKind::ConnectionRefused;
+                if is_socket && UnixStream::connect(path).await.is_err_and(is_refused) {
                     std::fs::remove_file(path)?;
                 }
                 let sockets = UnixListenerStream::new(UnixListener::bind(path)?);

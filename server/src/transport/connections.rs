@@ -2,15 +2,17 @@ use std::io;
 use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::Arc;
-use std::task::{Context, Poll};
+use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use http::Extensions;
 use prometheus::{IntCounter, IntGauge};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::time::{Sleep, sleep};
+use tokio_rustls::server::TlsStream;
+use tokio_rustls::{Accept, TlsAcceptor};
 use tokio_stream::{Stream, StreamExt};
-use tonic::transport::server::{Connected, TlsConnectInfo};
+use tonic::transport::server::Connected;
 use tracing::warn;
 
 use crate::transport::address::{Listener, Socket, peer};
@@ -19,16 +21,17 @@ use crate::transport::receive_budget::{ConnectionShare, ReceiveBudget};
 /// The limit on open connections, with its metrics.
 pub(crate) struct ConnectionLimit {
     pub limit: usize,
-    /// Maximum time until a client has sent the HTTP/2 preface.
+    /// Maximum time until a client has sent the HTTP/2 preface, with the TLS handshake.
     pub timeout: Duration,
     pub open: IntGauge,
     pub refused: IntCounter,
 }
 
-/// Accepts the connections of a listener. Connections beyond the limit are closed immediately, which clients report as
-/// UNAVAILABLE.
+/// Accepts the connections of a listener, with TLS if it is given. Connections beyond the limit are closed immediately,
+/// which clients report as UNAVAILABLE.
 pub(crate) fn accept(
     listener: Listener,
+    tls: Option<TlsAcceptor>,
     limit: ConnectionLimit,
     budget: Arc<ReceiveBudget>,
 ) -> impl Stream<Item = io::Result<Connection>> {
@@ -43,7 +46,7 @@ pub(crate) fn accept(
     });
     accepted.filter_map(move |accepted| match accepted {
         Ok(stream) if open.get() < i64::try_from(limit).unwrap_or(i64::MAX) => {
-            Some(Ok(Connection::new(stream, timeout, &open, &budget)))
+            Some(Ok(Connection::new(stream, tls.as_ref(), timeout, &open, &budget)))
         }
         Ok(_) => {
             refused.inc();
@@ -57,18 +60,30 @@ pub(crate) fn accept(
 /// Pause after an error of the listener.
 const ERROR_PAUSE: Duration = Duration::from_millis(100);
 
-/// Length of the HTTP/2 connection preface (RFC 9113, section 3.4), bytes. A TLS handshake starts with more. After it,
-/// keep-alive pings and the TLS handshake timeout close dead connections.
+/// Length of the HTTP/2 connection preface (RFC 9113, section 3.4), bytes. After it, keep-alive pings close dead
+/// connections.
 const PREFACE: usize = 24;
 
 /// A connection, counted in `open` until it is dropped.
 pub(crate) struct Connection {
-    stream: Socket,
+    stream: Stage,
     /// Missing bytes of the preface and their timeout; None after the preface.
     preface: Option<(usize, Pin<Box<Sleep>>)>,
     open: IntGauge,
     peer: Peer,
 }
+
+/// The stream of a connection.
+enum Stage {
+    Plain(Socket),
+    Handshake(Box<Accept<Socket>>),
+    Tls(Box<TlsStream<Socket>>),
+}
+
+/// The bytes of a connection, decrypted.
+trait Bytes: AsyncRead + AsyncWrite + Unpin {}
+
+impl<T: AsyncRead + AsyncWrite + Unpin> Bytes for T {}
 
 /// The client of a connection.
 #[derive(Clone)]
@@ -81,15 +96,47 @@ pub(crate) struct Peer {
 impl Peer {
     /// The client that sent a request.
     pub fn of(extensions: &Extensions) -> Option<&Self> {
-        extensions.get().or_else(|| extensions.get::<TlsConnectInfo<Self>>().map(TlsConnectInfo::get_ref))
+        extensions.get()
     }
 }
 
 impl Connection {
-    fn new(stream: Socket, timeout: Duration, open: &IntGauge, budget: &Arc<ReceiveBudget>) -> Self {
+    fn new(
+        stream: Socket,
+        tls: Option<&TlsAcceptor>,
+        timeout: Duration,
+        open: &IntGauge,
+        budget: &Arc<ReceiveBudget>,
+    ) -> Self {
         open.inc();
         let peer = Peer { address: peer(&stream), share: budget.connection() };
+        let stream = match tls {
+            None => Stage::Plain(stream),
+            Some(tls) => Stage::Handshake(Box::new(tls.accept(stream))),
+        };
         Self { stream, preface: Some((PREFACE, Box::pin(sleep(timeout)))), open: open.clone(), peer }
+    }
+
+    /// The bytes, when the handshake is done.
+    fn poll_bytes(&mut self, context: &mut Context<'_>) -> Poll<io::Result<Pin<&mut dyn Bytes>>> {
+        if let Stage::Handshake(handshake) = &mut self.stream {
+            let done = Pin::new(handshake.as_mut()).poll(context);
+            if done.is_pending() {
+                self.check_time(context)?;
+            }
+            self.stream = Stage::Tls(Box::new(ready!(done)?));
+        }
+        match &mut self.stream {
+            Stage::Plain(stream) => Poll::Ready(Ok(Pin::new(stream))),
+            Stage::Tls(stream) => Poll::Ready(Ok(Pin::new(stream.as_mut()))),
+            Stage::Handshake(_) => Poll::Pending,
+        }
+    }
+
+    /// An error if the preface is late.
+    fn check_time(&mut self, context: &mut Context<'_>) -> io::Result<()> {
+        let is_late = self.preface.as_mut().is_some_and(|(_, timeout)| timeout.as_mut().poll(context).is_ready());
+        if is_late { Err(io::ErrorKind::TimedOut.into()) } else { Ok(()) }
     }
 }
 
@@ -114,15 +161,15 @@ impl AsyncRead for Connection {
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
         let before = buffer.filled().len();
-        let read = Pin::new(&mut self.stream).poll_read(context, buffer)?;
-        if let Some((missing, timeout)) = &mut self.preface {
-            let received = buffer.filled().len() - before;
-            *missing = missing.saturating_sub(received);
-            if *missing == 0 {
-                self.preface = None;
-            } else if timeout.as_mut().poll(context).is_ready() {
-                return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
+        let read = ready!(self.poll_bytes(context))?.poll_read(context, buffer)?;
+        let received = buffer.filled().len() - before;
+        match &mut self.preface {
+            Some((missing, _)) if *missing <= received => self.preface = None,
+            Some((missing, _)) => {
+                *missing -= received;
+                self.check_time(context)?;
             }
+            None => {}
         }
         read.map(Ok)
     }
@@ -130,15 +177,15 @@ impl AsyncRead for Connection {
 
 impl AsyncWrite for Connection {
     fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write(context, bytes)
+        ready!(self.poll_bytes(context))?.poll_write(context, bytes)
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_flush(context)
+        ready!(self.poll_bytes(context))?.poll_flush(context)
     }
 
     fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_shutdown(context)
+        ready!(self.poll_bytes(context))?.poll_shutdown(context)
     }
 
     fn poll_write_vectored(
@@ -146,11 +193,15 @@ impl AsyncWrite for Connection {
         context: &mut Context<'_>,
         slices: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write_vectored(context, slices)
+        ready!(self.poll_bytes(context))?.poll_write_vectored(context, slices)
     }
 
     fn is_write_vectored(&self) -> bool {
-        self.stream.is_write_vectored()
+        match &self.stream {
+            Stage::Plain(stream) => stream.is_write_vectored(),
+            // As TlsStream, which encrypts the slices one after the other.
+            Stage::Handshake(_) | Stage::Tls(_) => true,
+        }
     }
 }
 
@@ -182,7 +233,8 @@ mod tests {
         let open = IntGauge::new("open", "Open connections.").unwrap();
         let refused = IntCounter::new("refused", "Refused connections.").unwrap();
         let timeout = Duration::from_secs(10);
-        let mut incoming = pin!(accept(listener, ConnectionLimit { limit: 1, timeout, open, refused }, budget()));
+        let limit = ConnectionLimit { limit: 1, timeout, open, refused };
+        let mut incoming = pin!(accept(listener, None, limit, budget()));
 
         let _silent = TcpStream::connect(address).await.unwrap();
         let mut connection = incoming.next().await.unwrap().unwrap();
@@ -202,11 +254,11 @@ mod tests {
             open: open.clone(),
             refused: refused.clone(),
         };
-        let mut incoming = pin!(accept(listener, limit, budget()));
+        let mut incoming = pin!(accept(listener, None, limit, budget()));
 
         let _first = TcpStream::connect(address).await.unwrap();
         let connection = incoming.next().await.unwrap().unwrap();
-        let Either::Left(stream) = &connection.stream else { panic!("it is a TCP connection") };
+        let Stage::Plain(Either::Left(stream)) = &connection.stream else { panic!("it is a TCP connection") };
         assert!(stream.nodelay().unwrap());
         assert_eq!(open.get(), 1);
 

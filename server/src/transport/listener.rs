@@ -1,7 +1,6 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::Context;
 use grasp_proto::FILE_DESCRIPTOR_SET;
 use grasp_proto::oip::grpc_inference_service_server::GrpcInferenceServiceServer;
 use grasp_proto::pb::grasp_service_server::GraspServiceServer;
@@ -73,7 +72,8 @@ pub(crate) async fn serve(
     let grasps = grasps.accept_compressed(CompressionEncoding::Gzip).accept_compressed(CompressionEncoding::Zstd);
     let inference = inference.accept_compressed(CompressionEncoding::Gzip).accept_compressed(CompressionEncoding::Zstd);
     let guard = tokens::guard(tokens, Arc::clone(&metrics));
-    let incoming = connections::accept(listener, metrics.connections(connections, limits.stall), Arc::clone(&budget));
+    let limit = metrics.connections(connections, limits.stall);
+    let incoming = connections::accept(listener, tls.map(|tls| tls.grpc), limit, Arc::clone(&budget));
     let counted = Arc::clone(&metrics);
     let outgoing = MapResponseLayer::new(move |response| keep_permit(request_body::unreadable(response, &counted)));
     let intake = MapRequestLayer::new(move |request: http::Request<Body>| {
@@ -87,13 +87,7 @@ pub(crate) async fn serve(
         let body = RequestBody::new(parts.uri.path(), body, deadline, limits, share, Arc::clone(&metrics));
         http::Request::from_parts(parts, Body::new(body))
     });
-    let mut server = Server::builder();
-    if let Some(tls) = tls {
-        server = server
-            .tls_config(tls.config.timeout(limits.stall))
-            .context("cannot use the files of --tls-cert, --tls-key and --tls-client-ca")?;
-    }
-    server
+    Server::builder()
         .layer(intake)
         .layer(outgoing)
         .initial_stream_window_size(STREAM_WINDOW)

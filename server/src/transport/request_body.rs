@@ -189,7 +189,8 @@ pub(crate) fn unreadable(mut response: http::Response<Body>, metrics: &Metrics) 
 
 /// The same for a message of a stream.
 pub(crate) fn unreadable_message(status: Status, metrics: &Metrics) -> Status {
-    if !matches!(status.code(), Code::Internal | Code::ResourceExhausted) {
+    let is_tonics = status.details().is_empty();
+    if !is_tonics || !matches!(status.code(), Code::Internal | Code::ResourceExhausted) {
         return status;
     }
     metrics.ended("", Code::InvalidArgument);

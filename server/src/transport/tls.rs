@@ -9,7 +9,6 @@ use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use tokio_rustls::rustls::server::WebPkiClientVerifier;
 use tokio_rustls::rustls::{self, RootCertStore};
-use tonic::transport::{Certificate, Identity, Server, ServerTlsConfig};
 use tracing::warn;
 use x509_parser::pem::Pem;
 
@@ -19,7 +18,8 @@ const SOON: Duration = Duration::from_secs(14 * 24 * 3600);
 /// A checked configuration of TLS.
 #[derive(Clone)]
 pub(crate) struct Tls {
-    pub config: ServerTlsConfig,
+    /// Of the gRPC listener, which speaks HTTP/2.
+    pub grpc: TlsAcceptor,
     /// The same for HTTP/1.1.
     pub http: TlsAcceptor,
     /// When the first certificate of the chain expires, seconds since 1970.
@@ -31,14 +31,11 @@ impl Tls {
     /// of clients.
     pub fn new(certificate: &[u8], key: &[u8], client_ca: Option<&[u8]>) -> anyhow::Result<Self> {
         let expiry = expiry(certificate).context("cannot read --tls-cert")?;
-        let mut config = ServerTlsConfig::new().identity(Identity::from_pem(certificate, key));
         if let Some(ca) = client_ca {
             self::expiry(ca).context("cannot read --tls-client-ca")?;
-            config = config.client_ca_root(Certificate::from_pem(ca));
         }
-        Server::builder().tls_config(config.clone()).context("cannot use the files")?;
-        let http = acceptor(certificate, key, client_ca).context("cannot use the files")?;
-        Ok(Self { config, http, expiry })
+        let acceptor = |protocol| acceptor(certificate, key, client_ca, protocol).context("cannot use the files");
+        Ok(Self { grpc: acceptor("h2")?, http: acceptor("http/1.1")?, expiry })
     }
 
     /// Logs a warning if a certificate has expired or expires soon.
@@ -52,7 +49,8 @@ impl Tls {
     }
 }
 
-fn acceptor(certificate: &[u8], key: &[u8], client_ca: Option<&[u8]>) -> anyhow::Result<TlsAcceptor> {
+/// Accepts connections with this protocol (ALPN).
+fn acceptor(certificate: &[u8], key: &[u8], client_ca: Option<&[u8]>, protocol: &str) -> anyhow::Result<TlsAcceptor> {
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let config = rustls::ServerConfig::builder_with_provider(Arc::clone(&provider));
     let config = config.with_safe_default_protocol_versions()?;
@@ -69,7 +67,7 @@ fn acceptor(certificate: &[u8], key: &[u8], client_ca: Option<&[u8]>) -> anyhow:
     };
     let chain = CertificateDer::pem_slice_iter(certificate).collect::<Result<Vec<_>, _>>()?;
     let mut config = config.with_single_cert(chain, PrivateKeyDer::from_pem_slice(key)?)?;
-    config.alpn_protocols = vec![b"http/1.1".to_vec()];
+    config.alpn_protocols = vec![protocol.as_bytes().to_vec()];
     Ok(TlsAcceptor::from(Arc::new(config)))
 }
 

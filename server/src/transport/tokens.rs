@@ -8,6 +8,7 @@ use anyhow::{Context, ensure};
 use sha2::{Digest, Sha256};
 use subtle::{Choice, ConstantTimeEq};
 use tokio::signal::unix::Signal;
+use tokio::task::spawn_blocking;
 use tonic::metadata::MetadataMap;
 use tonic::{Code, Request, Status};
 use tracing::{error, info};
@@ -38,7 +39,10 @@ impl Tokens {
     /// Reloads the file at each SIGHUP. If it cannot be read, the tokens are unchanged.
     pub async fn watch(self: Arc<Self>, mut hangup: Signal) {
         while hangup.recv().await.is_some() {
-            match hashes(&self.file) {
+            // On a blocking thread, because a network file system may hang.
+            let file = self.file.clone();
+            let read = spawn_blocking(move || hashes(&file)).await;
+            match read.unwrap_or_else(|panic| Err(panic.into())) {
                 Ok(hashes) => {
                     info!(tokens = hashes.len(), "tokens reloaded");
                     *self.hashes.write().unwrap_or_else(PoisonError::into_inner) = hashes;

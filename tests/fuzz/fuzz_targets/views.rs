@@ -49,7 +49,7 @@ fn depth(bytes: &[u8]) {
     let Ok(request) = pb::DetectGraspsFromDepthRequest::decode(bytes) else { return };
     let Ok(mut workspace) = Workspace::try_from(request.workspace.unwrap_or_default()) else { return };
     let mut views = request.views;
-    if let Err(error) = workspace.find_table(&mut views, 0.05) {
+    if let Err(error) = workspace.find_table(&mut views, 0.05, 0.3) {
         assert!(error.message.starts_with(&*error.field), "{error:?}");
     }
     for (index, view) in views.iter().enumerate() {
@@ -60,7 +60,7 @@ fn depth(bytes: &[u8]) {
 fn cloud(bytes: &[u8]) {
     let Ok(request) = pb::DetectGraspsFromCloudRequest::decode(bytes) else { return };
     if let Ok(mut workspace) = Workspace::try_from(request.workspace.unwrap_or_default())
-        && let Err(error) = workspace.find_table_in_clouds(&request.views, 0.05)
+        && let Err(error) = workspace.find_table_in_clouds(&request.views, 0.05, 0.3)
     {
         assert!(error.message.starts_with(&*error.field), "{error:?}");
     }
