@@ -6,9 +6,10 @@ use rand::RngExt;
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
 use tonic::transport::{Certificate, ClientTlsConfig, Identity};
-use tonic::{Code, Request, Status};
+use tonic::{Code, Request, Status, TimeoutExpired};
 
-/// TLS, authentication and retries of a connection. The default is no TLS, no token and a single attempt.
+/// TLS, authentication, retries and time limit of a connection. The default is no TLS, no token, a single attempt and no
+/// time limit.
 ///
 /// TLS is used when the address begins with `https://`, or when a CA or an identity is set.
 #[derive(Clone, Default)]
@@ -21,6 +22,9 @@ pub struct Access {
     pub token: Option<Token>,
     /// When failed calls are retried.
     pub retry: Retry,
+    /// Time limit of each attempt of a call whose options have none. It is sent to the server as the deadline. It does
+    /// not apply to streams and tracking. `None`: no limit.
+    pub timeout: Option<Duration>,
 }
 
 /// A bearer token. `Debug` does not print it.
@@ -70,6 +74,18 @@ pub(crate) fn is_transient(status: &Status) -> bool {
     matches!(status.code(), Code::Unavailable | Code::ResourceExhausted) || std::error::Error::source(status).is_some()
 }
 
+/// Whether this client ended the call because its time limit has passed. tonic reports that as CANCELLED.
+pub(crate) fn has_timed_out(status: &Status) -> bool {
+    let mut source = std::error::Error::source(status);
+    while let Some(error) = source {
+        if error.is::<TimeoutExpired>() {
+            return true;
+        }
+        source = error.source();
+    }
+    false
+}
+
 impl Access {
     /// The TLS configuration; `None` when neither these settings nor the address require TLS.
     pub(crate) fn tls(&self, address: &str) -> Option<ClientTlsConfig> {
@@ -89,10 +105,10 @@ impl Access {
 
 impl Debug for Access {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { ca, identity, token, retry } = self;
+        let Self { ca, identity, token, retry, timeout } = self;
         let mut access = f.debug_struct("Access");
         access.field("ca", &ca.is_some()).field("identity", &identity.is_some()).field("token", &token.is_some());
-        access.field("retry", retry).finish()
+        access.field("retry", retry).field("timeout", timeout).finish()
     }
 }
 
@@ -146,6 +162,13 @@ mod tests {
         assert_eq!(retry.pause(1, Some(Duration::from_secs(3))), Some(Duration::from_secs(3)));
         assert_eq!(Retry::NONE.pause(1, Some(Duration::from_secs(3))), None);
         assert!(Retry { attempts: 100, ..retry }.pause(99, None).unwrap() <= retry.longest);
+    }
+
+    #[test]
+    fn only_a_passed_time_limit_of_this_client_is_a_timeout() {
+        assert!(has_timed_out(&Status::from_error(Box::new(TimeoutExpired(())))));
+        assert!(!has_timed_out(&Status::from_error(Box::new(std::io::Error::other("the connection broke")))));
+        assert!(!has_timed_out(&Status::cancelled("by the server")));
     }
 
     #[test]

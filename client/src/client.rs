@@ -1,13 +1,13 @@
 use std::time::Duration;
 
 use grasp::Volume;
-use grasp_proto::pb;
 use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::grasp_service_client::GraspServiceClient;
 use grasp_proto::pb::recording::{Answer, Request};
+use grasp_proto::{FieldError, pb};
 use nalgebra::Isometry3;
 use tokio::sync::mpsc;
-use tokio::time::{Instant, sleep, timeout_at};
+use tokio::time::{Instant, sleep, timeout, timeout_at};
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_stream::{Stream, StreamExt};
 use tonic::service::interceptor::InterceptedService;
@@ -17,11 +17,22 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
-use crate::access::{Bearer, is_transient};
-use crate::{Access, CloudView, DepthView, Detection, Error, Observation, Options, Retry, Scores, Workspace};
+use crate::access::{Bearer, has_timed_out, is_transient};
+use crate::{
+    Access, AnyView, Candidate, CloudView, DepthView, Detection, Error, Observation, Options, Retry, Scores, Workspace,
+};
 
 /// Flow-control window, bytes. HTTP/2's default of 64 KiB stalls concurrent large replies.
 const WINDOW: u32 = 4 << 20;
+
+/// Time limit of a connection attempt, and of its TLS handshake. By default a host that does not answer blocks for
+/// minutes.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Interval of the pings during calls, and the time within which the server must answer one. They detect a server that
+/// disappears without closing the connection. The Python client has the same values.
+const KEEPALIVE: Duration = Duration::from_secs(30);
+const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Polling interval of `wait_ready`.
 const POLL: Duration = Duration::from_millis(50);
@@ -32,6 +43,8 @@ pub struct Client {
     channel: Channel,
     bearer: Bearer,
     retry: Retry,
+    /// Time limit of calls whose options have none.
+    timeout: Option<Duration>,
 }
 
 /// The server's health status.
@@ -52,7 +65,7 @@ impl Client {
         Self::connect_with(address, Access::default()).await
     }
 
-    /// Connects with TLS, a token or retries.
+    /// Connects with TLS, a token, retries or a time limit of the calls.
     ///
     /// # Errors
     /// [`Error::Connect`] when the server cannot be reached or the TLS handshake fails.
@@ -68,12 +81,19 @@ impl Client {
         let connect = async || {
             let mut endpoint = Endpoint::from_shared(uri)?;
             if let Some(tls) = tls {
-                endpoint = endpoint.tls_config(tls)?;
+                endpoint = endpoint.tls_config(tls.timeout(CONNECT_TIMEOUT))?;
             }
-            endpoint.initial_stream_window_size(WINDOW).initial_connection_window_size(WINDOW).connect().await
+            endpoint
+                .initial_stream_window_size(WINDOW)
+                .initial_connection_window_size(WINDOW)
+                .connect_timeout(CONNECT_TIMEOUT)
+                .http2_keep_alive_interval(KEEPALIVE)
+                .keep_alive_timeout(KEEPALIVE_TIMEOUT)
+                .connect()
+                .await
         };
         let channel = connect().await.map_err(|source| Error::Connect { address, source })?;
-        Ok(Self { channel, bearer: Bearer(access.token), retry: access.retry })
+        Ok(Self { channel, bearer: Bearer(access.token), retry: access.retry, timeout: access.timeout })
     }
 
     /// Connects to a server that may still be starting, and returns when it is ready.
@@ -81,11 +101,19 @@ impl Client {
     /// # Errors
     /// [`Error::NotReady`] with the last failure, if the server is not ready within `timeout`.
     pub async fn wait_ready(address: impl Into<String>, timeout: Duration) -> Result<Self, Error> {
+        Self::wait_ready_with(address, Access::default(), timeout).await
+    }
+
+    /// Like [`wait_ready`](Self::wait_ready), with TLS, a token, retries or a time limit of the calls.
+    ///
+    /// # Errors
+    /// [`Error::NotReady`] with the last failure, if the server is not ready within `timeout`.
+    pub async fn wait_ready_with(address: impl Into<String>, access: Access, timeout: Duration) -> Result<Self, Error> {
         let address = address.into();
         let deadline = Instant::now() + timeout;
         loop {
             let attempt = async {
-                let client = Self::connect(address.clone()).await?;
+                let client = Self::connect_with(address.clone(), access.clone()).await?;
                 Ok::<_, Error>((client.health().await?, client))
             };
             let last = match timeout_at(deadline, attempt).await {
@@ -162,7 +190,8 @@ impl Client {
     }
 
     /// Scores the caller's grasps in an observation: `candidates` are `T_frame_grasp`, in the convention of the options.
-    /// Transient failures are retried according to [`Retry`].
+    /// Their widths are unknown; [`score_candidates`](Self::score_candidates) takes widths, too. Transient failures are
+    /// retried according to [`Retry`].
     ///
     /// # Errors
     /// [`Error::Refused`] with the status of the last attempt.
@@ -170,6 +199,21 @@ impl Client {
         &self,
         observation: Observation<'_>,
         candidates: &[Isometry3<f64>],
+        options: Options,
+    ) -> Result<Scores, Error> {
+        let candidates: Vec<Candidate> = candidates.iter().copied().map(Candidate::from).collect();
+        self.score_candidates(observation, &candidates, options).await
+    }
+
+    /// Scores the caller's grasps in an observation. With a width the server also checks it against the opening of the
+    /// hand. Transient failures are retried according to [`Retry`].
+    ///
+    /// # Errors
+    /// [`Error::Refused`] with the status of the last attempt.
+    pub async fn score_candidates(
+        &self,
+        observation: Observation<'_>,
+        candidates: &[Candidate],
         options: Options,
     ) -> Result<Scores, Error> {
         let timeout = options.timeout;
@@ -180,6 +224,32 @@ impl Client {
             async |(mut grasps, request)| grasps.score_grasps(request).await,
         );
         Ok(response.await?.into())
+    }
+
+    /// Finds the table in a view, and the workspace over what stands on it. Of `workspace` only the size, the extent and
+    /// the gravity of `find_table` are used; of `options` only `request_id`, `frame_id`, `stamp` and `timeout`.
+    /// `table_height` is the height of the table above the bottom of the workspace, metres, from 0 to 0.3; `None`: 0.05.
+    /// A depth image needs [`Extrinsics::FrameFromCamera`](crate::Extrinsics::FrameFromCamera). Transient failures are
+    /// retried according to [`Retry`].
+    ///
+    /// # Errors
+    /// [`Error::Refused`] with the status of the last attempt, also if the view shows no table; [`Error::Reply`] for an
+    /// invalid reply.
+    pub async fn find_table(
+        &self,
+        view: AnyView<'_>,
+        workspace: &Workspace,
+        table_height: Option<f64>,
+        options: Options,
+    ) -> Result<pb::FoundTable, Error> {
+        let timeout = options.timeout;
+        let message = options.table_request(view, workspace, table_height);
+        let response = self.call(
+            timeout,
+            || (self.grasps(), message.clone()),
+            async |(mut grasps, request)| grasps.find_table(request).await,
+        );
+        response.await?.table.ok_or_else(|| FieldError::new("table", "absent", "must be given").into())
     }
 
     /// Sends a recorded request again. `model` replaces its model; the version is dropped with it.
@@ -265,43 +335,61 @@ impl Client {
         Ok(responses.map(|response| outcome(response?)))
     }
 
-    /// The models that the server serves; the default model is first.
+    /// The models that the server serves; the default model is first. Transient failures are retried according to
+    /// [`Retry`].
     ///
     /// # Errors
-    /// [`Error::Refused`] with the server's status.
+    /// [`Error::Refused`] with the status of the last attempt.
     pub async fn list_models(&self) -> Result<Vec<pb::Model>, Error> {
-        Ok(self.grasps().list_models(pb::ListModelsRequest {}).await?.into_inner().models)
+        let response = self.call(
+            None,
+            || (self.grasps(), pb::ListModelsRequest {}),
+            async |(mut grasps, request)| grasps.list_models(request).await,
+        );
+        Ok(response.await?.models)
     }
 
-    /// The server's health.
+    /// The server's health. Transient failures are retried according to [`Retry`].
     ///
     /// # Errors
-    /// [`Error::Refused`] with the server's status.
+    /// [`Error::Refused`] with the status of the last attempt.
     pub async fn health(&self) -> Result<Health, Error> {
-        let response = HealthClient::new(self.channel.clone()).check(HealthCheckRequest::default()).await?;
-        Ok(match response.into_inner().status() {
+        let response = self.call(
+            None,
+            || (HealthClient::new(self.channel.clone()), HealthCheckRequest::default()),
+            async |(mut health, request)| health.check(request).await,
+        );
+        Ok(match response.await?.status() {
             ServingStatus::Serving => Health::Serving,
             ServingStatus::NotServing | ServingStatus::Unknown | ServingStatus::ServiceUnknown => Health::NotServing,
         })
     }
 
-    /// Calls the server and retries according to [`Retry`].
+    /// Calls the server and retries according to [`Retry`]. Without a `limit` that of the connection applies.
     async fn call<S, M, R>(
         &self,
-        timeout: Option<Duration>,
+        limit: Option<Duration>,
         message: impl Fn() -> (S, M),
         call: impl AsyncFn((S, tonic::Request<M>)) -> Result<tonic::Response<R>, Status>,
     ) -> Result<R, Error> {
+        let limit = limit.or(self.timeout);
         let mut attempts = 0;
         loop {
             let (service, message) = message();
             let mut request = tonic::Request::new(message);
-            if let Some(timeout) = timeout {
-                request.set_timeout(timeout);
+            if let Some(limit) = limit {
+                request.set_timeout(limit);
             }
-            let status = match call((service, request)).await {
-                Ok(response) => return Ok(response.into_inner()),
-                Err(status) => status,
+            let answer = call((service, request));
+            let outcome = match limit {
+                // tonic's own limit does not include the time that it takes to connect again.
+                Some(limit) => timeout(limit, answer).await.unwrap_or_else(|_| Err(expired(limit))),
+                None => answer.await,
+            };
+            let status = match (outcome, limit) {
+                (Ok(response), _) => return Ok(response.into_inner()),
+                (Err(status), Some(limit)) if has_timed_out(&status) => expired(limit),
+                (Err(status), _) => status,
             };
             attempts += 1;
             let is_transient = is_transient(&status);
@@ -355,6 +443,11 @@ impl Tracking {
     }
 }
 
+/// The status of an attempt whose time limit has passed. It has no source, so that it is not retried.
+fn expired(limit: Duration) -> Status {
+    Status::deadline_exceeded(format!("no reply within {limit:?}; raise the time limit, or check the server's load"))
+}
+
 /// The options of a request, which are created if they are absent.
 fn options_of(request: &mut Request) -> &mut pb::Options {
     let options = match request {
@@ -367,14 +460,11 @@ fn options_of(request: &mut Request) -> &mut pb::Options {
 }
 
 fn outcome(response: pb::DetectGraspsStreamResponse) -> Result<Detection, Error> {
-    match response.outcome {
-        Some(Outcome::Response(response)) => response.try_into(),
-        Some(Outcome::Error(error)) => Err(error.into()),
-        None => Err(Error::Refused {
-            code: Code::Internal,
-            message: "the server's reply has neither `response` nor `error`".to_owned(),
-            retry_after: None,
-            field: None,
-        }),
-    }
+    let pb::DetectGraspsStreamResponse { request_id, outcome } = response;
+    let error: Error = match outcome {
+        Some(Outcome::Response(response)) => return response.try_into(),
+        Some(Outcome::Error(error)) => error.into(),
+        None => Status::internal("the server's reply has neither `response` nor `error`").into(),
+    };
+    Err(error.of_request(request_id))
 }

@@ -1,7 +1,7 @@
 use std::time::{Duration, SystemTime};
 
 use grasp::{Grasp, Volume};
-use grasp_proto::{encode, grey_png, pb};
+use grasp_proto::{FieldError, encode, grey_png, pb};
 use nalgebra::Isometry3;
 
 use crate::Error;
@@ -19,7 +19,8 @@ pub struct Options {
     pub stamp: Option<SystemTime>,
     /// Encoding of a volume's values on the wire: F32 (also when unspecified), F16 or U8.
     pub dtype: pb::DataType,
-    /// Time limit of each attempt. It is sent to the server as the deadline.
+    /// Time limit of each attempt. It is sent to the server as the deadline. `None`: that of the connection
+    /// ([`Access::timeout`](crate::Access::timeout)).
     pub timeout: Option<Duration>,
 }
 
@@ -74,6 +75,15 @@ pub struct CloudView {
     pub labels: Option<Vec<u16>>,
 }
 
+/// One view.
+#[derive(Clone, Copy, Debug)]
+pub enum AnyView<'a> {
+    /// A depth image.
+    Depth(&'a DepthView),
+    /// A point cloud.
+    Cloud(&'a CloudView),
+}
+
 /// An observation of a scene.
 #[derive(Clone, Copy, Debug)]
 pub enum Observation<'a> {
@@ -83,6 +93,22 @@ pub enum Observation<'a> {
     Depth(&'a [DepthView], &'a Workspace),
     /// Point clouds, which the server fuses into the workspace.
     Clouds(&'a [CloudView], &'a Workspace),
+}
+
+/// A grasp of the caller, to be scored.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Candidate {
+    /// `T_frame_grasp`, in the convention of the request.
+    pub pose: Isometry3<f64>,
+    /// Opening between the fingers when the object is held, metres. `None`: unknown.
+    pub width: Option<f64>,
+}
+
+impl From<Isometry3<f64>> for Candidate {
+    /// A candidate of unknown width.
+    fn from(pose: Isometry3<f64>) -> Self {
+        Self { pose, width: None }
+    }
 }
 
 /// The cube that views are fused into and in which grasps are detected, or the part of a table that is covered with such
@@ -164,6 +190,10 @@ pub struct Proposal {
 pub struct Scores {
     /// The id of the request.
     pub request_id: String,
+    /// Name of the frame of the candidates.
+    pub frame_id: String,
+    /// Time of the observation, as sent.
+    pub stamp: Option<SystemTime>,
     /// One score for each candidate, in their order.
     pub scores: Vec<pb::Score>,
     /// Name of the model.
@@ -184,6 +214,8 @@ impl From<pb::ScoreGraspsResponse> for Scores {
     fn from(response: pb::ScoreGraspsResponse) -> Self {
         Self {
             request_id: response.request_id,
+            frame_id: response.frame_id,
+            stamp: response.stamp.and_then(system_time),
             scores: response.scores,
             model: response.model,
             version: response.version,
@@ -206,11 +238,13 @@ impl TryFrom<&pb::Grasp> for Proposal {
 
     fn try_from(message: &pb::Grasp) -> Result<Self, Error> {
         let Grasp { pose, width, quality } = message.try_into()?;
-        let optional = |pose: &Option<pb::Pose>, field| {
-            pose.as_ref().map(|pose| grasp_proto::pose(pose, field)).transpose().map(Option::unwrap_or_default)
+        // Not the identity: a robot would move there.
+        let required = |pose: &Option<pb::Pose>, field: &'static str| {
+            let pose = pose.as_ref().ok_or_else(|| FieldError::new(field, "absent", "must be given"))?;
+            grasp_proto::pose(pose, field)
         };
-        let pregrasp = optional(&message.pregrasp, "grasps.pregrasp")?;
-        let retreat = optional(&message.retreat, "grasps.retreat")?;
+        let pregrasp = required(&message.pregrasp, "grasps.pregrasp")?;
+        let retreat = required(&message.retreat, "grasps.retreat")?;
         let pb::Grasp { collides, object, open_width, .. } = *message;
         Ok(Self { pose, width, quality, pregrasp, retreat, collides, object, open_width })
     }
@@ -244,10 +278,11 @@ impl Options {
     pub(crate) fn score_request(
         self,
         observation: Observation<'_>,
-        candidates: &[Isometry3<f64>],
+        candidates: &[Candidate],
     ) -> pb::ScoreGraspsRequest {
         use pb::score_grasps_request::Scene;
-        let candidate = |pose: &Isometry3<f64>| pb::Candidate { pose: Some(pose.into()), width: None };
+        let candidate =
+            |Candidate { pose, width }: &Candidate| pb::Candidate { pose: Some(pose.into()), width: *width };
         let workspace = |workspace: &Workspace| Some(workspace.message(self.frame_id.clone(), self.stamp));
         let scene = match observation {
             Observation::Volume(volume) => {
@@ -269,6 +304,27 @@ impl Options {
             candidates: candidates.iter().map(candidate).collect(),
             scene: Some(scene),
             options: Some(self.detect),
+        }
+    }
+
+    pub(crate) fn table_request(
+        self,
+        view: AnyView<'_>,
+        workspace: &Workspace,
+        table_height: Option<f64>,
+    ) -> pb::FindTableRequest {
+        use pb::find_table_request::Observation as Message;
+        // The server refuses a pose and a correction of depths here.
+        let find_table = Some(workspace.find_table.unwrap_or_default());
+        let workspace = Workspace { find_table, correct_depth_scale: false, ..*workspace };
+        pb::FindTableRequest {
+            observation: Some(match view {
+                AnyView::Depth(view) => Message::View(view.into()),
+                AnyView::Cloud(view) => Message::Cloud(view.into()),
+            }),
+            workspace: Some(workspace.message(self.frame_id, self.stamp)),
+            table_height,
+            request_id: self.request_id,
         }
     }
 
@@ -359,8 +415,7 @@ impl TryFrom<pb::DetectGraspsResponse> for Detection {
             grasps: response.grasps.iter().map(Proposal::try_from).collect::<Result<_, _>>()?,
             request_id: response.request_id,
             frame_id: response.frame_id,
-            // A stamp that `SystemTime` cannot represent was not sent by this client.
-            stamp: response.stamp.and_then(|stamp| stamp.try_into().ok()),
+            stamp: response.stamp.and_then(system_time),
             model: response.model,
             version: response.version,
             latency: response.latency.unwrap_or_default(),
@@ -369,5 +424,65 @@ impl TryFrom<pb::DetectGraspsResponse> for Detection {
             table: response.table,
             depth_factors: response.depth_factors,
         })
+    }
+}
+
+/// The time of a reply. A stamp that `SystemTime` cannot represent was not sent by this client.
+fn system_time(stamp: impl TryInto<SystemTime>) -> Option<SystemTime> {
+    stamp.try_into().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_reply_without_a_pre_grasp_or_a_retreat_is_an_error() {
+        let pose = Some(pb::Pose::from(&Isometry3::translation(0.1, 0.2, 0.3)));
+        let whole = pb::Grasp { pose, pregrasp: pose, retreat: pose, ..Default::default() };
+        assert!(Proposal::try_from(&whole).is_ok());
+        for (message, field) in [
+            (pb::Grasp { pregrasp: None, ..whole }, "grasps.pregrasp is absent"),
+            (pb::Grasp { retreat: None, ..whole }, "grasps.retreat is absent"),
+        ] {
+            let error = Proposal::try_from(&message).unwrap_err();
+            assert!(matches!(error, Error::Reply(_)) && error.to_string().contains(field), "{error}");
+        }
+    }
+
+    #[test]
+    fn candidates_are_sent_with_their_widths() {
+        let pose = Isometry3::translation(0.1, 0.2, 0.3);
+        let candidates = [Candidate::from(pose), Candidate { pose, width: Some(0.04) }];
+        let workspace = Workspace::default();
+        let request = Options::default().score_request(Observation::Depth(&[], &workspace), &candidates);
+        assert_eq!(request.candidates.iter().map(|candidate| candidate.width).collect::<Vec<_>>(), [None, Some(0.04)]);
+    }
+
+    #[test]
+    fn scores_have_the_frame_and_the_time_of_the_observation() {
+        let stamp = SystemTime::UNIX_EPOCH + Duration::from_millis(1500);
+        let frame_id = "base".to_owned();
+        let scores =
+            Scores::from(pb::ScoreGraspsResponse { frame_id, stamp: Some(stamp.into()), ..Default::default() });
+        assert_eq!((scores.frame_id.as_str(), scores.stamp), ("base", Some(stamp)));
+    }
+
+    #[test]
+    fn a_request_for_the_table_has_no_pose() {
+        let cloud = CloudView {
+            points: vec![[0.0, 0.0, 0.5]],
+            frame_from_cloud: Isometry3::identity(),
+            camera_position: [0.0; 3],
+            labels: None,
+        };
+        let workspace = Workspace { extent: Some([0.9, 0.6]), correct_depth_scale: true, ..Workspace::default() };
+        let options = Options { request_id: "shelf 7".to_owned(), frame_id: "base".to_owned(), ..Options::default() };
+        let request = options.table_request(AnyView::Cloud(&cloud), &workspace, Some(0.1));
+        assert_eq!((request.request_id.as_str(), request.table_height), ("shelf 7", Some(0.1)));
+        assert!(matches!(request.observation, Some(pb::find_table_request::Observation::Cloud(_))));
+        let workspace = request.workspace.unwrap();
+        assert!(workspace.find_table && workspace.pose.is_none() && !workspace.correct_depth_scale);
+        assert_eq!((workspace.frame_id.as_str(), workspace.extent), ("base", Some(pb::Extent { x: 0.9, y: 0.6 })));
     }
 }

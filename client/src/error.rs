@@ -37,6 +37,8 @@ pub enum Error {
         retry_after: Option<Duration>,
         /// Path of the invalid field of the request, such as `volume.voxel_size`, if the request is invalid.
         field: Option<String>,
+        /// Id of the request in the server's log. `None` if the request did not reach the server.
+        request_id: Option<String>,
     },
     /// The server's reply violates the protocol.
     #[error("invalid reply from the server: {0}; check that client and server have the same version")]
@@ -70,6 +72,23 @@ impl Error {
             Self::Connect { .. } | Self::NotReady { .. } | Self::Reply(_) => None,
         }
     }
+
+    /// Id of the request in the server's log, if the server refused it.
+    #[must_use]
+    pub fn request_id(&self) -> Option<&str> {
+        match self {
+            Self::Refused { request_id, .. } => request_id.as_deref(),
+            Self::Connect { .. } | Self::NotReady { .. } | Self::Reply(_) => None,
+        }
+    }
+
+    /// The same error with the id of the request. In a stream the reply contains it, not its error.
+    pub(crate) fn of_request(mut self, id: String) -> Self {
+        if let Self::Refused { request_id, .. } = &mut self {
+            *request_id = Some(id).filter(|id| !id.is_empty());
+        }
+        self
+    }
 }
 
 impl From<Status> for Error {
@@ -78,11 +97,13 @@ impl From<Status> for Error {
         let milliseconds = milliseconds.and_then(|value| value.to_str().ok()?.parse().ok());
         let violation =
             status.get_details_bad_request().and_then(|request| request.field_violations.into_iter().next());
+        let request_id = status.get_details_request_info().map(|info| info.request_id);
         Self::Refused {
             code: status.code(),
             message: status.message().to_owned(),
             retry_after: milliseconds.map(Duration::from_millis),
             field: violation.map(|violation| violation.field),
+            request_id: request_id.filter(|id| !id.is_empty()),
         }
     }
 }
@@ -94,6 +115,7 @@ impl From<pb::Error> for Error {
             message: error.message,
             retry_after: error.retry_after.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok()),
             field: Some(error.field).filter(|field| !field.is_empty()),
+            request_id: None,
         }
     }
 }
@@ -118,5 +140,17 @@ mod tests {
         let from_stream = |field: &str| Error::from(pb::Error { field: field.to_owned(), ..pb::Error::default() });
         assert_eq!(from_stream("volume.data").field(), Some("volume.data"));
         assert_eq!(from_stream("").field(), None);
+    }
+
+    #[test]
+    fn the_request_id_is_read_from_a_status_and_set_for_a_stream_reply() {
+        let mut details = ErrorDetails::new();
+        details.set_request_info("shelf 7", "");
+        let status = Status::with_error_details(Code::Internal, "the model failed", details);
+        assert_eq!(Error::from(status).request_id(), Some("shelf 7"));
+        assert_eq!(Error::from(Status::unavailable("connection refused")).request_id(), None);
+        let from_stream = |id: &str| Error::from(pb::Error::default()).of_request(id.to_owned());
+        assert_eq!(from_stream("shelf 7").request_id(), Some("shelf 7"));
+        assert_eq!(from_stream("").request_id(), None);
     }
 }

@@ -41,7 +41,8 @@ mod local;
 pub use access::{Access, Retry, Token};
 pub use client::{Client, Health, Tracking};
 pub use detection::{
-    CloudView, Depth, DepthView, Detection, Extrinsics, FindTable, Observation, Options, Proposal, Scores, Workspace,
+    AnyView, Candidate, CloudView, Depth, DepthView, Detection, Extrinsics, FindTable, Observation, Options, Proposal,
+    Scores, Workspace,
 };
 pub use error::Error;
 pub use grasp_proto::pb::{

@@ -79,7 +79,7 @@ impl Report {
 /// Runs `call` repeatedly and reports the latencies. Its argument is the index of the call, from 0.
 ///
 /// # Panics
-/// If a call panics.
+/// If a call panics, or if a rate is so small that a pause between two calls does not fit a [`Duration`].
 pub async fn load<C, F>(arrivals: Arrivals, until: Until, call: C) -> Report
 where
     C: Fn(usize) -> F + Send + Sync + 'static,

@@ -19,13 +19,14 @@ from graspd.errors import (
     Unavailable,
 )
 from graspd.geometry import Pose
-from graspd.options import Box, CollisionCheck, Cone, Convention, Gripper, Options, Retreat
+from graspd.options import Box, Candidate, CollisionCheck, Cone, Convention, Gripper, Options, Retreat
 from graspd.retry import Retry
 from graspd.seen import CloudView, DepthView, Volume, Workspace
 
 __all__ = [
     "Aborted",
     "Box",
+    "Candidate",
     "Client",
     "CloudView",
     "CollisionCheck",

@@ -18,7 +18,7 @@ from graspd.detection import Detection, FoundTable, Model, Scores
 from graspd.errors import Error, from_status
 from graspd.geometry import PoseLike
 from graspd.methods import Answer, Method, Request, Response
-from graspd.options import Options
+from graspd.options import Candidate, Options
 from graspd.seen import CloudView, DepthView, Volume, Workspace
 from graspd.streams import Adding, Detecting
 
@@ -103,14 +103,15 @@ class Client(Connection[grpc.Channel]):
     def score(
         self,
         observation: wire.Observation,
-        grasps: Iterable[PoseLike],
+        grasps: Iterable[PoseLike | Candidate],
         workspace: Workspace = Workspace(),
         options: Options | None = None,
         *,
         request_id: str = "",
     ) -> Scores:
         """Scores the caller's grasps in a volume, depth images or point clouds. `grasps` are ``T_frame_grasp``, in the
-        convention of the options, 1 to 1024. `workspace` is that of the images or points."""
+        convention of the options, 1 to 1024; a `Candidate` also has a width. `workspace` is that of the images or
+        points."""
         return self._call(
             methods.SCORE, wire.score_request(observation, grasps, workspace, options, request_id)
         )

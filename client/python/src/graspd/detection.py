@@ -43,7 +43,8 @@ class Score:
     """Predicted probability of success, in [0, 1]; 0 outside the volume. A model with an evaluator predicts it for the
     pose, a network alone for the best rotation at the position."""
     violations: tuple[str, ...]
-    """Why it would not be among the detected grasps: QUALITY, WIDTH, REGION, APPROACH, HEIGHT, OBJECT, COLLISION."""
+    """Why it would not be among the detected grasps: QUALITY, WIDTH, REGION, APPROACH, HEIGHT, OBJECT, COLLISION; the
+    number of a reason that only a newer server knows."""
     object: int | None
     """Label of the object between the fingers, for views with `labels`; None: no object."""
     open_width: float | None
@@ -103,7 +104,8 @@ class GeometryWarning:
     detected all the same."""
 
     code: str
-    """One of NO_TABLE, TABLE_TILTED, TABLE_HEIGHT, MOSTLY_UNSEEN, VIEWS_DISAGREE, CAMERA_DISTANCE and CAMERA_ANGLE."""
+    """One of NO_TABLE, TABLE_TILTED, TABLE_HEIGHT, MOSTLY_UNSEEN, VIEWS_DISAGREE, CAMERA_DISTANCE, CAMERA_ANGLE and
+    DEPTH_SCALE; the number of a code that only a newer server knows."""
     message: str
     """What was found, and what to check."""
     figures: Mapping[str, float]

@@ -86,6 +86,16 @@ class Retreat:
 
 
 @dataclass(frozen=True)
+class Candidate:
+    """A grasp of the caller, to be scored."""
+
+    pose: PoseLike
+    """``T_frame_grasp``, in the convention of the options."""
+    width: float | None = None
+    """Opening between the fingers when the object is held, metres; None: unknown."""
+
+
+@dataclass(frozen=True)
 class Options:
     """Options of a detection. The default uses the server's defaults."""
 

@@ -17,7 +17,7 @@ from graspd import errors
 from graspd import grasp_pb2 as pb
 from graspd.detection import Detection, Dropped, FoundTable, GeometryWarning, Grasp, Latency, Model, Score, Scores
 from graspd.geometry import Pose, PoseLike, Vector
-from graspd.options import Box, CollisionCheck, Cone, Convention, Gripper, Options, Retreat
+from graspd.options import Box, Candidate, CollisionCheck, Cone, Convention, Gripper, Options, Retreat
 from graspd.seen import CloudView, DepthView, Volume, Workspace
 
 Observation: TypeAlias = Volume | NDArray[Any] | DepthView | CloudView | Iterable[DepthView | CloudView]
@@ -78,14 +78,14 @@ def cloud_request(
 
 def score_request(
     observation: Observation,
-    grasps: Iterable[PoseLike],
+    grasps: Iterable[PoseLike | Candidate],
     workspace: Workspace,
     options: Options | None,
     request_id: str,
 ) -> pb.ScoreGraspsRequest:
     request = pb.ScoreGraspsRequest(
         request_id=request_id,
-        candidates=[pb.Candidate(pose=pose_message(grasp)) for grasp in grasps],
+        candidates=map(candidate_message, grasps),
         options=given(options_message, options),
     )
     if isinstance(observation, (Volume, np.ndarray)):
@@ -103,6 +103,12 @@ def score_request(
         of_images = pb.DepthViews(views=map(depth_message, images), workspace=workspace_message(workspace))
         request.depth.CopyFrom(of_images)
     return request
+
+
+def candidate_message(candidate: PoseLike | Candidate) -> pb.Candidate:
+    if not isinstance(candidate, Candidate):
+        candidate = Candidate(candidate)
+    return pb.Candidate(pose=pose_message(candidate.pose), width=candidate.width)
 
 
 def track_request(
@@ -371,13 +377,21 @@ def scores(message: pb.ScoreGraspsResponse) -> Scores:
 
 
 def score(message: pb.Score) -> Score:
-    names = map(pb.Score.Violation.Name, message.violations)
+    names = (enum_name(pb.Score.Violation.Name, violation) for violation in message.violations)
     return Score(
         quality=message.quality,
         violations=tuple(name.removeprefix("VIOLATION_") for name in names),
         object=message.object if message.HasField("object") else None,
         open_width=message.open_width if message.HasField("open_width") else None,
     )
+
+
+def enum_name(name: Callable[[Any], str], number: int) -> str:
+    """The name of an enum's value; the number if a newer server has sent a value that this client does not know."""
+    try:
+        return name(number)
+    except ValueError:
+        return str(number)
 
 
 def found_table(message: pb.FindTableResponse) -> FoundTable:
@@ -396,7 +410,7 @@ def table(message: pb.FoundTable) -> FoundTable:
 
 
 def warning(message: pb.GeometryWarning) -> GeometryWarning:
-    code = pb.GeometryWarning.Code.Name(message.code).removeprefix("CODE_")
+    code = enum_name(pb.GeometryWarning.Code.Name, message.code).removeprefix("CODE_")
     if code not in logged:
         logged.add(code)
         logger.warning("%s (logged once; see Detection.warnings)", message.message)

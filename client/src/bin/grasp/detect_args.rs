@@ -8,7 +8,7 @@ use crate::pose::Poses;
 /// Options of the detection.
 #[derive(Args, Clone)]
 pub(crate) struct DetectArgs {
-    /// Model: a network's name, `gpd` or `shaf`. Default: the server's default model.
+    /// Model, one of `grasp models`. Default: the server's default model.
     #[arg(long, default_value = "", hide_default_value = true)]
     model: String,
 
@@ -86,7 +86,7 @@ pub(crate) struct DetectArgs {
     #[arg(long)]
     hidden: bool,
 
-    /// Height of the table above the bottom of the workspace, metres.
+    /// Height of the table above the bottom of the workspace, metres; negative: no table. Default: 0.05.
     #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
     table_height: Option<f64>,
 

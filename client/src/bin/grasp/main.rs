@@ -77,6 +77,17 @@ struct AccessArgs {
     /// File with the bearer token, for servers that require one.
     #[arg(long, global = true, help_heading = "Connection", env = "GRASPD_TOKEN_FILE", value_name = "FILE")]
     token_file: Option<PathBuf>,
+
+    /// Time limit of each attempt of a request, seconds. It is sent to the server as the deadline.
+    #[arg(
+        long,
+        global = true,
+        help_heading = "Connection",
+        value_name = "SECONDS",
+        default_value_t = 10.0,
+        value_parser = positive
+    )]
+    timeout: f64,
 }
 
 #[derive(Subcommand)]
@@ -177,7 +188,7 @@ struct Bench {
     callers: u16,
 
     /// Open loop: Poisson arrivals at this rate, requests per second, independent of the response times.
-    #[arg(long, value_name = "PER_SECOND", value_parser = positive)]
+    #[arg(long, value_name = "PER_SECOND", value_parser = per_second)]
     rate: Option<f64>,
 
     /// Duration, seconds.
@@ -188,6 +199,12 @@ struct Bench {
 fn positive(text: &str) -> Result<f64, String> {
     let number = text.parse().ok().filter(|number: &f64| *number > 0.0 && *number <= 1e6);
     number.ok_or_else(|| "must be a number greater than 0 and at most 1000000".to_owned())
+}
+
+/// A rate of the load generator, whose pauses must fit a `Duration`.
+fn per_second(text: &str) -> Result<f64, String> {
+    let number = text.parse().ok().filter(|number: &f64| (1e-3..=1e6).contains(number));
+    number.ok_or_else(|| "must be a number from 0.001 to 1000000".to_owned())
 }
 
 impl AccessArgs {
@@ -206,6 +223,7 @@ impl AccessArgs {
                 .transpose()
                 .map_err(|reason| anyhow!("--token-file: {reason}"))?,
             retry: Retry::RECOMMENDED,
+            timeout: Some(Duration::from_secs_f64(self.timeout)),
         })
     }
 }

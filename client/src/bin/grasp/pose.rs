@@ -5,12 +5,15 @@ use std::io::BufReader;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, anyhow, bail, ensure};
 use nalgebra::{Isometry3, Matrix3, Matrix4, Quaternion, Rotation3, Translation3, UnitQuaternion, Vector3};
 use serde_json::Value;
 
 use crate::files::{self, has_extension, in_file};
 use crate::numbers::Numbers;
+
+/// Largest deviation of the norm of a quaternion from 1, as in the server.
+const UNIT_TOLERANCE: f64 = 1e-3;
 
 /// Poses as given on the command line: the numbers of one pose, or a file.
 #[derive(Clone, Debug)]
@@ -25,8 +28,7 @@ impl FromStr for Poses {
     /// X,Y,Z or X,Y,Z,QX,QY,QZ,QW; anything else is a file.
     fn from_str(text: &str) -> Result<Self, String> {
         let pose = |position: [f64; 3], [x, y, z, w]: [f64; 4]| {
-            let rotation = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-6);
-            let rotation = rotation.ok_or("the norm of the quaternion is 0; it must be 1")?;
+            let rotation = unit(Quaternion::new(w, x, y, z))?;
             Ok(Self::Numbers(Isometry3::from_parts(Translation3::from(Vector3::from(position)), rotation)))
         };
         if let Ok(Numbers(position)) = text.parse::<Numbers<3>>() {
@@ -111,6 +113,17 @@ pub(crate) fn intrinsics_file(text: &str) -> Option<PathBuf> {
     (!is_numbers).then(|| PathBuf::from(text))
 }
 
+/// The rotation of a quaternion, with the server's check of its norm.
+fn unit(quaternion: Quaternion<f64>) -> Result<UnitQuaternion<f64>, String> {
+    let norm = quaternion.norm();
+    // Written so that NaN fails.
+    if (norm - 1.0).abs() <= UNIT_TOLERANCE {
+        Ok(UnitQuaternion::new_normalize(quaternion))
+    } else {
+        Err(format!("the norm of the quaternion is {norm}; it must be 1 ± {UNIT_TOLERANCE}"))
+    }
+}
+
 /// The numbers of a .npy file.
 fn numbers(path: &Path) -> anyhow::Result<Vec<f64>> {
     files::floats(files::array(path, "")?)
@@ -152,6 +165,11 @@ fn intrinsic_numbers(text: &str) -> anyhow::Result<Vec<f64>> {
     if let Some(columns) = value.get("intrinsic").unwrap_or(&value).get("intrinsic_matrix") {
         // Column by column.
         let numbers = flat(columns);
+        ensure!(
+            numbers.len() == 9,
+            "{} numbers in `intrinsic_matrix`; it must have nine, column by column",
+            numbers.len()
+        );
         return Ok((0..numbers.len()).map(|i| numbers[i % 3 * 3 + i / 3]).collect());
     }
     let number = |names: [&str; 2]| names.iter().find_map(|name| value.get(name)?.as_f64());
@@ -174,12 +192,13 @@ fn poses(path: &Path) -> anyhow::Result<Vec<Isometry3<f64>>> {
 
 fn named(value: &Value) -> anyhow::Result<Isometry3<f64>> {
     let part = |key: &str| value.get(key).map(flat).unwrap_or_default();
-    let (position, orientation) = (part("position"), part("orientation"));
+    // `grasp detect --json` writes `orientation_xyzw`.
+    let key = if value.get("orientation").is_some() { "orientation" } else { "orientation_xyzw" };
+    let (position, orientation) = (part("position"), part(key));
     let (&[x, y, z], &[qx, qy, qz, qw]) = (&position[..], &orientation[..]) else {
-        bail!("a pose must have `position` (x, y, z) and `orientation` (quaternion x, y, z, w)")
+        bail!("a pose must have `position` (x, y, z) and `orientation` or `orientation_xyzw` (quaternion x, y, z, w)")
     };
-    let rotation = UnitQuaternion::try_new(Quaternion::new(qw, qx, qy, qz), 1e-6);
-    let rotation = rotation.context("the norm of `orientation` is 0; it must be a unit quaternion")?;
+    let rotation = unit(Quaternion::new(qw, qx, qy, qz)).map_err(|reason| anyhow!("`{key}`: {reason}"))?;
     Ok(Isometry3::from_parts(Translation3::new(x, y, z), rotation))
 }
 
@@ -195,7 +214,8 @@ fn matrices(numbers: &[f64]) -> anyhow::Result<Vec<Isometry3<f64>>> {
         let orthonormal = (rotation * rotation.transpose() - Matrix3::identity()).norm() < 1e-3;
         ensure!(
             orthonormal && rotation.determinant() > 0.0 && numbers[12..] == [0.0, 0.0, 0.0, 1.0],
-            "invalid pose matrix: the upper left 3×3 block must be a rotation, the last row 0 0 0 1"
+            "invalid pose matrix: the upper left 3×3 block must be a rotation, the last row 0 0 0 1; got {:?}",
+            numbers.chunks(4).collect::<Vec<_>>()
         );
         let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&rotation));
         Ok(Isometry3::from_parts(Translation3::new(numbers[3], numbers[7], numbers[11]), rotation))
@@ -229,6 +249,8 @@ mod tests {
             assert_eq!(intrinsic_numbers(text).unwrap(), K, "{text}");
         }
         assert!(intrinsic_numbers("k: [1, 2").is_err());
+        let error = intrinsic_numbers(r#"{"intrinsic_matrix": [540, 540, 320, 240]}"#).unwrap_err().to_string();
+        assert!(error.contains("4 numbers in `intrinsic_matrix`"), "{error}");
         assert_eq!(intrinsics("540, 541,320,240").unwrap(), [540.0, 0.0, 320.0, 0.0, 541.0, 240.0, 0.0, 0.0, 1.0]);
         assert_eq!(intrinsics("540,0,320,0,541,240,0,0,1").unwrap(), K);
         assert_eq!(intrinsics_file("540,541,320,240"), None);
@@ -239,12 +261,36 @@ mod tests {
     fn poses_are_numbers_or_files() {
         let Ok(Poses::Numbers(pose)) = "-0.2,-0.28,-0.05".parse() else { panic!("three numbers are a position") };
         assert_eq!(pose, Isometry3::translation(-0.2, -0.28, -0.05));
-        let Ok(Poses::Numbers(pose)) = "1,2,3, 0,0,2,0".parse() else { panic!("seven numbers are a pose") };
+        let Ok(Poses::Numbers(pose)) = "1,2,3, 0,0,1.0009,0".parse() else { panic!("seven numbers are a pose") };
         assert!((pose * Point3::new(1.0, 0.0, 0.0) - Point3::new(0.0, 2.0, 3.0)).norm() < 1e-12);
         let Ok(Poses::File(path)) = "corner.json".parse() else { panic!("other texts are files") };
         assert_eq!(path.to_str(), Some("corner.json"));
-        assert!("1,2,3,0,0,0,0".parse::<Poses>().unwrap_err().contains("the norm of the quaternion is 0"));
+        let refused = |text: &str| text.parse::<Poses>().unwrap_err();
+        assert!(refused("1,2,3,0,0,0,0").contains("the norm of the quaternion is 0"));
+        assert!(refused("1,2,3,0,0,2,0").contains("the norm of the quaternion is 2; it must be 1 ± 0.001"));
+        assert!(refused("1,2,3,0,0,nan,0").contains("NaN"));
         let error = Poses::Numbers(pose).each(2, "images").unwrap_err().to_string();
         assert!(error.contains("1 pose for 2 images"), "{error}");
+    }
+
+    #[test]
+    fn poses_of_files_and_of_detect_are_read() {
+        for key in ["orientation", "orientation_xyzw"] {
+            let pose = named(&serde_json::json!({ "position": [1, 2, 3], key: [0, 0, 1, 0] })).unwrap();
+            assert!((pose * Point3::new(1.0, 0.0, 0.0) - Point3::new(0.0, 2.0, 3.0)).norm() < 1e-12, "{key}");
+            let long = named(&serde_json::json!({ "position": [1, 2, 3], key: [0, 0, 0, 2] }));
+            let error = long.unwrap_err().to_string();
+            assert!(error.starts_with(&format!("`{key}`: the norm of the quaternion is 2")), "{error}");
+        }
+        assert!(named(&serde_json::json!({ "position": [1, 2, 3] })).is_err());
+    }
+
+    #[test]
+    fn an_invalid_matrix_is_printed() {
+        let mut numbers: Vec<f64> = Matrix4::identity().iter().copied().collect();
+        assert!(matrices(&numbers).is_ok());
+        numbers[5] = 2.0;
+        let error = matrices(&numbers).unwrap_err().to_string();
+        assert!(error.contains("[0.0, 2.0, 0.0, 0.0]"), "{error}");
     }
 }

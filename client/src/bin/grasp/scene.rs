@@ -2,12 +2,13 @@ use std::path::PathBuf;
 
 use anyhow::{Context, bail, ensure};
 use clap::Args;
-use grasp::{DepthImage, Fusion, Intrinsics, RESOLUTION, View, Volume, WORKSPACE_SIZE, seen_from};
+use grasp::{DepthImage, Fusion, RESOLUTION, View, Volume, WORKSPACE_SIZE, overview, seen_from};
 use grasp_client::{
     Client, CloudView, Depth, DepthView, Detection, Error, Extrinsics, FindTable, Observation, Options, Scores,
     Workspace,
 };
-use nalgebra::{Isometry3, Point3};
+use grasp_proto::Points;
+use nalgebra::Isometry3;
 
 use crate::numbers::Numbers;
 use crate::pose::Poses;
@@ -81,8 +82,8 @@ pub(crate) struct SceneArgs {
     labels: Vec<PathBuf>,
 
     /// Lengths of the workspace along x and y, metres, at most 2: larger than one cube. Default: one cube.
-    #[arg(long, value_name = "X,Y")]
-    size: Option<Numbers<2>>,
+    #[arg(long, alias = "size", value_name = "X,Y")]
+    extent: Option<Numbers<2>>,
 
     /// T_frame_task: pose of the workspace's corner, formats as for --camera-from-task. Default: identity.
     #[arg(long, value_name = "FILE|NUMBERS", allow_hyphen_values = true)]
@@ -123,7 +124,7 @@ impl SceneArgs {
     pub fn read(&self) -> anyhow::Result<Scene> {
         let pose = self.workspace.as_ref().map(Poses::one).transpose()?.unwrap_or_default();
         let find_table = self.find_table.then(|| FindTable { gravity: self.gravity.map(|Numbers(gravity)| gravity) });
-        let extent = self.size.map(|Numbers(extent)| extent);
+        let extent = self.extent.map(|Numbers(extent)| extent);
         let correct_depth_scale = self.correct_depth_scale;
         let workspace = Workspace { pose, size: None, find_table, extent, correct_depth_scale };
         if let Some(intrinsics) = &self.intrinsics {
@@ -143,7 +144,7 @@ impl SceneArgs {
                 self.files.len()
             )
         };
-        ensure!(extent.is_none() && self.labels.is_empty(), "--size and --labels need depth images or point clouds");
+        ensure!(extent.is_none() && self.labels.is_empty(), "--extent and --labels need depth images or point clouds");
         Ok(Scene::Volume(Box::new(volume::read(file, self.voxel_size, pose)?)))
     }
 
@@ -218,7 +219,7 @@ impl Scene {
         let Self::Depth(views, workspace) = self else { bail!("--color needs depth images") };
         let workspace = found(workspace, detection)?;
         let view = views.first().context("no depth image")?;
-        Ok((depth_view(view, &workspace), workspace.pose))
+        Ok((depth_view(view, 0, &workspace)?, workspace.pose))
     }
 
     /// Detects grasps in the observation.
@@ -245,17 +246,26 @@ impl Scene {
         client.score(observation, candidates, options).await
     }
 
-    /// The volume to draw: the given one, or the fused images or points.
+    /// The volume to draw: the given one, or the fused images or points, with depths corrected as in the server.
     pub fn volume(&self, detection: &Detection) -> anyhow::Result<Volume> {
         let (views, workspace) = match self {
             Self::Volume(volume) => return Ok((**volume).clone()),
             Self::Depth(views, workspace) => {
                 let workspace = found(workspace, detection)?;
-                (views.iter().map(|view| depth_view(view, &workspace)).collect(), workspace)
+                let views = views.iter().enumerate().map(|(index, view)| {
+                    let mut view = depth_view(view, index, &workspace)?;
+                    let factor = depth_factor(detection, index) as f32;
+                    view.depth.iter_mut().for_each(|depth| *depth *= factor);
+                    anyhow::Ok(view)
+                });
+                (views.collect::<anyhow::Result<Vec<_>>>()?, workspace)
             }
             Self::Clouds(views, workspace) => {
                 let workspace = found(workspace, detection)?;
-                let views = views.iter().map(|view| rendered_view(view, &workspace));
+                let views = views
+                    .iter()
+                    .enumerate()
+                    .map(|(index, view)| rendered_view(view, index, &workspace, depth_factor(detection, index)));
                 (views.collect::<anyhow::Result<Vec<_>>>()?, workspace)
             }
         };
@@ -277,31 +287,98 @@ fn found(workspace: &Workspace, detection: &Detection) -> anyhow::Result<Workspa
     Ok(Workspace { pose: pose.unwrap_or(workspace.pose), ..*workspace })
 }
 
-/// The depths of an image, metres.
-pub(crate) fn metres(depth: &Depth) -> Vec<f32> {
-    match depth {
-        Depth::Metres(depth) => depth.clone(),
-        Depth::Millimetres(depth) | Depth::Png(depth) => depth.iter().map(|&depth| f32::from(depth) * 1e-3).collect(),
-    }
+/// By which the server multiplied the depths of a view.
+fn depth_factor(detection: &Detection, index: usize) -> f64 {
+    detection.depth_factors.get(index).copied().unwrap_or(1.0)
 }
 
-pub(crate) fn depth_view(view: &DepthView, workspace: &Workspace) -> View {
-    let depth = metres(&view.depth);
-    let [fx, _, cx, _, fy, cy, ..] = view.k;
-    let (width, height) = (view.width as usize, view.height as usize);
-    let camera_from_task = match view.extrinsics {
-        Extrinsics::CameraFromTask(pose) => pose,
-        Extrinsics::FrameFromCamera(pose) => pose.inverse() * workspace.pose,
+/// Depth view `index` as the server reads it, with the same checks and errors.
+pub(crate) fn depth_view(view: &DepthView, index: usize, workspace: &Workspace) -> anyhow::Result<View> {
+    Ok(grasp_proto::depth_view(&view.into(), index, &workspace.pose)?)
+}
+
+/// Renders cloud `index`, whose distances from its camera are multiplied by `factor`, to a depth image.
+fn rendered_view(view: &CloudView, index: usize, workspace: &Workspace, factor: f64) -> anyhow::Result<View> {
+    let Points { mut points, eye, .. } = grasp_proto::cloud_view(&view.into(), index, &workspace.pose)?;
+    points.iter_mut().for_each(|point| *point = eye + factor * (*point - eye));
+    let seen = match workspace.extent {
+        // As the server does.
+        None => seen_from(&points, &eye, WORKSPACE_SIZE),
+        // The server renders each of its cubes. The bounding sphere of all of them may contain the camera, and
+        // `seen_from` then has no image.
+        Some(_) => overview(&points, &eye),
     };
-    View { intrinsics: Intrinsics { width, height, fx, fy, cx, cy }, depth, camera_from_task, labels: None }
+    seen.context("a camera sees no point of its cloud; check --camera-position and the poses")
 }
 
-/// Renders a cloud to a depth image, as the server does.
-fn rendered_view(view: &CloudView, workspace: &Workspace) -> anyhow::Result<View> {
-    let task_from_cloud = workspace.pose.inverse() * view.frame_from_cloud;
-    let points: Vec<_> = view.points.iter().map(|&point| task_from_cloud * Point3::from(point).cast::<f64>()).collect();
-    let eye = task_from_cloud * Point3::from(view.camera_position);
-    let [x, y] = workspace.extent.unwrap_or_default();
-    seen_from(&points, &eye, x.max(y).max(WORKSPACE_SIZE))
-        .context("a camera sees no point of its cloud; check --camera-position and the poses")
+#[cfg(test)]
+mod tests {
+    use grasp_client::pb;
+    use nalgebra::{Point3, Vector3};
+
+    use super::*;
+
+    /// By which the distances that the cameras measure must be multiplied.
+    const FACTOR: f64 = 1.02;
+
+    /// Height of the camera and of the table below it, metres.
+    const HEIGHTS: [f64; 2] = [0.65, 0.05];
+
+    /// Mean height of the surface that is drawn after a reply with these factors, metres.
+    fn drawn(scene: &Scene, depth_factors: &[f64]) -> f64 {
+        let response = pb::DetectGraspsResponse { depth_factors: depth_factors.to_vec(), ..Default::default() };
+        let detection = Detection::try_from(response).unwrap();
+        let surface = Fusion::of(&scene.volume(&detection).unwrap()).surface();
+        surface.iter().map(|point| point.position.z).sum::<f64>() / surface.len() as f64
+    }
+
+    /// What a camera measures that looks straight down at the middle of the workspace.
+    fn image() -> DepthView {
+        let [eye, table] = HEIGHTS;
+        let turned = Vector3::new(std::f64::consts::PI, 0.0, 0.0);
+        DepthView {
+            depth: Depth::Metres(vec![((eye - table) / FACTOR) as f32; 64 * 64]),
+            width: 64,
+            height: 64,
+            k: [100.0, 0.0, 31.5, 0.0, 100.0, 31.5, 0.0, 0.0, 1.0],
+            extrinsics: Extrinsics::CameraFromTask(Isometry3::new(Vector3::new(-0.15, 0.15, eye), turned)),
+            labels: None,
+        }
+    }
+
+    #[test]
+    fn depth_images_are_drawn_with_corrected_depths() {
+        let [_, table] = HEIGHTS;
+        let scene = Scene::Depth(vec![image()], Workspace::default());
+        let (corrected, uncorrected) = (drawn(&scene, &[FACTOR]), drawn(&scene, &[]));
+        assert!((corrected - table).abs() < 2e-3 && uncorrected > table + 8e-3, "{corrected} m, {uncorrected} m");
+    }
+
+    #[test]
+    fn a_transposed_intrinsic_matrix_is_refused_as_by_the_server() {
+        let transposed = DepthView { k: [100.0, 0.0, 0.0, 0.0, 100.0, 0.0, 31.5, 31.5, 1.0], ..image() };
+        let error = depth_view(&transposed, 0, &Workspace::default()).unwrap_err().to_string();
+        assert!(error.starts_with("views[0].camera.k is") && error.ends_with("not transposed"), "{error}");
+    }
+
+    #[test]
+    fn the_clouds_of_a_large_workspace_are_drawn_with_corrected_depths() {
+        let [height, table] = HEIGHTS;
+        // Inside the bounding sphere of the cube that contains the workspace.
+        let eye = Point3::new(0.45, 0.3, height);
+        let point = |index: usize| -> [f32; 3] {
+            let at = Point3::new((index / 120) as f64 * 0.005, (index % 120) as f64 * 0.005, table);
+            (eye + (at - eye) / FACTOR).coords.cast::<f32>().into()
+        };
+        let view = CloudView {
+            points: (0..180 * 120).map(point).collect(),
+            frame_from_cloud: Isometry3::identity(),
+            camera_position: eye.coords.into(),
+            labels: None,
+        };
+        let workspace = Workspace { extent: Some([0.9, 0.6]), ..Workspace::default() };
+        let scene = Scene::Clouds(vec![view], workspace);
+        let (corrected, uncorrected) = (drawn(&scene, &[FACTOR]), drawn(&scene, &[]));
+        assert!((corrected - table).abs() < 2e-3 && uncorrected > table + 8e-3, "{corrected} m, {uncorrected} m");
+    }
 }

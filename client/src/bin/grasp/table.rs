@@ -101,7 +101,7 @@ impl Table {
         let (depth, width, height) = image::read(&self.file, self.depth_scale)?;
         let extrinsics = Extrinsics::FrameFromCamera(Isometry3::identity());
         let view = DepthView { depth, width, height, k, extrinsics, labels: None };
-        Ok(depth_view(&view, &Workspace::default()))
+        in_file(&self.file, |_| depth_view(&view, 0, &Workspace::default()))
     }
 }
 
