@@ -47,13 +47,13 @@ pub enum BenchPlanner {
     /// [`PlannerSpec::Random`].
     Random,
     /// [`PlannerSpec::Server`].
-    Server(Server),
+    Server(Box<Server>),
     /// A planner of graspd in this process.
     Local {
         /// The planner.
         planner: Box<dyn Planner + Send>,
         /// Its decoding parameters.
-        decode: DecodeParams,
+        decode: Box<DecodeParams>,
         /// Whether it reads the point cloud.
         reads_points: bool,
     },
@@ -72,7 +72,7 @@ impl BenchPlanner {
             Self::Local { planner, decode, reads_points } => {
                 let points = reads_points.then(|| points(&observation.views));
                 let scene = Scene { volume: observation.volume.clone(), points };
-                let params = PlanParams { decode: *decode, table: Some(TABLE_HEIGHT) };
+                let params = PlanParams { decode: **decode, table: Some(TABLE_HEIGHT) };
                 Ok(planner.plan(&scene, &params, &|| true)?.grasps)
             }
         }
@@ -133,12 +133,12 @@ impl PlannerSpec {
         };
         let local = |planner: Box<dyn Planner + Send>, decode, reads_points| BenchPlanner::Local {
             planner,
-            decode,
+            decode: Box::new(decode),
             reads_points,
         };
         Ok(match self {
             Self::Random => BenchPlanner::Random,
-            Self::Server(address) => BenchPlanner::Server(Server::connect(address, params)?),
+            Self::Server(address) => BenchPlanner::Server(Box::new(Server::connect(address, params)?)),
             Self::Highest => local(Box::new(Shaf), Shaf::decode_params(), true),
             Self::Gpd(path) => local(Box::new(Gpd::load(path, options)?), Gpd::decode_params(), true),
             Self::Network(path) => {

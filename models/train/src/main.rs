@@ -42,7 +42,7 @@ enum Command {
     },
     /// Train a grasp network on data sets.
     Train(Box<TrainArgs>),
-    /// Train GPD's classifier on labelled candidates.
+    /// Train GPD's classifier on labelled candidates, or an evaluator on tried grasps.
     Classify(classify_command::Classify),
     /// Convert a network to another precision.
     Export(onnx_export::Export),

@@ -22,7 +22,8 @@ use super::{SceneArgs, show};
 /// The scenes depend only on the seed, so that all planners are evaluated on the same scenes.
 #[derive(Args)]
 pub struct Bench {
-    /// Planner; can be repeated: `random`; the path of an .onnx network; `grpc:ADDRESS` (a running graspd); `shaf` (the
+    /// Planner; can be repeated: `random`; the path of an .onnx network; `EVALUATOR.onnx:NETWORK.onnx`
+    /// (a network and the evaluator of its grasps); `grpc:ADDRESS` (a running graspd); `shaf` (the
     /// highest candidate); `shaf:FILE` (the highest of a network's proposals with a quality above 0.5); `gpd:FILE`
     /// (candidates scored by a classifier of `grasp-train classify`).
     #[arg(long = "planner", required = true)]

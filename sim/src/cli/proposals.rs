@@ -22,8 +22,8 @@ pub struct Proposals {
     #[arg(long)]
     network: PathBuf,
 
-    /// Try the grasps as this evaluator scores and moves them, so that the next evaluator learns from the errors of this
-    /// one.
+    /// Try the grasps as this evaluator scores and moves them, so that the next evaluator is trained on the errors of
+    /// this one.
     #[arg(long)]
     evaluator: Option<PathBuf>,
 

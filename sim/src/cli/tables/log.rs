@@ -58,10 +58,16 @@ impl Log {
         Ok(())
     }
 
-    /// Removes all other measurements, and sorts by these keys.
-    pub(super) fn keep<'a>(&mut self, keys: impl Iterator<Item = &'a str>) -> anyhow::Result<()> {
+    /// Sorts the measurements by these keys, and removes the others, except those that `is_kept` returns true for.
+    pub(super) fn keep<'a>(
+        &mut self,
+        keys: impl Iterator<Item = &'a str>,
+        is_kept: impl Fn(&Measurement) -> bool,
+    ) -> anyhow::Result<()> {
         let context = || self.path.display().to_string();
-        let lines = keys.filter_map(|key| self.measurements.get(key));
+        let keys: Vec<&str> = keys.collect();
+        let others = self.measurements.values().filter(|line| is_kept(line) && !keys.contains(&line.key.as_str()));
+        let lines = keys.iter().filter_map(|&key| self.measurements.get(key)).chain(others);
         let text = lines.map(|line| Ok(serde_json::to_string(line)? + "\n")).collect::<anyhow::Result<String>>()?;
         let partial = self.path.with_extension("jsonl.partial");
         fs::write(&partial, text).with_context(context)?;
