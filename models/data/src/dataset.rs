@@ -1,3 +1,4 @@
+use std::collections::HashSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -220,16 +221,22 @@ impl Dataset {
             hash.update(&id);
             hash.update((trials.len() as u64).to_le_bytes());
             hash.update((self.volumes(scene) as u64).to_le_bytes());
-            for Trial { position, rotation, width, success, yaws, share, clearance } in &trials {
-                for number in position.coords.iter().chain(rotation.coords.iter()).chain([width]) {
-                    hash.update(number.to_le_bytes());
-                }
-                hash.update([u8::from(*success) | yaws]);
-                hash.update(share.to_le_bytes());
-                hash.update(clearance.to_le_bytes());
-            }
+            update(&mut hash, &trials);
         }
         hash.finalize().iter().take(8).map(|byte| format!("{byte:02x}")).collect()
+    }
+
+    /// Indices of the scenes, each once: of a scene that was observed again into another folder, which has the same name
+    /// and trials there, only the first.
+    #[must_use]
+    pub fn distinct(&self) -> Vec<usize> {
+        let mut known = HashSet::new();
+        let is_new = |&scene: &usize| {
+            let mut hash = Sha256::new();
+            update(&mut hash, &self.trials(scene));
+            known.insert((self.id(scene), hash.finalize()))
+        };
+        (0..self.len()).filter(is_new).collect()
     }
 
     /// Indices of the training scenes and of the validation scenes, about `fraction` of all. They are split by a hash of
@@ -241,6 +248,18 @@ impl Dataset {
             let leading = hash.iter().take(8).fold(0_u64, |number, &byte| number << 8 | u64::from(byte));
             leading as f64 >= fraction * 2.0_f64.powi(64)
         })
+    }
+}
+
+/// Adds trials to a hash.
+fn update(hash: &mut Sha256, trials: &[Trial]) {
+    for Trial { position, rotation, width, success, yaws, share, clearance } in trials {
+        for number in position.coords.iter().chain(rotation.coords.iter()).chain([width]) {
+            hash.update(number.to_le_bytes());
+        }
+        hash.update([u8::from(*success) | yaws]);
+        hash.update(share.to_le_bytes());
+        hash.update(clearance.to_le_bytes());
     }
 }
 

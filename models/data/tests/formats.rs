@@ -126,6 +126,17 @@ fn earlier_versions_of_the_packed_format_are_read() {
 }
 
 #[test]
+fn a_scene_that_was_observed_again_counts_once() {
+    let scene = |id: &str, trials: Vec<Trial>, seen: u64| {
+        let volumes = volumes(seen).iter().map(|volume| grasp_data::quantise(volume)).collect();
+        Scene { id: id.into(), volumes, trials }
+    };
+    let scenes = [("0", trials(0), 0), ("1", trials(1), 0), ("0", trials(0), 1), ("0", trials(1), 0)];
+    let scenes = scenes.map(|(id, trials, seen)| scene(id, trials, seen));
+    assert_eq!(Dataset::of(scenes.into()).unwrap().distinct(), [0, 1, 3]);
+}
+
+#[test]
 fn the_fingerprint_depends_on_shares_and_clearances() {
     let fingerprint = |change: fn(&mut Trial)| {
         let mut trials = trials(0);

@@ -250,10 +250,11 @@ fn settings(training: &TrainArgs, metadata: &Metadata) -> TrainingSettings {
 /// Writes the provenance of the weights to the metadata.
 fn add_provenance(training: &TrainArgs, settings: &TrainingSettings, dataset: &Dataset, metadata: &mut Metadata) {
     let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let (grasps, successes) = count_grasps(dataset);
+    let scenes = dataset.distinct();
+    let (grasps, successes) = dataset.grasps(&scenes);
     let mut note = |key: &str, value: String| metadata.provenance.insert(key.to_owned(), value);
     note("data", training.data.iter().map(name).collect::<Vec<_>>().join(" "));
-    note("scenes", dataset.len().to_string());
+    note("scenes", scenes.len().to_string());
     note("grasps", grasps.to_string());
     note("successes", successes.to_string());
     note("settings", serde_json::to_string(settings).unwrap_or_default());
