@@ -331,7 +331,7 @@ impl Results {
             let published = |method| Some(published_times(method)?[column?].0);
             match (published(method), published(RELEASED)) {
                 (Some(time), Some(of_vgn)) => {
-                    let _ = writeln!(text, " (published: {time} / {of_vgn} = {:.1} times).", time / of_vgn);
+                    let _ = writeln!(text, " (published: {time:.1} / {of_vgn:.1} = {:.1} times).", time / of_vgn);
                 }
                 _ => text.push_str(".\n"),
             }
