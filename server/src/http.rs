@@ -26,7 +26,7 @@ use crate::transport::http_connections::{self, HttpConfig};
 /// Maximum number of open connections.
 pub(crate) const CONNECTIONS: usize = 128;
 
-/// Maximum number of pages that are told about new requests, so that connections remain for probes and Prometheus.
+/// Maximum number of open event streams, so that connections remain for probes and Prometheus.
 const PAGES: usize = 32;
 
 /// State shared by the HTTP handlers.
@@ -35,7 +35,7 @@ pub(crate) struct HttpState {
     pub metrics: Arc<Metrics>,
     pub models: Arc<ModelRegistry>,
     pub recent: Arc<RecentRequests>,
-    /// Permits of the pages that are told about new requests.
+    /// Permits of the open event streams.
     pub pages: Arc<Semaphore>,
 }
 

@@ -338,7 +338,7 @@ impl ModelFolder {
             warn!("a reload ended after a later one had begun; it changes nothing");
             return self.metrics.superseded();
         }
-        // A client may have been told meanwhile that a model could not be unloaded: it remains served.
+        // If an unloading has been answered with an error meanwhile, the model remains served.
         let still_unloaded = self.unloaded().clone();
         let is_kept = |engine: &&Arc<Engine>| {
             let is_rejected = engine.source.path().is_some_and(|path| rejected.iter().any(|rejected| rejected == path));

@@ -16,7 +16,7 @@ struct State {
     lines: Lines<oneshot::Sender<Turn>>,
     /// Number of the next waiting request.
     next: u64,
-    /// Number of turns that nobody has.
+    /// Number of free turns.
     free: usize,
 }
 
