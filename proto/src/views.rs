@@ -59,7 +59,7 @@ pub fn check_png(views: &[pb::DepthView]) -> Result<(), FieldError> {
         let labels = view.labels.as_ref().map(pb::Labels::r#type);
         let images =
             u64::from(view.unit() == pb::DepthUnit::PngMillimetres) + u64::from(labels == Some(pb::LabelType::Png));
-        // Fits: the edges have 32 bits, and a message of views has far fewer than 2³² of them.
+        // The product of the edges fits, because they have 32 bits; twice as much may not.
         view.camera
             .as_ref()
             .map_or(0, |camera| images.saturating_mul(u64::from(camera.width) * u64::from(camera.height)))

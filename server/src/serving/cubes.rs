@@ -102,7 +102,7 @@ impl Cubes {
         if edge <= 2.0 * margin {
             let value = format_args!("given, for cubes with an edge of {edge} m");
             let needed =
-                format_args!("needs an edge above {} m, twice options.margin or the smallest one", 2.0 * margin);
+                format_args!("needs more than {} m, twice options.margin (at least {} m)", 2.0 * margin, Tile::MARGIN);
             return Err(FieldError::new("workspace.extent", value, needed));
         }
         let count = Tile::count(extent, edge, margin);
