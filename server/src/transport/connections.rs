@@ -78,6 +78,8 @@ enum Stage {
     Plain(Socket),
     Handshake(Box<Accept<Socket>>),
     Tls(Box<TlsStream<Socket>>),
+    /// The handshake has failed. It must not be polled again.
+    Failed,
 }
 
 /// The bytes of a connection, decrypted.
@@ -124,12 +126,19 @@ impl Connection {
             if done.is_pending() {
                 self.check_time(context)?;
             }
-            self.stream = Stage::Tls(Box::new(ready!(done)?));
+            match ready!(done) {
+                Ok(stream) => self.stream = Stage::Tls(Box::new(stream)),
+                Err(error) => {
+                    self.stream = Stage::Failed;
+                    return Poll::Ready(Err(error));
+                }
+            }
         }
         match &mut self.stream {
             Stage::Plain(stream) => Poll::Ready(Ok(Pin::new(stream))),
             Stage::Tls(stream) => Poll::Ready(Ok(Pin::new(stream.as_mut()))),
             Stage::Handshake(_) => Poll::Pending,
+            Stage::Failed => Poll::Ready(Err(io::ErrorKind::NotConnected.into())),
         }
     }
 
@@ -200,7 +209,7 @@ impl AsyncWrite for Connection {
         match &self.stream {
             Stage::Plain(stream) => stream.is_write_vectored(),
             // As TlsStream, which encrypts the slices one after the other.
-            Stage::Handshake(_) | Stage::Tls(_) => true,
+            Stage::Handshake(_) | Stage::Tls(_) | Stage::Failed => true,
         }
     }
 }
