@@ -98,20 +98,20 @@ fn is_own(host: &str, hosts: &[String]) -> bool {
         || hosts.iter().any(|own| own.eq_ignore_ascii_case(name))
 }
 
-const HANGING: (StatusCode, &str) = (
+const UNABLE: (StatusCode, &str) = (
     StatusCode::SERVICE_UNAVAILABLE,
-    "all sessions of a model hang in an inference, see the log; restart the server\n",
+    "all sessions of a model hang in an inference, or fail each one, see the log; restart the server\n",
 );
 
 fn liveness(state: State) -> impl IntoResponse {
-    if state == State::Hanging { HANGING } else { (StatusCode::OK, "ok\n") }
+    if state == State::Unable { UNABLE } else { (StatusCode::OK, "ok\n") }
 }
 
 fn readiness(state: State) -> impl IntoResponse {
     match state {
         State::Starting => (StatusCode::SERVICE_UNAVAILABLE, "warming up\n"),
         State::Ready => (StatusCode::OK, "ready\n"),
-        State::Hanging => HANGING,
+        State::Unable => UNABLE,
         State::Draining => (StatusCode::SERVICE_UNAVAILABLE, "draining\n"),
     }
 }

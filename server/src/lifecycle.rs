@@ -189,9 +189,8 @@ async fn serve(
         tokio::spawn(listener::serve(grpc, grpc_config, service, inference, Arc::clone(metrics), state.clone()));
 
     let (is_able, mut able) = watch::channel(true);
-    let hanging = config
-        .inference_timeout
-        .map(|timeout| tokio::spawn(Arc::clone(sessions).watch(Arc::clone(&models), timeout, is_able)));
+    let watch = Arc::clone(sessions).watch(Arc::clone(&models), config.inference_timeout, is_able);
+    let watch = tokio::spawn(watch);
     let entries = config.store.entries().to_vec();
     let mut loading = tokio::task::spawn_blocking(move || folder.load(&entries).map(|()| folder));
     let loaded = tokio::select! {
@@ -228,9 +227,7 @@ async fn serve(
         () = signals.next() => warn!("second signal: exiting immediately"),
     }
     http.abort();
-    if let Some(hanging) = hanging {
-        hanging.abort();
-    }
+    watch.abort();
     Ok(())
 }
 

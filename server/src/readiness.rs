@@ -17,8 +17,8 @@ pub(crate) enum State {
     Starting,
     /// Every session has completed an inference.
     Ready,
-    /// All sessions of a model hang in an inference; the other models are served. Only a restart helps.
-    Hanging,
+    /// All sessions of a model hang in an inference, or fail each one; the other models are served. Only a restart helps.
+    Unable,
     /// Shutting down: accepted requests are finished, new connections and messages are not accepted.
     Draining,
 }
@@ -35,9 +35,9 @@ impl Readiness {
         self.0.subscribe()
     }
 
-    /// Sets the state while serving: whether every model has a session that does not hang.
+    /// Sets the state while serving: whether every model has a session that neither hangs nor fails.
     pub fn serving(&self, is_able: bool) {
-        self.0.send_replace(if is_able { State::Ready } else { State::Hanging });
+        self.0.send_replace(if is_able { State::Ready } else { State::Unable });
     }
 
     /// Sets the last state and drops the sender, which ends all streams of [`Health::watch`].
@@ -85,7 +85,7 @@ fn is_known(service: &str) -> bool {
 fn serving_status(state: State) -> ServingStatus {
     match state {
         State::Ready => ServingStatus::Serving,
-        State::Starting | State::Hanging | State::Draining => ServingStatus::NotServing,
+        State::Starting | State::Unable | State::Draining => ServingStatus::NotServing,
     }
 }
 

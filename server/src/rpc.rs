@@ -4,5 +4,6 @@ pub(crate) mod call;
 pub(crate) mod grasp_service;
 mod infer_request;
 pub(crate) mod inference_service;
-pub(crate) mod refusal;
+mod pending;
+mod status;
 mod streams;

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use grasp::Warning;
-use grasp_proto::{Candidate, DetectParams, FieldError, Priority, pb};
+use grasp_proto::{Priority, pb};
 use opentelemetry::Context;
 use tokio::sync::watch;
 use tonic::{Code, Request, Status};
@@ -13,22 +13,17 @@ use tracing::field::Empty;
 use tracing::{Span, debug, info, info_span};
 
 use crate::readiness::State;
-use crate::rpc::refusal::Refusal;
-use crate::serving::cubes::CubeScene;
-use crate::serving::detection::{Detection, Score};
 use crate::serving::engine::Engine;
-use crate::serving::job::{EngineError, Reply, SessionOutput, Tensors};
+use crate::serving::frame_stamp::check_id;
 use crate::serving::queue::Ticket;
+use crate::serving::refusal::Refusal;
 use crate::telemetry::metrics::Metrics;
-use crate::telemetry::recent::{Outcome, RecentRequests, Shown};
+use crate::telemetry::recent::{Outcome, RecentRequests};
 use crate::telemetry::subscriber::{self, REQUEST};
 use crate::telemetry::timings::StageTimings;
 use crate::transport::caller::Caller;
 use crate::transport::deadline::{self, Deadline};
 use crate::transport::request_body::unreadable_message;
-
-/// Maximum length of a request id and a frame id, bytes. Both are echoed; the request id is also logged.
-const MAX_ID: usize = 256;
 
 /// Retry hint while the models are loaded and warmed up.
 pub(super) const WARM_UP: Duration = Duration::from_secs(1);
@@ -52,9 +47,11 @@ pub(crate) struct Call {
     span: Span,
     metrics: Arc<Metrics>,
     recent: Arc<RecentRequests>,
-    name: String,
-    version: String,
-    /// `name version` of the model; empty until a model is selected.
+    /// Name of the model; empty until a model is selected.
+    pub name: String,
+    /// Version of the model.
+    pub version: String,
+    /// `name version` of the model.
     label: String,
     ended: bool,
 }
@@ -75,38 +72,6 @@ impl CallContext {
             parent: subscriber::parent(request.metadata()),
         }
     }
-}
-
-/// A queued request: the pending results of its cubes, and what the response needs besides them.
-pub(crate) struct PendingReply<T = Detection> {
-    replies: Vec<Reply<T>>,
-    params: DetectParams,
-    /// The smallest quality of a grasp.
-    threshold: f32,
-    /// Time until the scenes were queued, without the fusion.
-    preprocessing: Duration,
-    observed: Observed,
-    origin: FrameStamp,
-}
-
-/// What the fusion of a request's views showed. The default is a request with a volume.
-#[derive(Default)]
-pub(crate) struct Observed {
-    /// The time that the fusion took.
-    pub fusion: Option<Duration>,
-    /// Signs that the geometry of the request is wrong.
-    pub warnings: Vec<Warning>,
-    /// The table that determined the workspace.
-    pub table: Option<pb::FoundTable>,
-    /// By which the depths of each view were multiplied; empty if they were not to be corrected.
-    pub depth_factors: Vec<f64>,
-}
-
-/// Frame id and time stamp of a request's views, echoed in the response.
-#[derive(Clone, Default)]
-pub(crate) struct FrameStamp {
-    pub frame_id: String,
-    pub stamp: Option<prost_types::Timestamp>,
 }
 
 impl Calls {
@@ -167,24 +132,6 @@ impl Calls {
     }
 }
 
-impl FrameStamp {
-    pub fn checked(
-        field: &'static str,
-        frame_id: String,
-        stamp: Option<prost_types::Timestamp>,
-    ) -> Result<Self, Refusal> {
-        check_id(field, &frame_id)?;
-        Ok(Self { frame_id, stamp })
-    }
-}
-
-fn check_id(field: &'static str, id: &str) -> Result<(), FieldError> {
-    if id.len() <= MAX_ID {
-        return Ok(());
-    }
-    Err(FieldError::new(field, format_args!("{} bytes long", id.len()), format_args!("must be at most {MAX_ID}")))
-}
-
 impl Call {
     /// The request's place in a queue.
     pub fn ticket(&self, priority: Priority) -> Ticket {
@@ -199,81 +146,19 @@ impl Call {
         self.span.record("model", &engine.label);
     }
 
-    /// Queues the scenes of a request for grasp detection.
-    pub fn submit(
-        &self,
-        engine: &Engine,
-        scenes: Vec<CubeScene>,
-        params: DetectParams,
-        origin: FrameStamp,
-        observed: Observed,
-    ) -> Result<PendingReply, Refusal> {
-        engine.check_cubes(scenes.len())?;
-        let ticket = self.ticket(params.priority);
-        self.queue(engine, scenes, params, origin, observed, |scenes| engine.detect(scenes, ticket, &self.span))
+    /// Time since the call was opened.
+    pub fn elapsed(&self) -> Duration {
+        self.started.elapsed()
     }
 
-    /// Queues a scene whose candidates are to be scored.
-    pub fn submit_candidates(
-        &self,
-        engine: &Engine,
-        scene: CubeScene,
-        candidates: &[Candidate],
-        origin: FrameStamp,
-        observed: Observed,
-    ) -> Result<PendingReply<Vec<Score>>, Refusal> {
-        let params = scene.params.clone();
-        let ticket = self.ticket(params.priority);
-        self.queue(engine, vec![scene], params, origin, observed, |scenes| {
-            engine.score(scenes, candidates, ticket, &self.span)
-        })
-    }
-
-    /// Checks the table in the scenes and queues them with `push`.
-    fn queue<T>(
-        &self,
-        engine: &Engine,
-        scenes: Vec<CubeScene>,
-        params: DetectParams,
-        origin: FrameStamp,
-        mut observed: Observed,
-        push: impl FnOnce(Vec<CubeScene>) -> Result<Vec<Reply<T>>, EngineError>,
-    ) -> Result<PendingReply<T>, Refusal> {
-        observed.warnings.extend(params.table.and_then(|expected| table_warning(&scenes, expected)));
-        let preprocessing = self.started.elapsed().saturating_sub(observed.fusion.unwrap_or_default());
-        let threshold = params.decode_params(engine.source.decode_params()).threshold;
-        Ok(PendingReply { replies: push(scenes)?, params, threshold, preprocessing, observed, origin })
-    }
-
-    /// Waits for the session's result, and records the outcome in the log and the metrics.
-    pub async fn finish(mut self, pending: Result<PendingReply, Refusal>) -> Result<pb::DetectGraspsResponse, Refusal> {
-        let outcome = match pending {
-            Ok(pending) => self.reply(pending).await,
-            Err(refusal) => Err(refusal),
-        };
-        self.concluded(outcome)
-    }
-
-    /// Waits for the maps of each volume, and records the outcome. The timings are those of the slowest volume.
-    pub async fn maps(mut self, replies: Vec<Reply<Tensors>>) -> Result<(Vec<Tensors>, StageTimings), Refusal> {
-        let preprocessing = self.started.elapsed();
-        let mut maps = Vec::with_capacity(replies.len());
-        let mut timings = StageTimings { preprocessing, ..StageTimings::default() };
-        for reply in replies {
-            let SessionOutput { value, queue, inference, postprocessing, .. } = match reply.wait(self.deadline).await {
-                Ok(output) => output,
-                Err(error) => return Err(self.end(error.into())),
-            };
-            maps.push(value);
-            if queue + inference >= timings.queue + timings.inference {
-                timings = StageTimings { queue, inference, postprocessing, ..timings };
-            }
-        }
-        timings.total = self.started.elapsed();
-        self.succeeded(&timings, 0);
-        self.recent.add(self.id.clone(), self.label.clone(), Outcome::Inferred(timings));
+    /// Records a success in the log, the metrics, the trace and the list of recent requests, and ends the call.
+    pub fn succeeded(&mut self, timings: &StageTimings, grasps: usize, outcome: Outcome) {
+        timings.record(&self.span);
+        subscriber::stages(&self.span, timings);
+        self.metrics.succeeded(&self.label, timings, grasps);
+        self.span.in_scope(|| debug!(grasps, "request succeeded"));
+        self.recent.add(self.id.clone(), self.label.clone(), outcome);
         self.ended = true;
-        Ok((maps, timings))
     }
 
     /// Ends a call that needs no model, and records the outcome.
@@ -288,20 +173,15 @@ impl Call {
         Ok(value)
     }
 
-    /// Ends the call with its outcome. A success is recorded already.
-    fn concluded<T>(mut self, outcome: Result<T, Refusal>) -> Result<T, Refusal> {
-        match outcome {
-            Ok(response) => {
-                self.ended = true;
-                Ok(response)
-            }
-            Err(refusal) => Err(self.end(refusal)),
-        }
-    }
-
     /// Ends the call with a refusal.
     pub fn end(mut self, refusal: Refusal) -> Refusal {
-        self.refused(&refusal);
+        self.metrics.ended(&self.label, refusal.code());
+        if refusal.code() == Code::Internal {
+            self.span.record("otel.status_code", "ERROR");
+        }
+        let outcome = Outcome::Refused { code: refusal.code(), message: refusal.to_string() };
+        self.recent.add(self.id.clone(), self.label.clone(), outcome);
+        self.span.in_scope(|| info!(code = ?refusal.code(), %refusal, "refused"));
         self.ended = true;
         refusal
     }
@@ -310,115 +190,14 @@ impl Call {
         &self.span
     }
 
-    /// Waits for the session's scores, and records the outcome in the log and the metrics.
-    pub async fn finish_scores(
-        mut self,
-        pending: Result<PendingReply<Vec<Score>>, Refusal>,
-    ) -> Result<pb::ScoreGraspsResponse, Refusal> {
-        let outcome = match pending {
-            Ok(pending) => self.scores(pending).await,
-            Err(refusal) => Err(refusal),
-        };
-        self.concluded(outcome)
-    }
-
-    async fn scores(&mut self, pending: PendingReply<Vec<Score>>) -> Result<pb::ScoreGraspsResponse, Refusal> {
-        let PendingReply { replies, preprocessing, observed, origin, .. } = pending;
-        let Observed { fusion, warnings, table, depth_factors } = observed;
-        let (values, stages) = all(replies, self.deadline).await?;
-        let total = self.started.elapsed();
-        let timings = StageTimings { preprocessing, fusion, total, ..stages };
-        self.succeeded(&timings, 0);
-        let warnings = self.warned(&warnings);
-        self.recent.add(self.id.clone(), self.label.clone(), Outcome::Scored(timings));
-        Ok(pb::ScoreGraspsResponse {
-            request_id: self.id.clone(),
-            frame_id: origin.frame_id,
-            stamp: origin.stamp,
-            scores: values.iter().flatten().map(Into::into).collect(),
-            model: std::mem::take(&mut self.name),
-            version: std::mem::take(&mut self.version),
-            latency: Some((&timings).into()),
-            warnings,
-            table,
-            depth_factors,
-        })
-    }
-
-    async fn reply(&mut self, pending: PendingReply) -> Result<pb::DetectGraspsResponse, Refusal> {
-        let PendingReply { replies, params, threshold, preprocessing, observed, origin } = pending;
-        let Observed { fusion, warnings, table, depth_factors } = observed;
-        let (cubes, stages) = all(replies, self.deadline).await?;
-        let Detection { grasps: found, dropped, over_limit, volumes } = Detection::merged(cubes, &params, threshold);
-
-        let grasps: Vec<_> = found
-            .iter()
-            .map(|detected| {
-                let [pose, pregrasp, retreat] = params.poses(&detected.grasp.pose).map(|pose| Some((&pose).into()));
-                pb::Grasp {
-                    pose,
-                    width: detected.grasp.width,
-                    quality: detected.grasp.quality,
-                    pregrasp,
-                    retreat,
-                    collides: detected.collides,
-                    object: detected.object.map(u32::from),
-                    open_width: detected.open_width,
-                }
-            })
-            .collect();
-        // Fits: there is at most one grasp per voxel.
-        let over_limit = over_limit as u32;
-        let dropped = (params.explain || grasps.is_empty()).then(|| pb::Dropped { over_limit, ..(&dropped).into() });
-
-        let finger_depth = params.hand.map_or(grasp::FINGER_DEPTH, |hand| hand.depth);
-        let total = self.started.elapsed();
-        let timings = StageTimings { preprocessing, fusion, total, ..stages };
-        self.succeeded(&timings, grasps.len());
-        let warnings = self.warned(&warnings);
-        let messages = warnings.iter().map(|warning| warning.message.clone()).collect();
-        let shown = Shown::new(timings, volumes, found, finger_depth, messages);
-        self.recent.add(self.id.clone(), self.label.clone(), Outcome::Detected(Box::new(shown)));
-        Ok(pb::DetectGraspsResponse {
-            request_id: self.id.clone(),
-            frame_id: origin.frame_id,
-            stamp: origin.stamp,
-            grasps,
-            model: std::mem::take(&mut self.name),
-            version: std::mem::take(&mut self.version),
-            latency: Some((&timings).into()),
-            dropped,
-            warnings,
-            table,
-            depth_factors,
-        })
-    }
-
     /// The warnings of the reply, which are logged and counted.
-    fn warned(&self, warnings: &[Warning]) -> Vec<pb::GeometryWarning> {
+    pub fn warned(&self, warnings: &[Warning]) -> Vec<pb::GeometryWarning> {
         let warnings: Vec<pb::GeometryWarning> = warnings.iter().map(Into::into).collect();
         for warning in &warnings {
             self.metrics.warned(&self.label, warning.code());
             self.span.in_scope(|| debug!(code = warning.code().as_str_name(), "{}", warning.message));
         }
         warnings
-    }
-
-    fn succeeded(&self, timings: &StageTimings, grasps: usize) {
-        timings.record(&self.span);
-        subscriber::stages(&self.span, timings);
-        self.metrics.succeeded(&self.label, timings, grasps);
-        self.span.in_scope(|| debug!(grasps, "request succeeded"));
-    }
-
-    fn refused(&self, refusal: &Refusal) {
-        self.metrics.ended(&self.label, refusal.code());
-        if refusal.code() == Code::Internal {
-            self.span.record("otel.status_code", "ERROR");
-        }
-        let outcome = Outcome::Refused { code: refusal.code(), message: refusal.to_string() };
-        self.recent.add(self.id.clone(), self.label.clone(), outcome);
-        self.span.in_scope(|| info!(code = ?refusal.code(), %refusal, "refused"));
     }
 }
 
@@ -435,38 +214,6 @@ impl Drop for Call {
             self.span.in_scope(|| info!(?code, "{reason}"));
         }
     }
-}
-
-/// Waits for the results of all cubes. The timings of the sessions are those from the first cube to the last: the cubes
-/// are computed in parallel, and one after another.
-async fn all<T>(replies: Vec<Reply<T>>, deadline: Option<Deadline>) -> Result<(Vec<T>, StageTimings), EngineError> {
-    let mut values = Vec::with_capacity(replies.len());
-    // When the first cube was taken from the queue, and the last one had passed each stage.
-    let mut taken = Duration::MAX;
-    let (mut inferred, mut evaluated, mut decoded) = (Duration::ZERO, None, Duration::ZERO);
-    for reply in replies {
-        let SessionOutput { value, queue, inference, evaluation, postprocessing } = reply.wait(deadline).await?;
-        values.push(value);
-        taken = taken.min(queue);
-        inferred = inferred.max(queue + inference);
-        evaluated = evaluated.max(evaluation.map(|evaluation| queue + inference + evaluation));
-        decoded = decoded.max(queue + inference + evaluation.unwrap_or_default() + postprocessing);
-    }
-    let stages = StageTimings {
-        queue: taken,
-        inference: inferred.saturating_sub(taken),
-        evaluation: evaluated.map(|evaluated| evaluated.saturating_sub(inferred)),
-        postprocessing: decoded.saturating_sub(evaluated.unwrap_or(inferred)),
-        ..StageTimings::default()
-    };
-    Ok((values, stages))
-}
-
-/// The warning about the table, unless it is as expected in one of the cubes.
-fn table_warning(scenes: &[CubeScene], expected: f64) -> Option<Warning> {
-    let mut warnings = scenes.iter().map(|scene| Warning::of_table(&scene.scene.volume, expected));
-    let first = warnings.next()??;
-    warnings.all(|warning| warning.is_some()).then_some(first)
 }
 
 /// Ids for requests without one: a random number of the process, then a counter.

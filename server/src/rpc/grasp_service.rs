@@ -1,28 +1,27 @@
 use std::num::NonZero;
 use std::sync::Arc;
 use std::thread;
-use std::time::Instant;
 
 use grasp::{Volume, WORKSPACE_SIZE};
 use grasp_proto::pb::find_table_request::Observation as Seen;
 use grasp_proto::pb::grasp_service_server::GraspService;
 use grasp_proto::pb::recording::{Answer, Request as Recorded};
 use grasp_proto::{
-    Candidate, DetectParams, FieldError, Priority, TABLE_HEIGHT, Workspace, candidates, check_count, check_png,
-    cloud_view, depth_view, pb, resolution,
+    Candidate, DetectParams, FieldError, Priority, TABLE_HEIGHT, Workspace, candidates, check_count, pb, resolution,
 };
 use tokio::time::timeout_at;
 use tonic::codegen::BoxStream;
 use tonic::{Request, Response, Status, Streaming};
 
-use crate::rpc::call::{Call, CallContext, Calls, FrameStamp, Observed, PendingReply};
-use crate::rpc::refusal::Refusal;
+use crate::rpc::call::{Call, CallContext, Calls};
+use crate::rpc::pending::{PendingReply, Prepared};
 use crate::serving::cubes::{CubeScene, Cubes, edge};
-use crate::serving::detection::Score;
 use crate::serving::engine::Engine;
+use crate::serving::frame_stamp::FrameStamp;
 use crate::serving::job::EngineError;
-use crate::serving::observation::Observation;
+use crate::serving::observation::{Observation, Observed, Placed};
 use crate::serving::queue::Ticket;
+use crate::serving::refusal::Refusal;
 use crate::serving::registry::{ModelRegistry, check_voxel_size};
 use crate::serving::tracking::TrackedVolumes;
 use crate::serving::turns::{NoTurn, Turn, Turns};
@@ -47,12 +46,6 @@ pub(crate) struct GraspRpc {
     conversions: Arc<Turns>,
 }
 
-/// What the cameras saw, and the table that determined the workspace.
-type Placed = (Observation, Option<pb::FoundTable>);
-
-/// The scenes of a request with views, and what their fusion showed.
-type Fused = (Vec<CubeScene>, Observed);
-
 /// A call that is queued, or refused with its refusal not yet sent.
 pub(super) struct PendingCall {
     pub call: Call,
@@ -62,8 +55,13 @@ pub(super) struct PendingCall {
 
 impl PendingCall {
     pub async fn finish(self) -> Result<pb::DetectGraspsResponse, Refusal> {
-        let outcome = self.call.finish(self.reply).await;
-        self.recording.answered(&outcome, |response| Answer::Grasps(response.clone()));
+        let Self { mut call, reply, recording } = self;
+        let outcome = match reply {
+            Ok(pending) => pending.response(&mut call).await,
+            Err(refusal) => Err(refusal),
+        };
+        let outcome = outcome.map_err(|refusal| call.end(refusal));
+        recording.answered(&outcome, |response| Answer::Grasps(response.clone()));
         outcome
     }
 
@@ -114,8 +112,8 @@ impl GraspRpc {
         let pb::DetectGraspsRequest { volume, options, .. } = request;
         let volume = volume.ok_or_else(|| FieldError::new("volume", "absent", "must be given"))?;
         let params = DetectParams::try_from(&options.unwrap_or_default())?;
-        let (engine, scene, origin) = self.of_volume(volume, &params, call).await?;
-        call.submit(&engine, vec![scene], params, origin, Observed::default())
+        let prepared = self.of_volume(volume, &params, call).await?;
+        PendingReply::detect(call, prepared, params)
     }
 
     /// Selects the model for a volume and converts the volume.
@@ -124,7 +122,7 @@ impl GraspRpc {
         mut volume: pb::Volume,
         params: &DetectParams,
         call: &mut Call,
-    ) -> Result<(Arc<Engine>, CubeScene, FrameStamp), Refusal> {
+    ) -> Result<Prepared, Refusal> {
         let origin = FrameStamp::checked("volume.frame_id", std::mem::take(&mut volume.frame_id), volume.stamp)?;
         params.check_without_views()?;
         // Selects the model first, so that no volume is converted that no model accepts.
@@ -145,7 +143,8 @@ impl GraspRpc {
         if params.margin > 0.0 {
             params.constraints.workspace = Some(checked.within(params.margin));
         }
-        Ok((engine, CubeScene { scene: Scene { volume: checked, points: None }, params }, origin))
+        let scenes = vec![CubeScene { scene: Scene { volume: checked, points: None }, params }];
+        Ok(Prepared { engine, scenes, observed: Observed::default(), origin })
     }
 
     async fn submit_depth(
@@ -176,8 +175,8 @@ impl GraspRpc {
         place: impl FnOnce(&mut Workspace, f64, f64) -> Result<Placed, FieldError> + Send + 'static,
     ) -> Result<PendingReply, Refusal> {
         let params = DetectParams::try_from(&options.unwrap_or_default())?;
-        let (engine, (scenes, observed), origin) = self.of_views(count, workspace, &params, call, place).await?;
-        call.submit(&engine, scenes, params, origin, observed)
+        let prepared = self.of_views(count, workspace, &params, call, place).await?;
+        PendingReply::detect(call, prepared, params)
     }
 
     /// Selects the model for `count` views and fuses them. `place` converts the views and sets the pose of the
@@ -189,7 +188,7 @@ impl GraspRpc {
         params: &DetectParams,
         call: &mut Call,
         place: impl FnOnce(&mut Workspace, f64, f64) -> Result<Placed, FieldError> + Send + 'static,
-    ) -> Result<(Arc<Engine>, Fused, FrameStamp), Refusal> {
+    ) -> Result<Prepared, Refusal> {
         check_count(count)?;
         let mut workspace = Workspace::try_from(workspace.unwrap_or_default())?;
         let origin =
@@ -204,17 +203,19 @@ impl GraspRpc {
         let fused = blocking(turn, call.deadline, move |is_wanted| {
             let edge = edge(&selected.source, workspace.size);
             let (observation, table) = place(&mut workspace, params.table.unwrap_or(TABLE_HEIGHT), edge)?;
-            fuse(&selected, &params, &workspace, observation, table, is_wanted)
+            let mut cubes = Cubes::of(&selected.source, &workspace, &observation.cameras(), params.margin)?;
+            cubes.fuse(observation, table, &params, is_wanted)
         });
-        Ok((engine, fused.await?, origin))
+        let (scenes, observed) = fused.await?;
+        Ok(Prepared { engine, scenes, observed, origin })
     }
 
-    /// Queues the scene of a request with candidates.
-    async fn submit_candidates(
+    /// Scores the candidates of a request.
+    async fn scores(
         &self,
         request: pb::ScoreGraspsRequest,
         call: &mut Call,
-    ) -> Result<PendingReply<Vec<Score>>, Refusal> {
+    ) -> Result<pb::ScoreGraspsResponse, Refusal> {
         use pb::score_grasps_request::Scene as Message;
         let pb::ScoreGraspsRequest { candidates: messages, scene, options, .. } = request;
         let params = DetectParams::try_from(&options.unwrap_or_default())?;
@@ -223,35 +224,29 @@ impl GraspRpc {
             Some(pb::Workspace { extent: Some(_), .. }) => Err(FieldError::new(field, "given", "must be absent")),
             _ => Ok(()),
         };
-        let (engine, (scenes, observed), origin) = match scene {
+        let prepared = match scene {
             None => {
                 let needed = "volume, depth or clouds must be given";
                 return Err(FieldError::new("scene", "absent", needed).into());
             }
-            Some(Message::Volume(volume)) => {
-                let (engine, scene, origin) = self.of_volume(volume, &params, call).await?;
-                (engine, (vec![scene], Observed::default()), origin)
-            }
+            Some(Message::Volume(volume)) => self.of_volume(volume, &params, call).await?,
             Some(Message::Depth(pb::DepthViews { views, workspace })) => {
                 one_cube(&workspace, "depth.workspace.extent")?;
-                let fused = self.of_views(views.len(), workspace, &params, call, depth(views)).await;
-                fused.map_err(|refusal| inside("depth", refusal))?
+                let prepared = self.of_views(views.len(), workspace, &params, call, depth(views)).await;
+                prepared.map_err(|refusal| inside("depth", refusal))?
             }
             Some(Message::Clouds(pb::CloudViews { views, workspace })) => {
                 one_cube(&workspace, "clouds.workspace.extent")?;
-                let fused = self.of_views(views.len(), workspace, &params, call, clouds(views)).await;
-                fused.map_err(|refusal| inside("clouds", refusal))?
+                let prepared = self.of_views(views.len(), workspace, &params, call, clouds(views)).await;
+                prepared.map_err(|refusal| inside("clouds", refusal))?
             }
         };
-        if engine.source.network().is_none() {
-            let value = format_args!("`{}`", engine.source.name());
+        let source = &prepared.engine.source;
+        if source.network().is_none() {
+            let value = format_args!("`{}`", source.name());
             return Err(FieldError::new("options.model", value, "which has no network and cannot score").into());
         }
-        match scenes.into_iter().next() {
-            Some(scene) => call.submit_candidates(&engine, scene, &candidates, origin, observed),
-            // Cannot happen: views without a surface are refused.
-            None => Err(EngineError::SessionEnded.into()),
-        }
+        PendingReply::score(call, prepared, params, &candidates)?.response(call).await
     }
 
     /// Finds the table in a view.
@@ -309,25 +304,14 @@ impl GraspRpc {
     }
 }
 
-/// Converts depth images, and finds the table if the workspace asks for it.
+/// Converts depth images for a workspace.
 fn depth(mut views: Vec<pb::DepthView>) -> impl FnOnce(&mut Workspace, f64, f64) -> Result<Placed, FieldError> {
-    move |workspace, table, edge| {
-        check_png(&views)?;
-        let table = workspace.find_table(&mut views, table, edge)?;
-        let views = views.iter().enumerate();
-        let views = views.map(|(index, view)| depth_view(view, index, &workspace.frame_from_task));
-        Ok((Observation::Depth(views.collect::<Result<_, _>>()?), table))
-    }
+    move |workspace, table, edge| Observation::of_depth(&mut views, workspace, table, edge)
 }
 
-/// Converts point clouds, and finds the table if the workspace asks for it.
+/// Converts point clouds for a workspace.
 fn clouds(views: Vec<pb::CloudView>) -> impl FnOnce(&mut Workspace, f64, f64) -> Result<Placed, FieldError> {
-    move |workspace, table, edge| {
-        let table = workspace.find_table_in_clouds(&views, table, edge)?;
-        let views = views.iter().enumerate();
-        let views = views.map(|(index, view)| cloud_view(view, index, &workspace.frame_from_task));
-        Ok((Observation::Clouds(views.collect::<Result<_, _>>()?), table))
-    }
+    move |workspace, table, edge| Observation::of_clouds(&views, workspace, table, edge)
 }
 
 /// The refusal of a field of `message`, with the path from the request. Options are not in it.
@@ -336,25 +320,6 @@ fn inside(message: &str, refusal: Refusal) -> Refusal {
         Refusal::Field(error) if !error.field.starts_with("options") => Refusal::Field(error.inside(message)),
         refusal => refusal,
     }
-}
-
-/// Fuses views into the scenes of a workspace. Stops when `is_wanted` returns false.
-fn fuse(
-    engine: &Engine,
-    params: &DetectParams,
-    workspace: &Workspace,
-    mut observation: Observation,
-    table: Option<pb::FoundTable>,
-    is_wanted: &dyn Fn() -> bool,
-) -> Result<Fused, Refusal> {
-    let started = Instant::now();
-    params.check_objects(observation.is_labelled())?;
-    let mut cubes = Cubes::of(&engine.source, workspace, &observation.cameras(), params.margin)?;
-    let integrated = cubes.integrate(&mut observation, params.table, is_wanted)?;
-    let (warnings, depth_factors) = (integrated.warnings.clone(), integrated.depth_factors.clone());
-    let objects = observation.objects(cubes.frame_from_task(), &params.objects)?;
-    let scenes = cubes.scenes(integrated, objects.as_ref(), params)?;
-    Ok((scenes, Observed { fusion: Some(started.elapsed()), warnings, table, depth_factors }))
 }
 
 /// Runs `work` on a thread for blocking tasks, to keep the async runtime's threads free. It is passed a function that
@@ -420,12 +385,12 @@ impl GraspService for GraspRpc {
         let mut request = request.into_inner();
         let recording = self.recorder.request(|| Recorded::Score(request.clone()));
         let (mut call, checked) = self.calls.open(std::mem::take(&mut request.request_id), context);
-        let pending = match checked {
-            Ok(()) => self.submit_candidates(request, &mut call).await,
+        let outcome = match checked {
+            Ok(()) => self.scores(request, &mut call).await,
             Err(refusal) => Err(refusal),
         };
         let id = call.id.clone();
-        let outcome = call.finish_scores(pending).await;
+        let outcome = outcome.map_err(|refusal| call.end(refusal));
         recording.answered(&outcome, |response| Answer::Scores(response.clone()));
         outcome.map(Response::new).map_err(|refusal| refusal.status(&id))
     }

@@ -19,10 +19,11 @@ use tonic::{Request, Response, Status};
 use crate::readiness::State;
 use crate::rpc::call::{Call, CallContext, Calls, WARM_UP};
 use crate::rpc::infer_request::{FP32, batches, check_parameters};
-use crate::rpc::refusal::Refusal;
+use crate::rpc::pending;
 use crate::serving::control::{Change, ModelControl};
 use crate::serving::engine::Engine;
 use crate::serving::job::{EngineError, Reply, Tensors};
+use crate::serving::refusal::Refusal;
 use crate::serving::registry::{ModelRegistry, Unavailable};
 use crate::telemetry::metrics::Metrics;
 use crate::telemetry::timings::StageTimings;
@@ -217,7 +218,7 @@ impl GrpcInferenceService for InferenceRpc {
         &self,
         _: Request<oip::ServerLiveRequest>,
     ) -> Result<Response<oip::ServerLiveResponse>, Status> {
-        let live = *self.calls.state().borrow() != State::Hanging;
+        let live = *self.calls.state().borrow() != State::Unable;
         Ok(Response::new(oip::ServerLiveResponse { live }))
     }
 
@@ -279,16 +280,18 @@ impl GrpcInferenceService for InferenceRpc {
         let (mut call, checked) = self.calls.open(request.id.clone(), context);
         let id = call.id.clone();
         let inference = self.clone();
-        let (call, request, queued) = copying(&id, move || {
+        let (mut call, request, queued) = copying(&id, move || {
             let queued = checked.and_then(|()| inference.submit(&request, &mut call));
             (call, request, queued)
         })
         .await?;
         let outcome = match queued {
-            Ok(Queued { engine, replies, permit }) => call.maps(replies).await.map(|maps| (engine, permit, maps)),
-            Err(refusal) => Err(call.end(refusal)),
+            Ok(Queued { engine, replies, permit }) => {
+                pending::maps(&mut call, replies).await.map(|maps| (engine, permit, maps))
+            }
+            Err(refusal) => Err(refusal),
         };
-        let (engine, permit, (maps, timings)) = outcome.map_err(|refusal| refusal.status(&id))?;
+        let (engine, permit, (maps, timings)) = outcome.map_err(|refusal| call.end(refusal).status(&id))?;
         let mut response = Response::new(copying(&id, move || response(request, &engine, &maps, &timings)).await?);
         response.extensions_mut().insert(permit);
         Ok(response)

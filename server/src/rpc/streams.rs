@@ -13,9 +13,10 @@ use tonic::codegen::BoxStream;
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::readiness::draining;
-use crate::rpc::call::{Call, CallContext, PendingReply};
+use crate::rpc::call::{Call, CallContext};
 use crate::rpc::grasp_service::{GraspRpc, PendingCall, blocking};
-use crate::rpc::refusal::Refusal;
+use crate::rpc::pending::{PendingReply, Prepared};
+use crate::serving::refusal::Refusal;
 use crate::serving::tracking::{Start, Track, TrackPermit};
 use crate::telemetry::recorder::Pending;
 
@@ -145,8 +146,8 @@ impl GraspRpc {
         .await?;
         *track = new;
         self.tracked_volumes.resize(volumes, track.as_ref().map_or(1, Track::volumes))?;
-        let (scenes, origin, observed) = fused?;
-        call.submit(&engine, scenes, params, origin, observed)
+        let ((scenes, observed), origin) = fused?;
+        PendingReply::detect(call, Prepared { engine, scenes, observed, origin }, params)
     }
 }
 

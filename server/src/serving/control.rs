@@ -3,7 +3,7 @@
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 
-use crate::rpc::refusal::Refusal;
+use crate::serving::refusal::Refusal;
 
 /// Sends requests to the task that watches the model folder.
 #[derive(Clone)]

@@ -1,14 +1,15 @@
 use std::sync::Arc;
+use std::time::Instant;
 
 use grasp::{Fusion, ObjectMap, Region, SurfacePoint, Tile, WORKSPACE_SIZE, Warning};
 use grasp_planner::{Scene, Source};
-use grasp_proto::{DetectParams, FieldError, Workspace};
+use grasp_proto::{DetectParams, FieldError, Workspace, pb};
 use nalgebra::{Isometry3, Point3};
 
 use super::job::EngineError;
-use super::observation::{Observation, at};
+use super::observation::{Observation, Observed, at};
+use super::refusal::Refusal;
 use super::scene::{FusionGrid, PointSampler, empty, sees_nothing};
-use crate::rpc::refusal::Refusal;
 
 /// The cubes that cover a workspace: one, or several overlapping ones for a workspace with an extent.
 pub(crate) struct Cubes {
@@ -21,6 +22,8 @@ pub(crate) struct Cubes {
     extent: [f64; 2],
     /// Whether to correct the scale of the depths.
     corrects_depth_scale: bool,
+    /// Whether views of several requests are integrated.
+    is_tracked: bool,
 }
 
 /// A cube and the field that its views are fused into.
@@ -40,23 +43,11 @@ pub(crate) struct CubeScene {
     pub params: DetectParams,
 }
 
-/// What the views of a request show besides the fused fields.
-pub(crate) struct Integrated {
-    /// For each cube the observed points, if the planner needs them.
-    points: Vec<Option<Vec<SurfacePoint>>>,
-    /// By which the depths of each view were multiplied; empty if they are not to be corrected.
-    pub depth_factors: Vec<f64>,
-    /// Signs that the geometry is wrong.
-    pub warnings: Vec<Warning>,
-}
+/// The scenes of a request with views, and what their fusion showed.
+pub(crate) type Fused = (Vec<CubeScene>, Observed);
 
-impl Integrated {
-    /// The same without observed points.
-    pub fn without_points(mut self) -> Self {
-        self.points.iter_mut().for_each(|points| *points = None);
-        self
-    }
-}
+/// For each cube the observed points, if the planner needs them.
+type CubePoints = Vec<Option<Vec<SurfacePoint>>>;
 
 impl Cubes {
     /// The cubes that a planner requires for a workspace. `cameras` are in the task frame, metres.
@@ -89,6 +80,7 @@ impl Cubes {
             task_from_middle: Isometry3::translation(x, y, 0.0),
             extent: extent.unwrap_or([edge; 2]),
             corrects_depth_scale: correct_depth_scale,
+            is_tracked: false,
         })
     }
 
@@ -119,10 +111,14 @@ impl Cubes {
         self.cubes.len()
     }
 
-    /// The cubes, whose fields forget with this half-life, views.
-    pub fn forgetting(mut self, half_life: f64) -> Self {
-        for cube in &mut self.cubes {
-            cube.fusion = cube.fusion.clone().forgetting(half_life);
+    /// The cubes for views of several requests, whose fields forget with this half-life, views. Without it all views have
+    /// the same weight.
+    pub fn tracked(mut self, half_life: Option<f64>) -> Self {
+        self.is_tracked = true;
+        if let Some(half_life) = half_life {
+            for cube in &mut self.cubes {
+                cube.fusion = cube.fusion.clone().forgetting(half_life);
+            }
         }
         self
     }
@@ -137,25 +133,51 @@ impl Cubes {
         self.cubes.iter().try_for_each(|cube| cube.grid.check(source))
     }
 
-    /// Integrates views, each of which must see a part of the workspace. `table` is the height of the table in it,
-    /// metres, to which the scale of the depths is corrected, if the workspace asks for it. Stops when `is_wanted` returns
-    /// false.
-    pub fn integrate(
+    /// Integrates the views of a request, and returns the scenes for the planner. `found` is the table that determined the
+    /// workspace. Stops when `is_wanted` returns false.
+    pub fn fuse(
         &mut self,
+        mut observation: Observation,
+        found: Option<pb::FoundTable>,
+        params: &DetectParams,
+        is_wanted: &dyn Fn() -> bool,
+    ) -> Result<Fused, Refusal> {
+        let started = Instant::now();
+        params.check_objects(observation.is_labelled())?;
+        let (depth_factors, mut warnings) = self.correct_depth_scale(&mut observation, params.table)?;
+        let points = self.integrate(&observation, &mut warnings, is_wanted)?;
+        let objects = observation.objects(&self.frame_from_task, &params.objects)?;
+        let scenes = self.scenes(points, objects.as_ref(), params)?;
+        Ok((scenes, Observed { fusion: Some(started.elapsed()), warnings, table: found, depth_factors }))
+    }
+
+    /// Corrects the scale of the depths if the workspace asks for it, so that the table is at the height `table`, metres.
+    /// Returns the factor of each view, and warnings.
+    fn correct_depth_scale(
+        &self,
         observation: &mut Observation,
         table: Option<f64>,
-        is_wanted: &dyn Fn() -> bool,
-    ) -> Result<Integrated, Refusal> {
-        let (depth_factors, mut warnings) = match (self.corrects_depth_scale, table) {
-            (false, _) => Default::default(),
-            (true, Some(table)) => observation.correct_depth_scale(table, self.extent),
+    ) -> Result<(Vec<f64>, Vec<Warning>), FieldError> {
+        match (self.corrects_depth_scale, table) {
+            (false, _) => Ok(Default::default()),
+            (true, Some(table)) => Ok(observation.correct_depth_scale(table, self.extent)),
             (true, None) => {
                 let needed = "must be false without a table, which a negative collision.table_height means";
-                return Err(FieldError::new("workspace.correct_depth_scale", true, needed).into());
+                Err(FieldError::new("workspace.correct_depth_scale", true, needed))
             }
-        };
-        let mut samplers: Vec<_> =
-            self.cubes.iter().map(|cube| cube.grid.needs_points().then(PointSampler::default)).collect();
+        }
+    }
+
+    /// Integrates views, each of which must see a part of the workspace. Returns the observed points of untracked cubes:
+    /// those of earlier requests are not stored.
+    fn integrate(
+        &mut self,
+        observation: &Observation,
+        warnings: &mut Vec<Warning>,
+        is_wanted: &dyn Fn() -> bool,
+    ) -> Result<CubePoints, Refusal> {
+        let samples = |cube: &Cube| cube.grid.needs_points() && !self.is_tracked;
+        let mut samplers: Vec<_> = self.cubes.iter().map(|cube| samples(cube).then(PointSampler::default)).collect();
         for (index, camera) in observation.cameras().iter().enumerate() {
             if let Some(grid) = self.cubes.first().map(|cube| &cube.grid).filter(|grid| !grid.needs_points()) {
                 warnings.extend(Warning::of_camera(index, &(at(camera) * self.task_from_middle), grid.size()));
@@ -179,14 +201,13 @@ impl Cubes {
         if unseen.len() == self.cubes.len() {
             warnings.extend(unseen.first());
         }
-        let points = samplers.into_iter().map(|sampler| sampler.map(PointSampler::into_points)).collect();
-        Ok(Integrated { points, depth_factors, warnings })
+        Ok(samplers.into_iter().map(|sampler| sampler.map(PointSampler::into_points)).collect())
     }
 
     /// The scenes for the planner: those of the cubes in which something stands on the table, and at least one.
-    pub fn scenes(
+    fn scenes(
         &self,
-        integrated: Integrated,
+        points: CubePoints,
         objects: Option<&Arc<ObjectMap>>,
         params: &DetectParams,
     ) -> Result<Vec<CubeScene>, FieldError> {
@@ -196,7 +217,7 @@ impl Cubes {
             params.constraints.workspace = cube.region(&self.frame_from_task, params.margin);
             Some(CubeScene { scene: Scene { volume, points }, params })
         };
-        let mut scenes: Vec<_> = self.cubes.iter().zip(integrated.points).filter_map(scene).collect();
+        let mut scenes: Vec<_> = self.cubes.iter().zip(points).filter_map(scene).collect();
         let is_used = |scene: &CubeScene| {
             params.table.is_none_or(|table| scene.scene.volume.has_surface_above(table + OBJECT_HEIGHT))
         };

@@ -144,8 +144,13 @@ impl Engine {
         ModelLabels([self.label.clone(), provider.to_string(), precision.to_string(), self.source.sha256().to_owned()])
     }
 
+    /// Whether a session neither hangs in an inference nor fails each one.
+    pub fn is_able(&self) -> bool {
+        self.running.iter().any(|session| session.is_able())
+    }
+
     /// Whether every session hangs in an inference.
-    pub fn is_hanging(&self) -> bool {
+    fn is_hanging(&self) -> bool {
         self.running.iter().all(|session| session.is_hanging())
     }
 

@@ -1,9 +1,10 @@
 use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::sync::Arc;
+use std::time::Duration;
 
 use grasp::{DepthImage, ObjectMap, View, Warning, depth_factor, seen_from};
-use grasp_proto::{FieldError, Points};
+use grasp_proto::{FieldError, MAX_VIEWS, Points, Workspace, check_png, cloud_view, depth_view, pb};
 use nalgebra::{Isometry3, Point3, Translation3};
 
 use super::scene::sees_nothing;
@@ -14,10 +15,63 @@ pub(crate) enum Observation {
     Clouds(Vec<Points>),
 }
 
+/// What the cameras saw, and the table that determined the pose of the workspace.
+pub(crate) type Placed = (Observation, Option<pb::FoundTable>);
+
+/// What the fusion of a request's views showed. The default is a request with a volume.
+#[derive(Default)]
+pub(crate) struct Observed {
+    /// The time that the fusion took.
+    pub fusion: Option<Duration>,
+    /// Signs that the geometry of the request is wrong.
+    pub warnings: Vec<Warning>,
+    /// The table that determined the workspace.
+    pub table: Option<pb::FoundTable>,
+    /// By which the depths of each view were multiplied; empty if they were not to be corrected.
+    pub depth_factors: Vec<f64>,
+}
+
 /// Labelled pixels of an image, and points of a cloud for its scale, that are used, about.
 const SAMPLES: usize = 100_000;
 
 impl Observation {
+    /// Depth images. If the workspace asks for it, its pose is determined from the table in the first of them, with the
+    /// table at the height `table` in cubes with this edge, metres.
+    pub fn of_depth(
+        views: &mut [pb::DepthView],
+        workspace: &mut Workspace,
+        table: f64,
+        edge: f64,
+    ) -> Result<Placed, FieldError> {
+        check_png(views)?;
+        let table = workspace.find_table(views, table, edge)?;
+        Ok((Self::depth(views, &workspace.frame_from_task)?, table))
+    }
+
+    /// Depth images in a workspace of known pose.
+    pub fn depth(views: &[pb::DepthView], frame_from_task: &Isometry3<f64>) -> Result<Self, FieldError> {
+        if views.len() > MAX_VIEWS {
+            let needed = format_args!("must have at most {MAX_VIEWS}");
+            return Err(FieldError::new("views", format_args!("a list of {}", views.len()), needed));
+        }
+        check_png(views)?;
+        let views = views.iter().enumerate().map(|(index, view)| depth_view(view, index, frame_from_task));
+        Ok(Self::Depth(views.collect::<Result<_, _>>()?))
+    }
+
+    /// Point clouds, as [`of_depth`](Self::of_depth).
+    pub fn of_clouds(
+        views: &[pb::CloudView],
+        workspace: &mut Workspace,
+        table: f64,
+        edge: f64,
+    ) -> Result<Placed, FieldError> {
+        let table = workspace.find_table_in_clouds(views, table, edge)?;
+        let views = views.iter().enumerate();
+        let views = views.map(|(index, view)| cloud_view(view, index, &workspace.frame_from_task));
+        Ok((Self::Clouds(views.collect::<Result<_, _>>()?), table))
+    }
+
     /// Positions of the cameras in the task frame, metres.
     pub fn cameras(&self) -> Vec<Point3<f64>> {
         match self {

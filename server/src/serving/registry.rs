@@ -3,8 +3,8 @@ use std::sync::{Arc, PoisonError, RwLock};
 use grasp::Volume;
 use grasp_proto::{FieldError, on_a_line, pb};
 
-use crate::rpc::refusal::Refusal;
 use crate::serving::engine::Engine;
+use crate::serving::refusal::Refusal;
 use grasp_planner::Source;
 
 /// The models of the model folder.

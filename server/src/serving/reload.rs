@@ -14,10 +14,10 @@ use tracing::{error, info, warn};
 
 use crate::config::Config;
 use crate::readiness::State;
-use crate::rpc::refusal::Refusal;
 use crate::serving::control::{Change, Command, ModelControl};
 use crate::serving::engine::{Engine, Serving};
 use crate::serving::model_files::ModelFiles;
+use crate::serving::refusal::Refusal;
 use crate::serving::registry::{ModelRegistry, Unavailable};
 use crate::serving::session_threads::SessionThreads;
 use crate::serving::stamps::{DEFAULT, Stamps, stamps};

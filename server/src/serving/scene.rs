@@ -143,9 +143,7 @@ impl PointSampler {
             self.stride *= 2;
         }
     }
-}
 
-impl PointSampler {
     pub fn into_points(self) -> Vec<SurfacePoint> {
         self.points
     }

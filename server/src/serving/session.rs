@@ -76,6 +76,8 @@ struct Batch<'a> {
     running: &'a Running,
     /// None when the session counts as idle again.
     queue: Option<&'a Queue<Job>>,
+    /// Whether a scene succeeded; None if none of them succeeded or failed.
+    succeeded: Option<bool>,
 }
 
 impl Batch<'_> {
@@ -85,6 +87,15 @@ impl Batch<'_> {
         let time = self.taken.elapsed();
         if time > self.service_time.get().long && !self.running.is_hanging() {
             self.service_time.add(time, self.scenes);
+        }
+    }
+
+    /// Counts the outcome of a scene. A request that has expired or that cannot be decoded says nothing about the session.
+    fn note_outcome(&mut self, error: Option<&EngineError>) {
+        match error {
+            None => self.succeeded = Some(true),
+            Some(EngineError::Run(_) | EngineError::Panic(_)) => _ = self.succeeded.get_or_insert(false),
+            Some(_) => {}
         }
     }
 
@@ -98,6 +109,9 @@ impl Batch<'_> {
 impl Drop for Batch<'_> {
     fn drop(&mut self) {
         self.free();
+        if let Some(succeeded) = self.succeeded {
+            self.running.computed(succeeded);
+        }
     }
 }
 
@@ -150,8 +164,15 @@ impl Session {
             let Self { planner, defaults, queue, running, service_time, .. } = &mut self;
             let _ended = running.begin(&jobs);
             let scenes = u32::try_from(jobs.len()).unwrap_or(u32::MAX);
-            let batch =
-                Batch { taken: now, inference: Duration::ZERO, scenes, service_time, running, queue: Some(queue) };
+            let batch = Batch {
+                taken: now,
+                inference: Duration::ZERO,
+                scenes,
+                service_time,
+                running,
+                queue: Some(queue),
+                succeeded: None,
+            };
             match planner {
                 Loaded::Network(network) => infer(network, *defaults, jobs, batch),
                 Loaded::Single(planner) => {
@@ -184,6 +205,7 @@ fn infer(network: &mut NetworkPlanner, defaults: DecodeParams, jobs: Vec<Job>, m
                 span.in_scope(|| error!(%error, "the session failed"));
                 drop(span);
                 batch.free();
+                batch.note_outcome(Some(error));
                 task.fail(error.clone());
                 continue;
             }
@@ -267,6 +289,7 @@ fn send_result<T: Send + 'static>(
     let queue = taken.duration_since(submitted);
     let postprocessing = started.elapsed().saturating_sub(evaluation.unwrap_or_default());
     batch.free();
+    batch.note_outcome(result.as_ref().err());
     reply.send(result.map(|value| SessionOutput { value, queue, inference, evaluation, postprocessing }));
 }
 

@@ -1,8 +1,8 @@
-//! The session threads of all engines. An inference that does not end loses its thread: its requests are failed, and a
-//! model without another session is reported.
+//! The session threads of all engines. An inference that does not end loses its thread: its requests are failed. A model
+//! is reported if all of its sessions hang, or fail again and again.
 
 use std::io;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
@@ -34,9 +34,14 @@ pub(super) struct Running {
     batch: Mutex<Option<Batch>>,
     /// When the latest batch ended, milliseconds since 1970.
     latest: AtomicU64,
+    /// Number of the latest batches that failed, one after another.
+    failures: AtomicU32,
     /// Number of the model's sessions that hang.
     hanging: IntGauge,
 }
+
+/// Failed batches, one after another, after which a session counts as failing: fewer may be due to their scenes.
+const FAILURES: u32 = 10;
 
 struct Batch {
     since: Instant,
@@ -55,7 +60,7 @@ impl Drop for Ended<'_> {
 
 impl Running {
     pub fn new(hanging: IntGauge) -> Self {
-        Self { batch: Mutex::default(), latest: AtomicU64::new(0), hanging }
+        Self { batch: Mutex::default(), latest: AtomicU64::new(0), failures: AtomicU32::new(0), hanging }
     }
 
     /// The batch runs until the returned value is dropped.
@@ -80,6 +85,25 @@ impl Running {
 
     pub fn is_hanging(&self) -> bool {
         self.batch().as_ref().is_some_and(|batch| batch.is_hanging)
+    }
+
+    /// Counts a batch that succeeded or failed.
+    pub fn computed(&self, succeeded: bool) {
+        let before = if succeeded {
+            self.failures.swap(0, Ordering::Relaxed)
+        } else {
+            self.failures.fetch_add(1, Ordering::Relaxed)
+        };
+        match (succeeded, before + u32::from(!succeeded)) {
+            (false, FAILURES) => error!("{FAILURES} batches have failed, one after another; the session counts as failing"),
+            (true, FAILURES..) => info!("the session no longer fails"),
+            _ => {}
+        }
+    }
+
+    /// Whether the session neither hangs nor fails each batch.
+    pub fn is_able(&self) -> bool {
+        !self.is_hanging() && self.failures.load(Ordering::Relaxed) < FAILURES
     }
 
     /// Fails the requests of a batch that takes longer than `timeout`. Returns whether the session hangs from now on.
@@ -116,14 +140,22 @@ impl SessionThreads {
         Ok(())
     }
 
-    /// Looks for inferences that take longer than `timeout`, without end. `is_able` receives whether each served model has
-    /// a session that does not hang.
-    pub async fn watch(self: Arc<Self>, models: Arc<ModelRegistry>, timeout: Duration, is_able: watch::Sender<bool>) {
-        let pause = (timeout / 10).clamp(Duration::from_millis(10), Duration::from_secs(1));
+    /// Watches the sessions, without end. An inference that takes longer than `timeout` hangs. `is_able` receives whether
+    /// each served model has a session that neither hangs nor fails.
+    pub async fn watch(
+        self: Arc<Self>,
+        models: Arc<ModelRegistry>,
+        timeout: Option<Duration>,
+        is_able: watch::Sender<bool>,
+    ) {
+        const LONGEST: Duration = Duration::from_secs(1);
+        let pause = timeout.map_or(LONGEST, |timeout| (timeout / 10).clamp(Duration::from_millis(10), LONGEST));
         loop {
             tokio::time::sleep(pause).await;
-            self.check(timeout);
-            let able = models.now().iter().all(|engine| !engine.is_hanging());
+            if let Some(timeout) = timeout {
+                self.check(timeout);
+            }
+            let able = models.now().iter().all(|engine| engine.is_able());
             is_able.send_if_modified(|before| std::mem::replace(before, able) != able);
         }
     }

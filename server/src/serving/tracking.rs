@@ -1,19 +1,16 @@
 use std::ops::RangeInclusive;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use grasp_proto::{
-    DetectParams, FieldError, MAX_VIEWS, TABLE_HEIGHT, Workspace, check_count, check_png, depth_view, pb,
-};
-use nalgebra::Isometry3;
+use grasp_proto::{DetectParams, FieldError, TABLE_HEIGHT, Workspace, check_count, pb};
 use prometheus::IntGauge;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
-use crate::rpc::call::{FrameStamp, Observed};
-use crate::rpc::refusal::Refusal;
-use crate::serving::cubes::{CubeScene, Cubes, edge};
-use crate::serving::engine::Engine;
-use crate::serving::observation::Observation;
+use super::cubes::{Cubes, Fused, edge};
+use super::engine::Engine;
+use super::frame_stamp::FrameStamp;
+use super::observation::Observation;
+use super::refusal::Refusal;
 
 /// Limits on TrackGrasps streams: the number of their volumes, and the time without a request.
 pub(crate) struct TrackedVolumes {
@@ -116,9 +113,6 @@ impl Start {
     }
 }
 
-/// The scenes, frame and stamp, and what the fusion showed.
-type Fused = (Vec<CubeScene>, FrameStamp, Observed);
-
 /// Shortest and longest half-life, views.
 const HALF_LIFE: RangeInclusive<f64> = 0.5..=10_000.0;
 
@@ -132,16 +126,16 @@ impl Track {
         start: Option<Start>,
         views: &mut [pb::DepthView],
         is_wanted: &dyn Fn() -> bool,
-    ) -> (Option<Self>, Result<Fused, Refusal>) {
+    ) -> (Option<Self>, Result<(Fused, FrameStamp), Refusal>) {
         match (track, start) {
             (None, None) => {
                 let missing = FieldError::new("workspace", "absent", "must be given in the first request of a stream");
                 (None, Err(missing.into()))
             }
             (Some(mut track), None) => {
-                let views = converted(views, track.cubes.frame_from_task());
-                let fused = views.map_err(Refusal::from);
-                let fused = fused.and_then(|views| track.add(engine, params, views, None, is_wanted));
+                let views = Observation::depth(views, track.cubes.frame_from_task());
+                let views = views.map_err(Refusal::from);
+                let fused = views.and_then(|views| track.add(engine, params, views, None, is_wanted));
                 (Some(track), fused)
             }
             (track, Some(start)) => match Self::start(engine, &params, start, views) {
@@ -149,7 +143,7 @@ impl Track {
                     let fused = track.add(engine, params, views, table, is_wanted);
                     (Some(track), fused)
                 }
-                Err(refusal) => (track, Err(refusal)),
+                Err(refusal) => (track, Err(refusal.into())),
             },
         }
     }
@@ -160,19 +154,14 @@ impl Track {
         params: &DetectParams,
         Start { mut workspace, origin, half_life }: Start,
         views: &mut [pb::DepthView],
-    ) -> Result<(Self, Observation, Option<pb::FoundTable>), Refusal> {
+    ) -> Result<(Self, Observation, Option<pb::FoundTable>), FieldError> {
         // The rotation of the grid may depend on the camera positions.
         check_count(views.len())?;
-        check_png(views)?;
         let edge = edge(&engine.source, workspace.size);
-        let table = workspace.find_table(views, params.table.unwrap_or(TABLE_HEIGHT), edge)?;
-        let views = converted(views, &workspace.frame_from_task)?;
+        let height = params.table.unwrap_or(TABLE_HEIGHT);
+        let (views, table) = Observation::of_depth(views, &mut workspace, height, edge)?;
         let cubes = Cubes::of(&engine.source, &workspace, &views.cameras(), params.margin)?;
-        let cubes = match half_life {
-            Some(half_life) => cubes.forgetting(half_life),
-            None => cubes,
-        };
-        Ok((Self { cubes, origin, params: params.clone() }, views, table))
+        Ok((Self { cubes: cubes.tracked(half_life), origin, params: params.clone() }, views, table))
     }
 
     /// Number of volumes.
@@ -184,30 +173,13 @@ impl Track {
         &mut self,
         engine: &Engine,
         params: DetectParams,
-        mut views: Observation,
+        views: Observation,
         table: Option<pb::FoundTable>,
         is_wanted: &dyn Fn() -> bool,
-    ) -> Result<Fused, Refusal> {
-        let started = Instant::now();
+    ) -> Result<(Fused, FrameStamp), Refusal> {
         self.cubes.check(&engine.source)?;
-        params.check_objects(views.is_labelled())?;
-        let integrated = self.cubes.integrate(&mut views, params.table, is_wanted)?;
-        let (warnings, depth_factors) = (integrated.warnings.clone(), integrated.depth_factors.clone());
-        let objects = views.objects(self.cubes.frame_from_task(), &params.objects)?;
-        // Without points: those of earlier views are not stored.
-        let scenes = self.cubes.scenes(integrated.without_points(), objects.as_ref(), &params)?;
+        let fused = self.cubes.fuse(views, table, &params, is_wanted)?;
         self.params = params;
-        let observed = Observed { fusion: Some(started.elapsed()), warnings, table, depth_factors };
-        Ok((scenes, self.origin.clone(), observed))
+        Ok((fused, self.origin.clone()))
     }
-}
-
-fn converted(views: &[pb::DepthView], frame_from_task: &Isometry3<f64>) -> Result<Observation, FieldError> {
-    if views.len() > MAX_VIEWS {
-        let needed = format_args!("must have at most {MAX_VIEWS}");
-        return Err(FieldError::new("views", format_args!("a list of {}", views.len()), needed));
-    }
-    check_png(views)?;
-    let views = views.iter().enumerate().map(|(index, view)| depth_view(view, index, frame_from_task));
-    Ok(Observation::Depth(views.collect::<Result<_, _>>()?))
 }

@@ -18,7 +18,7 @@ use prost::Message;
 use tonic::Code;
 use tracing::warn;
 
-use crate::rpc::refusal::Refusal;
+use crate::serving::refusal::Refusal;
 
 /// Recordings that wait to be written. Further ones are dropped and counted, so that a slow disk delays no reply.
 const WAITING: usize = 64;
