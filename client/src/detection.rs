@@ -338,9 +338,10 @@ impl Options {
         pb::TrackGraspsRequest {
             half_life: half_life.filter(|_| workspace.is_some()),
             views: views.iter().map(Into::into).collect(),
-            workspace: workspace.map(|workspace| workspace.message(self.frame_id, self.stamp)),
+            workspace: workspace.map(|workspace| workspace.message(self.frame_id, None)),
             request_id: self.request_id,
             options: Some(self.detect),
+            stamp: self.stamp.map(Into::into),
         }
     }
 }

@@ -165,7 +165,7 @@ async fn serve(
     let budget = metrics.receiving(config.max_receiving_bytes);
     let http_config = HttpConfig { connections: crate::http::CONNECTIONS, tls: None, budget: Arc::clone(&budget) };
     let http = tokio::spawn(crate::http::serve(http, config.http_hosts.clone(), pages, http_config, state.clone()));
-    let calls = Calls::new(Arc::clone(metrics), recent, state.clone());
+    let calls = Calls::new(Arc::clone(metrics), recent, state.clone(), tokens.clone());
     let (folder, control) =
         ModelFolder::new(config, Arc::clone(&models), Arc::clone(sessions), Arc::clone(metrics), state.clone());
     let loads = folder.loads();

@@ -437,14 +437,15 @@ class TrackTest(ServerTest):
 
     def test_each_view_is_added_to_those_before_it(self):
         cameras = [scene.camera(40, azimuth) for azimuth in (-90, 0, 90)]
-        workspace = graspd.Workspace(np.linalg.inv(scene.camera(40, 0)), frame_id="base")
+        workspace = graspd.Workspace(np.linalg.inv(scene.camera(40, 0)), frame_id="base", stamp=7)
         with self.client.track(workspace) as tracking:
             for seen, view in enumerate(views(cameras), 1):
-                kept = tracking.add([view], LOW if seen == 1 else None)
+                kept = tracking.add([view], LOW if seen == 1 else None, stamp=None if seen == 1 else 10 * seen)
                 expected = self.client.detect_from_depth(views(cameras[:seen]), workspace, LOW)
                 self.assertTrue(kept.grasps)
                 np.testing.assert_allclose(positions(kept), positions(expected), atol=1e-9)
                 self.assertEqual((kept.frame_id, self.server.metric(TRACKED)), ("base", 1))
+                self.assertEqual(kept.stamp, 7 if seen == 1 else 10 * seen)
             self.assertEqual(tracking.add(options=replace(LOW, max_grasps=1)).grasps, kept.grasps[:1])
         self.wait_until_none_is_tracked()
 

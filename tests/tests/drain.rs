@@ -11,6 +11,10 @@ use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio_stream::StreamExt;
 use tokio_stream::wrappers::ReceiverStream;
+use tonic::transport::Endpoint;
+use tonic_reflection::pb::v1::ServerReflectionRequest;
+use tonic_reflection::pb::v1::server_reflection_client::ServerReflectionClient;
+use tonic_reflection::pb::v1::server_reflection_request::MessageRequest;
 
 fn volume() -> Volume {
     blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]])
@@ -61,6 +65,23 @@ async fn an_open_stream_is_ended_with_unavailable() {
     // The client keeps its side open; the server ends the stream with an error.
     let ended = replies.next().await.expect("the error that ends the stream").unwrap_err();
     assert_eq!(ended.code(), Some(tonic::Code::Unavailable), "{ended}");
+    assert!(replies.next().await.is_none());
+    assert_eq!(server.wait().unwrap().code(), Some(0));
+    drop(send);
+}
+
+#[tokio::test]
+async fn an_open_reflection_stream_does_not_delay_the_exit() {
+    let mut server = Server::run(&[TestModel::new("mirror")], &["--drain-timeout", "3600"]);
+    let channel = Endpoint::from_shared(format!("http://{}", server.grpc())).unwrap().connect().await.unwrap();
+    let mut client = ServerReflectionClient::new(channel);
+    let (send, requests) = mpsc::channel(1);
+    let message_request = Some(MessageRequest::ListServices(String::new()));
+    send.send(ServerReflectionRequest { message_request, ..Default::default() }).await.unwrap();
+    let mut replies = client.server_reflection_info(ReceiverStream::new(requests)).await.unwrap().into_inner();
+    assert!(replies.next().await.unwrap().is_ok());
+    server.terminate().unwrap();
+    // The client keeps its side open.
     assert!(replies.next().await.is_none());
     assert_eq!(server.wait().unwrap().code(), Some(0));
     drop(send);

@@ -1,4 +1,4 @@
-//! Inferences that do not end.
+//! Inferences that do not end, or that always fail.
 
 use std::time::Duration;
 
@@ -94,4 +94,41 @@ async fn a_slow_inference_that_ends_returns_its_session() {
     })
     .await
     .expect("the server is healthy again");
+}
+
+#[tokio::test]
+async fn a_session_that_always_fails_makes_the_server_unhealthy_until_it_succeeds() {
+    let server = Server::run(&[TestModel::new("fragile").fails_at_zero()], &["--inference-timeout", "0"]);
+    let client = server.client().await;
+    let volume = |first: f32| {
+        let mut values = vec![0.5; RESOLUTION.pow(3)];
+        values[0] = first;
+        Volume::new(RESOLUTION, empty().voxel_size(), Isometry3::identity(), values).unwrap()
+    };
+    let (failing, sound) = (volume(0.0), volume(0.5));
+    let fail = async |times: usize| {
+        for _ in 0..times {
+            let (code, message) = detect(&client, &failing, "fragile").await.unwrap_err();
+            assert_eq!(code, Code::Internal, "{message}");
+        }
+    };
+    // Failures that do not follow one another.
+    for _ in 0..3 {
+        fail(9).await;
+        detect(&client, &sound, "fragile").await.unwrap();
+    }
+    // Longer than the pause between two checks.
+    tokio::time::sleep(Duration::from_secs(2)).await;
+    assert_eq!(client.health().await.unwrap(), Health::Serving);
+
+    fail(10).await;
+    server.wait_for("graspd_ready", 0.0).await;
+    assert_eq!(client.health().await.unwrap(), Health::NotServing);
+    for probe in ["/healthz", "/readyz"] {
+        let (status, body) = server.get(probe);
+        assert!(status == 503 && body.contains("fail each one"), "{status} {body}");
+    }
+    detect(&client, &sound, "fragile").await.unwrap();
+    server.wait_for("graspd_ready", 1.0).await;
+    assert_eq!(server.get("/healthz").0, 200);
 }

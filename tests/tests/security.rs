@@ -16,12 +16,15 @@ use tempfile::TempDir;
 use time::OffsetDateTime;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
+use tokio::sync::mpsc;
 use tokio::time::timeout;
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::pki_types::{CertificateDer, ServerName};
 use tokio_rustls::rustls::{self, ClientConfig, RootCertStore};
+use tokio_stream::StreamExt;
+use tokio_stream::wrappers::ReceiverStream;
 use tonic::Code;
 
 fn volume() -> Volume {
@@ -203,6 +206,13 @@ async fn requests_need_a_valid_token_and_sighup_reloads_the_tokens() {
     assert_eq!(client.health().await.unwrap(), Health::Serving);
     refused(client.list_models().await.unwrap_err());
 
+    // A stream that is opened with the first token.
+    let client = Client::connect_with(server.grpc().to_string(), with("first-secret")).await.unwrap();
+    let (send, requests) = mpsc::channel(1);
+    send.send((volume(), Options::default())).await.unwrap();
+    let mut replies = client.detect_stream(ReceiverStream::new(requests)).await.unwrap();
+    assert_eq!(replies.next().await.unwrap().unwrap().grasps.len(), 1);
+
     // First both tokens are valid, then only the new one. A missing file keeps the tokens.
     for (text, good) in [("first-secret\nnew-secret\n", true), ("new-secret\n", false)] {
         fs::write(&file, text).unwrap();
@@ -218,6 +228,9 @@ async fn requests_need_a_valid_token_and_sighup_reloads_the_tokens() {
         };
         timeout(Duration::from_secs(60), applied).await.expect("the file is reloaded");
     }
+    send.send((volume(), Options::default())).await.unwrap();
+    refused(replies.next().await.unwrap().unwrap_err());
+
     fs::remove_file(&file).unwrap();
     server.reload().unwrap();
     server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 3.0).await;

@@ -1,5 +1,7 @@
 //! TrackGrasps: a volume that the server keeps between views.
 
+use std::time::{Duration, SystemTime};
+
 use grasp_client::{DetectOptions, Detection, Error, Extrinsics, Options, Workspace};
 use grasp_proto::pb;
 use grasp_tests::scene::{camera, view};
@@ -32,19 +34,21 @@ async fn each_view_is_added_to_those_before_it() {
 
     let mut tracking = client.track(workspace).await.unwrap();
     for seen in 1..=views.len() {
-        let options = Options { frame_id: "base".to_owned(), ..low() };
+        let stamp = Some(SystemTime::UNIX_EPOCH + Duration::from_secs(seen as u64));
+        let options = Options { frame_id: "base".to_owned(), stamp, ..low() };
         let kept = tracking.add(&views[seen - 1..seen], options).await.unwrap();
         let expected = client.detect_from_depth(&views[..seen], &workspace, low()).await.unwrap();
         let poses = |detection: &Detection| detection.grasps.iter().map(|grasp| grasp.pose).collect::<Vec<_>>();
         assert!(!kept.grasps.is_empty());
         assert_eq!(poses(&kept), poses(&expected), "after {seen} views");
-        assert_eq!(kept.frame_id, "base");
+        assert_eq!((kept.frame_id.as_str(), kept.stamp), ("base", stamp));
         assert_eq!(server.metric(TRACKED), 1.0);
     }
-    // No new view, other options.
+    // No new view, other options, the time of the latest views.
     let detect = DetectOptions { max_grasps: 1, ..low().detect };
     let one = tracking.add(&[], Options { detect, ..Options::default() }).await.unwrap();
     assert_eq!(one.grasps.len(), 1);
+    assert_eq!(one.stamp, Some(SystemTime::UNIX_EPOCH + Duration::from_secs(3)));
 
     drop(tracking);
     server.wait_for(TRACKED, 0.0).await;

@@ -24,6 +24,7 @@ use crate::telemetry::timings::StageTimings;
 use crate::transport::caller::Caller;
 use crate::transport::deadline::{self, Deadline};
 use crate::transport::request_body::unreadable_message;
+use crate::transport::tokens::Tokens;
 
 /// Retry hint while the models are loaded and warmed up.
 pub(super) const WARM_UP: Duration = Duration::from_secs(1);
@@ -34,6 +35,8 @@ pub(crate) struct Calls {
     metrics: Arc<Metrics>,
     recent: Arc<RecentRequests>,
     state: watch::Receiver<State>,
+    /// None if requests need no token.
+    tokens: Option<Arc<Tokens>>,
     ids: Arc<RequestIds>,
 }
 
@@ -75,8 +78,13 @@ impl CallContext {
 }
 
 impl Calls {
-    pub fn new(metrics: Arc<Metrics>, recent: Arc<RecentRequests>, state: watch::Receiver<State>) -> Self {
-        Self { metrics, recent, state, ids: Arc::new(RequestIds::new()) }
+    pub fn new(
+        metrics: Arc<Metrics>,
+        recent: Arc<RecentRequests>,
+        state: watch::Receiver<State>,
+        tokens: Option<Arc<Tokens>>,
+    ) -> Self {
+        Self { metrics, recent, state, tokens, ids: Arc::new(RequestIds::new()) }
     }
 
     pub fn state(&self) -> watch::Receiver<State> {
@@ -88,7 +96,8 @@ impl Calls {
         unreadable_message(status, &self.metrics)
     }
 
-    /// Opens a call. The second value is an error if the id is invalid or the server is still starting.
+    /// Opens a call. The second value is an error if the id is invalid, the server is still starting, or the token of the
+    /// call's stream is no longer accepted.
     pub fn open(&self, mut id: String, context: CallContext) -> (Call, Result<(), Refusal>) {
         let started = Instant::now();
         let mut checked = check_id("request_id", &id).map_err(Refusal::from);
@@ -100,6 +109,10 @@ impl Calls {
             checked = Err(Refusal::Starting(WARM_UP));
         }
         let CallContext { caller, deadline, parent } = context;
+        // The token of a stream was checked when the stream was opened.
+        if checked.is_ok() && self.tokens.as_ref().is_some_and(|tokens| !tokens.accept(&caller)) {
+            checked = Err(Refusal::TokenRemoved);
+        }
         let span = info_span!(
             REQUEST,
             otel.kind = "server",

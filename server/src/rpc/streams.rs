@@ -123,7 +123,7 @@ impl GraspRpc {
         volumes: &mut TrackPermit,
         call: &mut Call,
     ) -> Result<PendingReply, Refusal> {
-        let pb::TrackGraspsRequest { mut views, workspace, options, half_life, .. } = request;
+        let pb::TrackGraspsRequest { mut views, workspace, options, half_life, stamp, .. } = request;
         let before = track.as_ref().map(|track| track.params.clone());
         let params = match (options, before) {
             (None, Some(before)) => before,
@@ -141,7 +141,7 @@ impl GraspRpc {
         let (selected, old, of_request) = (Arc::clone(&engine), track.take(), params.clone());
         // The volume is returned in any case, so an invalid view does not lose it.
         let (new, fused) = blocking(turn, call.deadline, move |is_wanted| {
-            Ok(Track::integrate(old, &selected, of_request, start, &mut views, is_wanted))
+            Ok(Track::integrate(old, &selected, of_request, start, &mut views, stamp, is_wanted))
         })
         .await?;
         *track = new;

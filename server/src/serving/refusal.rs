@@ -26,6 +26,8 @@ pub(crate) enum Refusal {
     TooManyTracked { needed: usize, limit: usize },
     #[error("no request for {0:?} (--track-timeout), the volume was dropped; open a new stream")]
     TrackExpired(Duration),
+    #[error("the token of the stream is no longer accepted; open a new stream with a valid one")]
+    TokenRemoved,
     #[error("loading and unloading of models is not allowed; start the server with --allow-model-control")]
     NoModelControl,
     #[error("{0}")]
@@ -54,6 +56,7 @@ impl Refusal {
             Self::Overloaded(_) | Self::TooManyTracked { .. } => Code::ResourceExhausted,
             Self::Starting(_) | Self::Draining => Code::Unavailable,
             Self::TrackExpired(_) => Code::Aborted,
+            Self::TokenRemoved => Code::Unauthenticated,
             Self::NoModelControl => Code::PermissionDenied,
             Self::NotChanged(_) => Code::FailedPrecondition,
             Self::Failed(EngineError::Expired) => Code::DeadlineExceeded,
@@ -81,6 +84,7 @@ impl Refusal {
             | Self::UnknownModel { .. }
             | Self::Draining
             | Self::TrackExpired(_)
+            | Self::TokenRemoved
             | Self::NoModelControl
             | Self::NotChanged(_)
             | Self::Failed(_) => None,

@@ -95,7 +95,9 @@ impl Running {
             self.failures.fetch_add(1, Ordering::Relaxed)
         };
         match (succeeded, before + u32::from(!succeeded)) {
-            (false, FAILURES) => error!("{FAILURES} batches have failed, one after another; the session counts as failing"),
+            (false, FAILURES) => {
+                error!("{FAILURES} batches have failed, one after another; the session counts as failing")
+            }
             (true, FAILURES..) => info!("the session no longer fails"),
             _ => {}
         }

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use grasp_proto::{DetectParams, FieldError, TABLE_HEIGHT, Workspace, check_count, pb};
 use prometheus::IntGauge;
+use prost_types::Timestamp;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::cubes::{Cubes, Fused, edge};
@@ -117,14 +118,16 @@ impl Start {
 const HALF_LIFE: RangeInclusive<f64> = 0.5..=10_000.0;
 
 impl Track {
-    /// Adds views to the field, or to a new one if a workspace is given. An invalid view is an error; views before it
-    /// in the request may already be integrated. Stops when `is_wanted` returns false.
+    /// Adds views to the field, or to a new one if a workspace is given. `stamp` is their time, if it is not that of the
+    /// workspace. An invalid view is an error; views before it in the request may already be integrated. Stops when
+    /// `is_wanted` returns false.
     pub fn integrate(
         track: Option<Self>,
         engine: &Engine,
         params: DetectParams,
         start: Option<Start>,
         views: &mut [pb::DepthView],
+        stamp: Option<Timestamp>,
         is_wanted: &dyn Fn() -> bool,
     ) -> (Option<Self>, Result<(Fused, FrameStamp), Refusal>) {
         match (track, start) {
@@ -135,12 +138,12 @@ impl Track {
             (Some(mut track), None) => {
                 let views = Observation::depth(views, track.cubes.frame_from_task());
                 let views = views.map_err(Refusal::from);
-                let fused = views.and_then(|views| track.add(engine, params, views, None, is_wanted));
+                let fused = views.and_then(|views| track.add(engine, params, views, stamp, None, is_wanted));
                 (Some(track), fused)
             }
             (track, Some(start)) => match Self::start(engine, &params, start, views) {
                 Ok((mut track, views, table)) => {
-                    let fused = track.add(engine, params, views, table, is_wanted);
+                    let fused = track.add(engine, params, views, stamp, table, is_wanted);
                     (Some(track), fused)
                 }
                 Err(refusal) => (track, Err(refusal.into())),
@@ -174,12 +177,14 @@ impl Track {
         engine: &Engine,
         params: DetectParams,
         views: Observation,
+        stamp: Option<Timestamp>,
         table: Option<pb::FoundTable>,
         is_wanted: &dyn Fn() -> bool,
     ) -> Result<(Fused, FrameStamp), Refusal> {
         self.cubes.check(&engine.source)?;
         let fused = self.cubes.fuse(views, table, &params, is_wanted)?;
         self.params = params;
+        self.origin.stamp = stamp.or(self.origin.stamp);
         Ok((fused, self.origin.clone()))
     }
 }

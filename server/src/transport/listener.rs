@@ -74,7 +74,7 @@ pub(crate) async fn serve(
     let guard = tokens::guard(tokens, Arc::clone(&metrics));
     let limit = metrics.connections(connections, limits.stall);
     let incoming = connections::accept(listener, tls.map(|tls| tls.grpc), limit, Arc::clone(&budget));
-    let counted = Arc::clone(&metrics);
+    let (counted, drain) = (Arc::clone(&metrics), state.clone());
     let outgoing = MapResponseLayer::new(move |response| keep_permit(request_body::unreadable(response, &counted)));
     let intake = MapRequestLayer::new(move |request: http::Request<Body>| {
         let (mut parts, body) = request.into_parts();
@@ -84,7 +84,8 @@ pub(crate) async fn serve(
         }
         // Every request belongs to a connection.
         let share = Peer::of(&parts.extensions).map_or_else(|| budget.connection(), |peer| peer.share.clone());
-        let body = RequestBody::new(parts.uri.path(), body, deadline, limits, share, Arc::clone(&metrics));
+        let body =
+            RequestBody::new(parts.uri.path(), body, deadline, limits, share, Arc::clone(&metrics), drain.clone());
         http::Request::from_parts(parts, Body::new(body))
     });
     Server::builder()

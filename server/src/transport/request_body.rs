@@ -7,11 +7,13 @@ use std::time::Duration;
 
 use http::HeaderValue;
 use http_body::{Body as _, Frame, SizeHint};
+use tokio::sync::watch;
 use tokio::time::{Instant, Sleep, sleep};
 use tonic::body::Body;
 use tonic::codegen::Bytes;
 use tonic::{Code, Status};
 
+use crate::readiness::{self, draining};
 use crate::telemetry::metrics::Metrics;
 use crate::transport::deadline::Deadline;
 use crate::transport::receive_budget::{ConnectionShare, Received};
@@ -20,10 +22,16 @@ use crate::transport::receive_budget::{ConnectionShare, Received};
 const PREFIX: usize = 5;
 
 /// Suffixes of the methods with a client stream.
-const STREAMS: [&str; 3] = ["Stream", "TrackGrasps", "ServerReflectionInfo"];
+const STREAMS: [&str; 3] = ["Stream", "TrackGrasps", REFLECTION];
+
+/// The method of the reflection service. Its implementation does not know that the server drains.
+const REFLECTION: &str = "ServerReflectionInfo";
 
 /// Minimum rate of a message, bytes per second. It refuses clients that send single bytes and so never stall.
 const MIN_RATE: f64 = 65_536.0;
+
+/// Completes when the server drains.
+type Draining = Pin<Box<dyn Future<Output = ()> + Send>>;
 
 /// Limits on messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -43,6 +51,8 @@ pub(crate) struct RequestBody {
     metrics: Arc<Metrics>,
     /// Whether pauses between messages are allowed, as in a client stream.
     is_stream: bool,
+    /// Ends a stream between its messages.
+    drain: Option<Draining>,
     message: Message,
     /// The memory of the current message.
     received: Received,
@@ -73,7 +83,7 @@ enum State {
     Open,
     /// The data before the invalid message was passed on; the next poll returns the status.
     Refusing(Status),
-    Refused,
+    Ended,
 }
 
 /// Position of the body within its messages.
@@ -97,6 +107,7 @@ impl RequestBody {
         limits: Limits,
         share: ConnectionShare,
         metrics: Arc<Metrics>,
+        state: watch::Receiver<readiness::State>,
     ) -> Self {
         let is_stream = STREAMS.iter().any(|stream| path.ends_with(stream));
         Self {
@@ -106,6 +117,8 @@ impl RequestBody {
             limits,
             metrics,
             is_stream,
+            // The other streams end on their own, with a status.
+            drain: path.ends_with(REFLECTION).then(|| -> Draining { Box::pin(draining(state)) }),
             message: Message::default(),
             received: share.message(),
             since: None,
@@ -142,7 +155,7 @@ impl RequestBody {
     }
 
     fn end(&mut self, status: Status) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-        self.state = State::Refused;
+        self.state = State::Ended;
         self.received.clear();
         Poll::Ready(Some(Err(status)))
     }
@@ -257,14 +270,17 @@ impl http_body::Body for RequestBody {
             State::Open if this.deadline.is_some_and(Deadline::has_passed) => return this.refuse(late()),
             State::Open => {}
             State::Refusing(status) => return this.refuse(status),
-            State::Refused => {
-                this.state = State::Refused;
+            State::Ended => {
+                this.state = State::Ended;
                 return Poll::Ready(None);
             }
         }
         let Poll::Ready(frame) = Pin::new(&mut this.body).poll_frame(context) else {
             if !this.expects_data() {
-                return Poll::Pending;
+                let Some(drain) = &mut this.drain else { return Poll::Pending };
+                ready!(drain.as_mut().poll(context));
+                this.state = State::Ended;
+                return Poll::Ready(None);
             }
             if this.since.is_none() {
                 let now = Instant::now();
@@ -311,7 +327,7 @@ impl http_body::Body for RequestBody {
     }
 
     fn is_end_stream(&self) -> bool {
-        matches!(self.state, State::Refused) || self.body.is_end_stream()
+        matches!(self.state, State::Ended) || self.body.is_end_stream()
     }
 
     fn size_hint(&self) -> SizeHint {
@@ -329,6 +345,7 @@ mod tests {
     use tokio::time::timeout;
 
     use super::*;
+    use crate::readiness::Readiness;
 
     /// The data that a client sends.
     struct Sent(mpsc::Receiver<Vec<u8>>);
@@ -347,15 +364,21 @@ mod tests {
 
     const STALL: Duration = Duration::from_secs(10);
 
-    /// The body of a request for `path`, and the channel that fills it.
+    /// The body of a request for `path` to a server that starts, and the channel that fills it.
     fn body(path: &str) -> (RequestBody, mpsc::Sender<Vec<u8>>) {
+        let (body, sender, _) = body_of(path, Readiness::starting());
+        (body, sender)
+    }
+
+    fn body_of(path: &str, readiness: Readiness) -> (RequestBody, mpsc::Sender<Vec<u8>>, Readiness) {
         let (sender, data) = mpsc::channel(1);
         let (log, _guard) = tracing_appender::non_blocking(io::sink());
         let suppressed = prometheus::IntCounter::new("suppressed", "Lines.").unwrap();
         let metrics = Arc::new(Metrics::new(log.error_counter(), suppressed));
         let limits = Limits { message_bytes: 1 << 20, stall: STALL };
         let share = metrics.receiving(4 << 20).connection();
-        (RequestBody::new(path, Body::new(Sent(data)), None, limits, share, metrics), sender)
+        let state = readiness.subscribe();
+        (RequestBody::new(path, Body::new(Sent(data)), None, limits, share, metrics, state), sender, readiness)
     }
 
     /// Reads to the end. Returns the refusal, if there is one, and the seconds until then.
@@ -426,6 +449,18 @@ mod tests {
         let (refusal, seconds) = read(unary).await;
         assert!(refusal.unwrap().message().contains("the end of the request missing"));
         assert_eq!(seconds, STALL.as_secs());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_reflection_stream_ends_between_messages_when_the_server_drains() {
+        let (stream, sender, readiness) =
+            body_of("/grpc.reflection.v1.ServerReflection/ServerReflectionInfo", Readiness::starting());
+        sender.send([prefix(1), vec![7]].concat()).await.unwrap();
+        let ended = tokio::spawn(read(stream));
+        tokio::time::sleep(100 * STALL).await;
+        assert!(!ended.is_finished());
+        readiness.drain();
+        assert!(ended.await.unwrap().0.is_none());
     }
 
     #[test]

@@ -64,15 +64,21 @@ impl Tokens {
             .filter(|text| text.get(..SCHEME.len()).is_some_and(|scheme| scheme.eq_ignore_ascii_case(SCHEME)));
         let token = token.map(|text| text[SCHEME.len()..].trim());
         let token = token.ok_or_else(|| Status::unauthenticated(format!("no bearer token; {NEEDED}")))?;
-        // Compares with every hash in constant time, so that the duration reveals nothing about the tokens.
-        let hash: Hash = Sha256::digest(token).into();
-        let hashes = self.hashes.read().unwrap_or_else(PoisonError::into_inner);
-        let known = hashes.iter().fold(Choice::from(0), |known, accepted| known | accepted.ct_eq(&hash));
-        if bool::from(known) {
-            Ok(Caller::Token(hash))
+        let caller = Caller::Token(Sha256::digest(token).into());
+        if self.accept(&caller) {
+            Ok(caller)
         } else {
             Err(Status::unauthenticated("invalid token; send one of the server's --token-file"))
         }
+    }
+
+    /// Whether the token of a caller is accepted now.
+    pub fn accept(&self, caller: &Caller) -> bool {
+        let Caller::Token(hash) = caller else { return false };
+        // Compares with every hash in constant time, so that the duration reveals nothing about the tokens.
+        let hashes = self.hashes.read().unwrap_or_else(PoisonError::into_inner);
+        let known = hashes.iter().fold(Choice::from(0), |known, accepted| known | accepted.ct_eq(hash));
+        known.into()
     }
 }
 

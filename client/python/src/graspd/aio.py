@@ -184,11 +184,16 @@ class Tracking:
         self._stream.cancel()
 
     async def add(
-        self, views: DepthView | Iterable[DepthView] = (), options: Options | None = None, *, request_id: str = ""
+        self,
+        views: DepthView | Iterable[DepthView] = (),
+        options: Options | None = None,
+        *,
+        request_id: str = "",
+        stamp: int | None = None,
     ) -> Detection:
         """Adds views to the volume and detects grasps in everything observed so far. Calls must not overlap. For the
         rest see `graspd.Tracking.add`."""
-        request = self._adding.request(views, options, request_id)
+        request = self._adding.request(views, options, request_id, stamp)
         try:
             # If the server has closed the stream, `read` returns or raises the reason.
             with suppress(asyncio.InvalidStateError):

@@ -188,15 +188,21 @@ class Tracking:
         self._replies.cancel()
 
     def add(
-        self, views: DepthView | Iterable[DepthView] = (), options: Options | None = None, *, request_id: str = ""
+        self,
+        views: DepthView | Iterable[DepthView] = (),
+        options: Options | None = None,
+        *,
+        request_id: str = "",
+        stamp: int | None = None,
     ) -> Detection:
         """Adds views to the volume and detects grasps in everything observed so far. `views` may be empty. With
-        `options` of None the options of the previous call apply.
+        `options` of None the options of the previous call apply. `stamp` is the time of the views, nanoseconds since
+        1970; None: that of the previous call, or of the workspace.
 
         An invalid view does not end the tracking. `Aborted` ends it. `ResourceExhausted` at the first call ends it too:
         the server's limit of tracked volumes is reached. Calls are not retried.
         """
-        self._requests.put(self._adding.request(views, options, request_id))
+        self._requests.put(self._adding.request(views, options, request_id, stamp))
         try:
             reply = next(self._replies, None)
         except grpc.RpcError as status:

@@ -66,9 +66,11 @@ class Adding:
         # None once the server has accepted it.
         self._workspace: Workspace | None = workspace
 
-    def request(self, views: DepthView | Iterable[DepthView], options: Options | None, request_id: str) -> pb.TrackGraspsRequest:
+    def request(
+        self, views: DepthView | Iterable[DepthView], options: Options | None, request_id: str, stamp: int | None
+    ) -> pb.TrackGraspsRequest:
         half_life = None if self._workspace is None else self._half_life
-        return wire.track_request(views, self._workspace, half_life, options, request_id)
+        return wire.track_request(views, self._workspace, half_life, options, request_id, stamp)
 
     def answer(self, reply: pb.DetectGraspsStreamResponse | None) -> Detection:
         if reply is None:

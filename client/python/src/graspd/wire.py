@@ -117,10 +117,12 @@ def track_request(
     half_life: float | None,
     options: Options | None,
     request_id: str,
+    stamp: int | None,
 ) -> pb.TrackGraspsRequest:
     return pb.TrackGraspsRequest(
         half_life=half_life,
         request_id=request_id,
+        stamp=given(stamp_message, stamp),
         views=map(depth_message, [views] if isinstance(views, DepthView) else views),
         workspace=given(workspace_message, workspace),
         options=given(options_message, options),
