@@ -8,6 +8,7 @@ set -eu
 : "${PARTS:?set it to the number of parts}"
 # The index of a pod in a Kubernetes Indexed Job, or of a task in a Slurm array.
 INDEX=${JOB_COMPLETION_INDEX:-${SLURM_ARRAY_TASK_ID:?set it to the index of this part, from 0}}
+[ "$INDEX" -lt "$PARTS" ] || { echo "the index of this part is $INDEX, must be less than PARTS, $PARTS" >&2; exit 1; }
 
 first=$((SCENES * INDEX / PARTS))
 end=$((SCENES * (INDEX + 1) / PARTS))

@@ -21,6 +21,16 @@ pub use generated::{
 };
 pub use tensor::TensorError;
 
+impl GraphProto {
+    /// A stored value by its name: an initializer, or the output of a `Constant` node.
+    #[must_use]
+    pub fn stored(&self, name: &str) -> Option<&TensorProto> {
+        let is_it = |node: &&NodeProto| node.op_type() == "Constant" && node.output.iter().any(|output| output == name);
+        let of_node = || self.node.iter().find(is_it)?.attribute("value")?.t.as_ref();
+        self.initializer.iter().find(|tensor| tensor.name() == name).or_else(of_node)
+    }
+}
+
 impl NodeProto {
     /// An attribute by its name.
     #[must_use]

@@ -11,7 +11,7 @@ use thiserror::Error;
 
 use crate::onnx::{AttributeProto, GraphProto, ModelProto, NodeProto, TensorError, TensorProto};
 
-/// ActivationRange of the values of an activation.
+/// Range of the values of an activation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ActivationRange {
     /// Smallest value.
@@ -90,12 +90,14 @@ pub fn with_int8(model: &ModelProto, ranges: &HashMap<String, ActivationRange>) 
             }
         }
         if let Some(product) = product {
-            let scales = quantize_weight(&mut quantized, product)?;
+            let (scale, _) = activations[product.input()];
+            let name = product.node.input.get(2).filter(|name| !name.is_empty());
+            let bias = name.map(|name| bias(graph, name)).transpose()?;
+            let scales = quantize_weight(&mut quantized, product, bias.as_deref().unwrap_or_default(), scale)?;
             node.input[1] = dequantized(product.weight.name());
-            if let Some(bias) = product.node.input.get(2).filter(|bias| !bias.is_empty()) {
-                let (scale, _) = activations[product.input()];
-                quantize_bias(&mut quantized, graph, bias, &scales, scale)?;
-                node.input[2] = dequantized(bias);
+            if let (Some(name), Some(bias)) = (name, bias) {
+                quantize_bias(&mut quantized, name, &bias, &scales, scale);
+                node.input[2] = dequantized(name);
             }
         }
         let outputs = node.output.clone();
@@ -190,8 +192,20 @@ fn quantize_activation(graph: &mut GraphProto, name: &str, (scale, zero): (f32, 
     graph.node.push(node("DequantizeLinear", [&quantized, &scale_name, &zero_name], &dequantized(name), None));
 }
 
-/// Quantises the product's weight to i8 and returns the scales of its output channels.
-fn quantize_weight(graph: &mut GraphProto, product: &QuantizableProduct) -> Result<Vec<f32>, TensorError> {
+/// The values of a stored bias.
+fn bias(graph: &GraphProto, name: &str) -> Result<Vec<f32>, QuantizeError> {
+    let tensor = graph.initializer.iter().find(|tensor| tensor.name() == name);
+    Ok(tensor.ok_or_else(|| QuantizeError::MissingRange(name.to_owned()))?.to_f32()?)
+}
+
+/// Quantises the product's weight to i8 and returns the scales of its output channels. They are large enough for the
+/// bias, which is stored in units of weight scale and `input_scale`: half of the range of i32, for the sums.
+fn quantize_weight(
+    graph: &mut GraphProto,
+    product: &QuantizableProduct,
+    bias: &[f32],
+    input_scale: f32,
+) -> Result<Vec<f32>, TensorError> {
     let QuantizableProduct { weight, axis, .. } = *product;
     let values = weight.to_f32()?;
     let dims: Vec<usize> = weight.dims.iter().map(|&dim| dim as usize).collect();
@@ -202,6 +216,9 @@ fn quantize_weight(graph: &mut GraphProto, product: &QuantizableProduct) -> Resu
     for (index, value) in values.iter().enumerate() {
         let scale = &mut scales[channel(index)];
         *scale = scale.max(value.abs() / 127.0);
+    }
+    for (scale, value) in scales.iter_mut().zip(bias) {
+        *scale = scale.max(value.abs() / input_scale / (i32::MAX / 2) as f32);
     }
     for scale in scales.iter_mut().filter(|scale| **scale == 0.0) {
         *scale = 1.0;
@@ -220,24 +237,15 @@ fn quantize_weight(graph: &mut GraphProto, product: &QuantizableProduct) -> Resu
 }
 
 /// Quantises a bias to i32 in the units of the product's sums, as integer kernels require.
-fn quantize_bias(
-    graph: &mut GraphProto,
-    from: &GraphProto,
-    name: &str,
-    weight_scales: &[f32],
-    input_scale: f32,
-) -> Result<(), QuantizeError> {
-    let bias = from.initializer.iter().find(|tensor| tensor.name() == name);
-    let values = bias.ok_or_else(|| QuantizeError::MissingRange(name.to_owned()))?.to_f32()?;
+fn quantize_bias(graph: &mut GraphProto, name: &str, bias: &[f32], weight_scales: &[f32], input_scale: f32) {
     let scales: Vec<f32> = weight_scales.iter().map(|scale| scale * input_scale).collect();
-    let values: Vec<i32> = values.iter().zip(&scales).map(|(value, scale)| (value / scale).round() as i32).collect();
+    let values: Vec<i32> = bias.iter().zip(&scales).map(|(value, scale)| (value / scale).round() as i32).collect();
     let [stored, scale, zero] = ["i32", "scale", "zero"].map(|suffix| format!("{name}.{suffix}"));
     let channels = [scales.len() as i64];
     graph.initializer.push(TensorProto::from_i32(&stored, &channels, &values));
     graph.initializer.push(TensorProto::from_f32(&scale, &channels, &scales));
     graph.initializer.push(TensorProto::from_i32(&zero, &channels, &vec![0; scales.len()]));
     graph.node.push(node("DequantizeLinear", [&stored, &scale, &zero], &dequantized(name), Some(0)));
-    Ok(())
 }
 
 fn node(op: &str, inputs: [&str; 3], output: &str, axis: Option<usize>) -> NodeProto {

@@ -206,8 +206,8 @@ impl<'a> GraphIndex<'a> {
             return None;
         }
         let weight = self.constants.get(node.input.get(1)?.as_str())?;
-        let &[channels, inputs, ..] = weight.dims.as_slice() else { return None };
-        if weight.element_type() != DataType::Float {
+        let &[channels, inputs, ref edges @ ..] = weight.dims.as_slice() else { return None };
+        if weight.element_type() != DataType::Float || edges != [kernel as i64; 3] {
             return None;
         }
         let name = node.output.first()?;
@@ -343,11 +343,8 @@ fn conv_shape(node: &NodeProto) -> Option<ConvShape> {
     if whole("group") != 1 || same("dilations", 3, Some(1)) != Some(1) || !padded {
         return None;
     }
-    Some(ConvShape {
-        kernel: same("kernel_shape", 3, None)?,
-        pad: same("pads", 6, Some(0))?,
-        stride: same("strides", 3, Some(1))?,
-    })
+    let stride = same("strides", 3, Some(1)).filter(|&stride| stride > 0)?;
+    Some(ConvShape { kernel: same("kernel_shape", 3, None)?, pad: same("pads", 6, Some(0))?, stride })
 }
 
 /// The edge of an input `[batch, channels, edge, edge, edge]`.

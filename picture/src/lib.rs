@@ -9,4 +9,4 @@ mod raster;
 pub use color::{Color, object_color, quality_color};
 pub use mesh::Mesh;
 pub use picture::{Picture, PictureError, save_sheet};
-pub use raster::{Frame, Instance, NOTHING, TABLE, render};
+pub use raster::{Frame, Instance, NOTHING, TABLE, render, toward};

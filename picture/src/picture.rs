@@ -3,8 +3,8 @@
 //! A picture is rendered with the depth camera and shaded with the light of [`Light`].
 
 use std::collections::HashMap;
-use std::fs::File;
-use std::io::BufWriter;
+use std::fs::{self, File};
+use std::io::{BufWriter, ErrorKind};
 use std::path::{Path, PathBuf};
 
 use grasp::Intrinsics;
@@ -188,13 +188,14 @@ impl Picture {
     }
 }
 
-/// Renders pictures of one size and writes them as one PNG with `columns` pictures per row.
+/// Renders pictures of one size and writes them as one PNG with `columns` pictures per row. Without pictures, an
+/// earlier file is removed.
 ///
 /// # Errors
-/// [`PictureError`] if the file cannot be created or written.
+/// [`PictureError`] if the file cannot be created, written or removed.
 pub fn save_sheet(path: &Path, pictures: &[&Picture], columns: usize) -> Result<(), PictureError> {
     let Some(Intrinsics { width, height, .. }) = pictures.first().map(|picture| picture.camera) else {
-        return Ok(());
+        return remove(path);
     };
     let columns = columns.clamp(1, pictures.len());
     let mut sheet = Vec::new();
@@ -210,6 +211,15 @@ pub fn save_sheet(path: &Path, pictures: &[&Picture], columns: usize) -> Result<
         }
     }
     write(path, columns * width, pictures.len().div_ceil(columns) * height, &sheet)
+}
+
+fn remove(path: &Path) -> Result<(), PictureError> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != ErrorKind::NotFound => {
+            Err(PictureError { path: path.into(), source: error.into() })
+        }
+        _ => Ok(()),
+    }
 }
 
 fn write(path: &Path, width: usize, height: usize, pixels: &[u8]) -> Result<(), PictureError> {
@@ -325,6 +335,18 @@ mod tests {
     fn a_gripper_has_its_width_and_depth() {
         let (low, high) = fork(0.04, grasp::FINGER_DEPTH, [0.006, 0.005]).bounds();
         assert!((high.z - 0.05).abs() < 1e-12 && (high.y - 0.025).abs() < 1e-12 && (low.y + 0.025).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_sheet_without_pictures_replaces_an_earlier_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("sheet.png");
+        save_sheet(&path, &[&cube()], 3).unwrap();
+        assert!(path.exists());
+        for _ in 0..2 {
+            save_sheet(&path, &[], 3).unwrap();
+            assert!(!path.exists());
+        }
     }
 
     #[test]

@@ -55,8 +55,8 @@ pub struct Frame {
     pub ids: Vec<u16>,
 }
 
-/// `T_camera_task` of a camera at `eye` that looks at `target`, with z up in its picture.
-pub(crate) fn toward(eye: Point3<f64>, target: Point3<f64>) -> Isometry3<f64> {
+/// `T_camera_task` of a camera at `eye` that looks at `target` (task frame, metres), with z up in its picture.
+pub fn toward(eye: Point3<f64>, target: Point3<f64>) -> Isometry3<f64> {
     let forward = (target - eye).normalize();
     // For a vertical view any up direction works.
     let up = if forward.xy().norm() < 1e-6 { Vector3::y() } else { Vector3::z() };
@@ -277,26 +277,9 @@ fn clip(corners: [Point3<f64>; 3], near: f64) -> ([Point3<f64>; 4], usize) {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::UnitQuaternion;
-
     use super::*;
 
     const CAMERA: Intrinsics = Intrinsics { width: 320, height: 240, fx: 270.0, fy: 265.0, cx: 158.3, cy: 121.1 };
-
-    fn looking_at(eye: Point3<f64>, target: Point3<f64>) -> Isometry3<f64> {
-        Isometry3::look_at_rh(&eye, &target, &Vector3::z()).then_y_down()
-    }
-
-    trait Optical {
-        fn then_y_down(self) -> Self;
-    }
-
-    impl Optical for Isometry3<f64> {
-        /// Converts from y up and z backward to y down and z forward.
-        fn then_y_down(self) -> Self {
-            UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI) * self
-        }
-    }
 
     fn instance(mesh: &Mesh, pose: Isometry3<f64>) -> Instance<'_> {
         Instance { mesh, pose, scale: 1.0, id: 3 }
@@ -322,7 +305,7 @@ mod tests {
 
     #[test]
     fn table_and_a_large_quad_have_the_same_depth() {
-        let pose = looking_at(Point3::new(0.5, -0.2, 0.45), Point3::new(0.15, 0.15, 0.05));
+        let pose = toward(Point3::new(0.5, -0.2, 0.45), Point3::new(0.15, 0.15, 0.05));
         let table = render(&[], Some(0.05), &CAMERA, &pose, 0.1, 2.0);
         assert!(table.ids.iter().filter(|&&id| id == TABLE).count() > 50_000);
         let quad = Mesh::cuboid(Vector3::new(20.0, 20.0, 1.0));
@@ -373,7 +356,7 @@ mod tests {
     #[test]
     fn neighbouring_triangles_share_no_pixel_and_leave_no_gap() {
         let mesh = Mesh::sphere(0.1, 90);
-        let pose = looking_at(Point3::new(0.31, 0.17, 0.23), Point3::new(0.01, 0.0, 0.0));
+        let pose = toward(Point3::new(0.31, 0.17, 0.23), Point3::new(0.01, 0.0, 0.0));
         let mut view = View::new(&CAMERA, &pose, 0.01, 2.0);
         let mut front = vec![0; view.depth.len()];
         let (eye, sphere) = (pose.inverse_transform_point(&Point3::origin()), instance(&mesh, Isometry3::identity()));

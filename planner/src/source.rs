@@ -119,6 +119,9 @@ impl Source {
     /// [`LoadError`] if the file is invalid or cannot run with `options`.
     pub fn load(&self, options: &Options, count: usize) -> Result<(Vec<Loaded>, Backend), LoadError> {
         let single = |planner: Box<dyn Planner + Send>| Loaded::Single(planner);
+        // 8 bits are for the networks that were exported for them.
+        let precision = options.precision.filter(|&precision| precision != Precision::Int8);
+        let of_classifiers = Options { precision, ..*options };
         Ok(match self {
             Self::Network(entry) => {
                 let networks = Network::load_several(entry, options, count)?;
@@ -129,17 +132,14 @@ impl Source {
             Self::Evaluated { network, evaluator } => {
                 let networks = Network::load_several(network, options, count)?;
                 let backend = networks.first().map_or(Backend::REFERENCE, Network::backend);
-                let evaluators = Classifier::load_several(evaluator, &Patch::SHAPE, options, count)?;
+                let evaluators = Classifier::load_several(evaluator, &Patch::SHAPE, &of_classifiers, count)?;
                 let planner = |(network, evaluator)| {
                     Loaded::Network(Box::new(NetworkPlanner::new(network, Some(Evaluator::new(evaluator)))))
                 };
                 (networks.into_iter().zip(evaluators).map(planner).collect(), backend)
             }
             Self::Gpd(entry) => {
-                // 8 bits are for the networks that were exported for them.
-                let precision = options.precision.filter(|&precision| precision != Precision::Int8);
-                let options = Options { precision, ..*options };
-                let classifiers = Classifier::load_several(entry, &Image::SHAPE, &options, count)?;
+                let classifiers = Classifier::load_several(entry, &Image::SHAPE, &of_classifiers, count)?;
                 let backend = classifiers.first().map_or(Backend::REFERENCE, Classifier::backend);
                 let planner = |classifier| single(Box::new(Gpd::new(classifier)));
                 (classifiers.into_iter().map(planner).collect(), backend)

@@ -122,8 +122,10 @@ def cameras(text: str) -> list[Array]:
     kind, _, angle = text.partition(":")
     try:
         if kind == "side":
-            return side(math.radians(float(angle or 0)))
-        if 1 <= int(text) <= 64:
+            degrees = float(angle or 0)
+            if math.isfinite(degrees):
+                return side(math.radians(degrees))
+        elif 1 <= int(text) <= 64:
             return circle(int(text))
     except ValueError:
         pass
@@ -137,6 +139,14 @@ def part_of(folder: Path, part: str) -> list[Path]:
     if not kept:
         raise FileNotFoundError(f"--objects is {folder}: it has no .urdf file for --part {part}")
     return kept
+
+
+def create(path: Path) -> None:
+    """Creates an output file if it does not exist, so that a wrong path is an error before the run."""
+    try:
+        path.open("a").close()
+    except OSError as mistake:
+        raise OSError(f"{path} cannot be written ({mistake.strerror}); use another path") from None
 
 
 def run(config: BenchmarkConfig, numbers: list[tuple[int, int]], jobs: int) -> Iterator[Round]:
@@ -197,6 +207,8 @@ def main() -> None:
     collision = CollisionCheck("filter") if args.clear else None
     if args.pictures:
         args.pictures.mkdir(parents=True, exist_ok=True)
+    for path in filter(None, [args.attempts, args.out]):
+        create(path)
     config = BenchmarkConfig(
         scene=args.scene,
         urdfs=part_of(args.objects, args.part),
@@ -233,15 +245,15 @@ def main() -> None:
         f"{len(config.cameras)} views, noise {args.noise}, {args.count} objects a scene, {args.rounds} rounds, "
         f"seed {args.seed}, hand {args.hand}",
     }
+    print(json.dumps(report))
     if args.attempts:
         args.attempts.write_text("".join(f"{json.dumps(line)}\n" for line in attempts(args.planner, rounds)))
     if args.out:
         args.out.write_text(json.dumps(report, indent=1) + "\n")
-    print(json.dumps(report))
 
 
 if __name__ == "__main__":
     try:
         main()
-    except (FileNotFoundError, ValueError, Error) as mistake:
+    except (OSError, ValueError, Error) as mistake:
         sys.exit(f"clear.py: {mistake}")

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from clear import positive
+from clear import create, positive
 from graspd import Pose
 from score import share, wilson
 from world import HAND, World
@@ -231,6 +231,8 @@ def kept(records: list[dict[str, Any]], expected: int) -> dict[str, Any]:
 def main() -> None:
     """Repeats the trials and prints the report."""
     args = arguments()
+    if args.records:
+        create(args.records)
     settings = Settings(args.objects, args.hand, args.contact == "allow", args.shake, args.seed)
     records: list[dict[str, Any]] = []
     moved: list[float] = []
@@ -254,13 +256,13 @@ def main() -> None:
         "moved_mm_median": round(1e3 * statistics.median(moved or [0.0]), 2),
         "moved_mm_p95": round(1e3 * float(np.percentile(moved or [0.0], 95)), 2),
     }
+    print(json.dumps(report))
     if args.records:
         args.records.write_text("".join(f"{json.dumps(record)}\n" for record in records))
-    print(json.dumps(report))
 
 
 if __name__ == "__main__":
     try:
         main()
-    except (FileNotFoundError, ValueError) as mistake:
+    except (OSError, ValueError) as mistake:
         sys.exit(f"replay.py: {mistake}")

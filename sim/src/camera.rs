@@ -12,7 +12,7 @@ use rand_distr::{Distribution, Gamma, Normal};
 
 use crate::TABLE_HEIGHT;
 use crate::physics::World;
-use grasp_picture::{Instance, render};
+use grasp_picture::{Instance, render, toward};
 
 /// Smallest measured depth, metres.
 const NEAR: f64 = 0.1;
@@ -75,10 +75,7 @@ fn random_view(polar: Range<f64>, azimuth: Range<f64>, rng: &mut impl Rng) -> Is
 #[must_use]
 pub fn look_at(target: &Point3<f64>, distance: f64, polar: f64, azimuth: f64) -> Isometry3<f64> {
     let direction = Vector3::new(polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos());
-    let eye = target + direction * distance;
-    // nalgebra's right-handed view looks along -z with y up; the optical frame looks along +z with y down.
-    let optical = nalgebra::UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
-    optical * Isometry3::look_at_rh(&eye, target, &Vector3::z())
+    toward(target + direction * distance, *target)
 }
 
 /// Renders the scene's depth from each camera, without noise.
@@ -184,14 +181,14 @@ pub fn add_noise(view: &mut View, rng: &mut impl Rng) {
 }
 
 /// The noise of a stereo camera: errors that grow with the square of the depth, in steps, holes at the edges of objects,
-/// and flying pixels between them and what is behind.
+/// and flying pixels between them and what is behind. Pixels without a measurement stay 0.
 pub fn add_stereo_noise(view: &mut View, rng: &mut impl Rng) {
     let width = Intrinsics::BENCHMARK.width;
     let clean = view.depth.clone();
     for (index, depth) in view.depth.iter_mut().enumerate() {
         let behind = clean.get(index + 2).filter(|_| index % width + 2 < width).copied().unwrap_or(*depth);
         let edge = (behind - *depth).abs() > 0.02;
-        *depth = if rng.random_bool(if edge { 0.5 } else { 0.02 }) {
+        let noisy = if rng.random_bool(if edge { 0.5 } else { 0.02 }) {
             0.0
         } else if edge {
             rng.random_range(depth.min(behind)..=depth.max(behind))
@@ -200,6 +197,9 @@ pub fn add_stereo_noise(view: &mut View, rng: &mut impl Rng) {
             let step = *depth * *depth / (540.0 * 0.05) * 0.2;
             ((*depth + step * rng.random_range(-1.0..1.0)) / step).round() * step
         };
+        // No pixel flies between a surface and a pixel without a measurement.
+        let is_unmeasured = *depth == 0.0 || edge && behind == 0.0;
+        *depth = if is_unmeasured { 0.0 } else { noisy };
     }
 }
 

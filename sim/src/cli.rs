@@ -270,6 +270,12 @@ fn refuse_looks(_: &str) -> Result<String, String> {
     Err(renamed("--looks", "--observations"))
 }
 
+/// Parses a quality of grasps, with the limits of the server.
+fn parse_quality(text: &str) -> Result<f32, String> {
+    let quality = text.parse().ok().filter(|&quality: &f32| quality > 0.0 && quality <= 1.0);
+    quality.ok_or_else(|| "must be greater than 0 and at most 1".to_owned())
+}
+
 fn parse_share(text: &str) -> Result<f64, String> {
     let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
     share.ok_or_else(|| "must be from 0 to 1".to_owned())
@@ -286,7 +292,10 @@ fn parse_views(text: &str) -> Option<Views> {
     match name {
         "side" if rest.is_empty() => Some(Views::Side { azimuth: 0.0 }),
         "side" if rest == "random" => Some(Views::RandomSide),
-        "side" => Some(Views::Side { azimuth: rest.parse::<f64>().ok()?.to_radians() }),
+        "side" => {
+            let degrees: f64 = rest.parse().ok()?;
+            degrees.is_finite().then(|| Views::Side { azimuth: degrees.to_radians() })
+        }
         "circle" if rest.is_empty() => Some(Views::Circle),
         // `anywhere` is the former name, which older data sets contain.
         "random" | "anywhere" => {
@@ -320,7 +329,10 @@ mod tests {
         assert_eq!(parse_views("random:2"), Some(Views::Random(2..=2)));
         let one_of = Views::OneOf(vec![Views::Random(1..=1), Views::Circle]);
         assert_eq!(parse_views("random:1,circle"), Some(one_of));
-        for wrong in ["", "top", "side:x", "anywhere", "random:0-2", "random:3-2", "circle:1", "side,", "side,top"] {
+        for wrong in ["", "top", "side:x", "side:nan", "side:inf", "anywhere", "random:0-2", "random:3-2", "circle:1"] {
+            assert_eq!(parse_views(wrong), None, "{wrong}");
+        }
+        for wrong in ["side,", "side,top"] {
             assert_eq!(parse_views(wrong), None, "{wrong}");
         }
     }

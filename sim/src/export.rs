@@ -122,6 +122,17 @@ impl Export {
         Ok(Self { path: path.to_owned(), file })
     }
 
+    /// Number of the last scene of a file; `None` if it has no scene or does not exist.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn last(path: &Path) -> anyhow::Result<Option<u64>> {
+        match File::open(path).and_then(|file| complete(&file, u64::MAX)) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            found => found.map(|(_, last)| last).with_context(|| path.display().to_string()),
+        }
+    }
+
     /// Appends a scene.
     ///
     /// # Errors
@@ -133,24 +144,29 @@ impl Export {
 }
 
 fn open(path: &Path, next: u64) -> io::Result<File> {
+    let mut file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)?;
+    let (kept, _) = complete(&file, next)?;
+    file.set_len(kept)?;
+    file.seek(SeekFrom::End(0))?;
+    Ok(file)
+}
+
+/// Length of the complete lines of the scenes before number `next`, and the number of the last of them.
+fn complete(file: &File, next: u64) -> io::Result<(u64, Option<u64>)> {
     #[derive(Deserialize)]
     struct Number {
         scene: u64,
     }
-    let mut file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)?;
-    let mut reader = BufReader::new(&file);
-    let (mut kept, mut line) = (0, String::new());
+    let mut reader = BufReader::new(file);
+    let (mut length, mut last, mut line) = (0, None, String::new());
     while reader.read_line(&mut line)? > 0 {
         let number = serde_json::from_str::<Number>(&line).ok().filter(|_| line.ends_with('\n'));
-        if number.is_none_or(|number| number.scene >= next) {
-            break;
-        }
-        kept += line.len() as u64;
+        let Some(Number { scene }) = number.filter(|number| number.scene < next) else { break };
+        last = Some(scene);
+        length += line.len() as u64;
         line.clear();
     }
-    file.set_len(kept)?;
-    file.seek(SeekFrom::End(0))?;
-    Ok(file)
+    Ok((length, last))
 }
 
 /// Reads the scenes of a file.

@@ -120,8 +120,22 @@ impl From<&str> for PlannerSpec {
 }
 
 impl PlannerSpec {
-    /// Creates the planner. Networks and classifiers run with `options`, and networks decode with `params`. GPD and
-    /// SHAF use their default parameters. A server uses its model's parameters except for the threshold and `force`.
+    /// The decoding parameters of the planner, given those of networks; `None` for random grasps. GPD and SHAF use
+    /// their own, and SHAF on a network's proposals replaces the threshold and `force`. A server uses its model's
+    /// parameters except for the threshold and `force`.
+    #[must_use]
+    pub fn decode_params(&self, params: &DecodeParams) -> Option<DecodeParams> {
+        match self {
+            Self::Random => None,
+            Self::Highest => Some(Shaf::decode_params()),
+            Self::Gpd(_) => Some(Gpd::decode_params()),
+            Self::HighestProposed(_) => Some(DecodeParams { threshold: 0.5, force: None, ..*params }),
+            Self::Server(_) | Self::Network(_) | Self::Evaluated { .. } => Some(*params),
+        }
+    }
+
+    /// Creates the planner. Networks and classifiers run with `options`; [`decode_params`](Self::decode_params) says
+    /// what uses `params`.
     ///
     /// # Errors
     /// If the file is not the expected kind of network, or the server cannot be reached.

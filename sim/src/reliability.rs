@@ -67,10 +67,10 @@ impl Reliability {
 }
 
 /// The calibration that makes the qualities of these attempts their success rate: a logistic regression on the log-odds
-/// of the quality, by Newton's method. `None` if all attempts have the same outcome.
+/// of the quality. `None` if all attempts have the same outcome or the same quality, if the success rate does not rise
+/// with the quality, or if the regression does not converge.
 #[must_use]
 pub fn calibration(attempts: &[Attempt]) -> Option<Calibration> {
-    const STEPS: usize = 50;
     let lifted = attempts.iter().filter(|attempt| attempt.lifted).count();
     if lifted == 0 || lifted == attempts.len() {
         return None;
@@ -82,23 +82,51 @@ pub fn calibration(attempts: &[Attempt]) -> Option<Calibration> {
         let quality = attempt.quality.clamp(1e-4, 1.0 - 1e-4);
         (quality / (1.0 - quality)).ln()
     };
-    // From here Newton's method converges: the loss is convex, and the start has the right mean.
-    let mut weights = Vector2::new(0.0, ((n + 1.0) / (m + 1.0)).ln());
+    let rows: Vec<Row> =
+        attempts.iter().map(|attempt| (Vector2::new(log_odds(attempt), 1.0), target(attempt))).collect();
+    if rows.iter().all(|(features, _)| *features == rows[0].0) {
+        return None;
+    }
+    let weights = regression(&rows, Vector2::new(0.0, ((n + 1.0) / (m + 1.0)).ln()))?;
+    Some(Calibration { slope: weights.x as f32, offset: weights.y as f32 }).filter(|found| found.slope > 0.0)
+}
+
+/// Features and target of an attempt.
+type Row = (Vector2<f64>, f64);
+
+/// The weights of a logistic regression, by Newton's method from `weights`; `None` if it does not converge. The loss is
+/// convex, but a whole step can raise it.
+fn regression(rows: &[Row], mut weights: Vector2<f64>) -> Option<Vector2<f64>> {
+    const STEPS: usize = 50;
+    const HALVINGS: i32 = 60;
+    /// Twice the predicted difference from the smallest loss. Its statistical error is about 1, its rounding errors are
+    /// much smaller.
+    const TOLERANCE: f64 = 1e-6;
     for _ in 0..STEPS {
         let (mut gradient, mut curvature) = (Vector2::zeros(), Matrix2::identity() * 1e-9);
-        for attempt in attempts {
-            let row = Vector2::new(log_odds(attempt), 1.0);
-            let probability = 1.0 / (1.0 + (-weights.dot(&row)).exp());
-            gradient += row * (probability - target(attempt));
-            curvature += row * row.transpose() * (probability * (1.0 - probability));
+        for (features, target) in rows {
+            let probability = 1.0 / (1.0 + (-weights.dot(features)).exp());
+            gradient += features * (probability - target);
+            curvature += features * features.transpose() * (probability * (1.0 - probability));
         }
         let step = curvature.try_inverse()? * gradient;
-        weights -= step;
-        if step.norm() < 1e-9 {
-            break;
+        if gradient.dot(&step) < TOLERANCE {
+            return Some(weights - step);
         }
+        let before = loss(rows, &weights);
+        let mut shorter = (0..=HALVINGS).map(|halvings| weights - step * 0.5_f64.powi(halvings));
+        weights = shorter.find(|weights| loss(rows, weights) < before)?;
     }
-    Some(Calibration { slope: weights.x as f32, offset: weights.y as f32 }).filter(|found| found.slope > 0.0)
+    None
+}
+
+/// The negative log-likelihood.
+fn loss(rows: &[Row], weights: &Vector2<f64>) -> f64 {
+    let of_row = |(features, target): &Row| {
+        let score = weights.dot(features);
+        score.max(0.0) + (-score.abs()).exp().ln_1p() - target * score
+    };
+    rows.iter().map(of_row).sum()
 }
 
 impl Bin {
@@ -154,6 +182,14 @@ mod tests {
         let falling: Vec<Attempt> = attempts(0.2, 100, 90).chain(attempts(0.8, 100, 10)).collect();
         assert_eq!(calibration(&falling), None);
         assert_eq!(calibration(&attempts(0.7, 10, 10).collect::<Vec<_>>()), None);
+        assert_eq!(calibration(&attempts(0.7, 10, 5).collect::<Vec<_>>()), None);
+    }
+
+    #[test]
+    fn a_calibration_is_found_where_whole_newton_steps_diverge() {
+        let all: Vec<Attempt> = attempts(0.9999, 1000, 990).chain(attempts(0.7, 100, 0)).collect();
+        let fitted = calibration(&all).unwrap();
+        assert!((fitted.slope - 1.102).abs() < 0.001 && (fitted.offset + 5.643).abs() < 0.001, "{fitted:?}");
     }
 
     #[test]

@@ -58,7 +58,6 @@ pub struct Condition {
     /// Name of the planner in the tables.
     pub method: String,
     /// The scenario that its network was trained on; `None` for several, or without a network.
-    #[serde(alias = "learnt")]
     pub trained_on: Option<String>,
     /// The scenario of the scenes.
     pub scenario: String,
@@ -70,7 +69,7 @@ pub struct Condition {
     pub views: String,
     /// ε, the smallest quality of a grasp, in hundredths.
     pub epsilon: u8,
-    /// If no grasp reaches ε: whether the best grasp is executed if its quality is at least 0.5, or 0.1 with an evaluator.
+    /// If no grasp reaches ε: whether the best grasp is executed if its quality is at least 0.5.
     pub forced: bool,
     /// Whether the scale of the depths is corrected by the table (`Workspace.correct_depth_scale`).
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
@@ -245,7 +244,7 @@ impl Results {
         let is_other = |condition: &Condition| condition.objects != TEST_OBJECTS && !condition.is_scale_corrected;
         for objects in self.object_sets(is_other) {
             let _ = write!(text, "\n### Objects of `{objects}`\n\nGSR / DR in %, pooled.\n\n");
-            self.by_simulator(text, |condition| is_other(condition) && condition.objects == objects, pooled_of);
+            self.by_simulator(text, |condition| is_other(condition) && condition.objects == objects, of_first_seed);
         }
     }
 
@@ -260,7 +259,7 @@ impl Results {
             let is_wanted = |condition: &Condition| condition.is_scale_corrected && condition.objects == objects;
             self.by_simulator(text, is_wanted, |results, condition| {
                 let measured = Condition { is_scale_corrected: false, ..condition.clone() };
-                format!("{} → {}", pooled_of(results, &measured), pooled_of(results, condition))
+                format!("{} → {}", of_first_seed(results, &measured), of_first_seed(results, condition))
             });
         }
     }
@@ -380,7 +379,7 @@ impl Results {
         for condition in conditions.map(as_published).collect::<BTreeSet<_>>() {
             let _ = write!(text, "| {} on {} |", condition.method, condition.scenario);
             for cell in cells.clone() {
-                let _ = write!(text, " {} |", pooled_of(self, &cell(&condition)));
+                let _ = write!(text, " {} |", of_first_seed(self, &cell(&condition)));
             }
             text.push('\n');
         }
@@ -446,13 +445,44 @@ fn spread(summaries: &[Summary], figure: fn(&Summary) -> f64) -> String {
     Spread::of(&values).map_or_else(|| "–".to_owned(), |spread| spread.percent())
 }
 
-/// GSR and DR of a condition over all its seeds.
-fn pooled_of(results: &Results, condition: &Condition) -> String {
-    results.conditions.get(condition).map_or_else(|| "–".to_owned(), |summaries| pooled(summaries))
+/// GSR and DR of a condition with its first seed: only the conditions of the paper are measured with the others.
+fn of_first_seed(results: &Results, condition: &Condition) -> String {
+    let summary = results.conditions.get(condition).and_then(|summaries| summaries.first());
+    summary.map_or_else(|| "–".to_owned(), gsr_and_dr)
 }
 
-fn pooled(summaries: &[Summary]) -> String {
-    let sum = |figure: fn(&Summary) -> usize| summaries.iter().map(figure).sum::<usize>() as f64;
-    let successes = sum(|s| s.successes) * 100.0;
-    format!("{:.1} / {:.1}", successes / sum(|s| s.attempts).max(1.0), successes / sum(|s| s.objects).max(1.0))
+fn gsr_and_dr(summary: &Summary) -> String {
+    let successes = summary.successes as f64 * 100.0;
+    format!("{:.1} / {:.1}", successes / summary.attempts.max(1) as f64, successes / summary.objects.max(1) as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn views_and_corrections_are_compared_on_the_first_seed() {
+        let measured = Condition {
+            method: "vgn".to_owned(),
+            trained_on: None,
+            scenario: "packed".to_owned(),
+            objects: TEST_OBJECTS.to_owned(),
+            simulator: Simulator::Rapier,
+            views: VIEWS[0].0.to_owned(),
+            epsilon: EPSILON,
+            forced: true,
+            is_scale_corrected: false,
+        };
+        let corrected = Condition { is_scale_corrected: true, ..measured.clone() };
+        let from_above = Condition { views: "circle".to_owned(), ..measured.clone() };
+        let summary = |successes| Summary { attempts: 10, objects: 10, successes, ..Summary::default() };
+        let conditions = BTreeMap::from([
+            (measured, vec![summary(4), summary(8)]),
+            (corrected, vec![summary(5)]),
+            (from_above, vec![summary(6)]),
+        ]);
+        let text = Results { conditions, ..Results::default() }.markdown();
+        assert!(text.contains("| vgn | 40.0 / 40.0 → 50.0 / 50.0 |"), "{text}");
+        assert!(text.contains("| vgn on packed | 40.0 / 40.0 | – | – | – | 60.0 / 60.0 |"), "{text}");
+    }
 }

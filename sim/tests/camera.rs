@@ -5,7 +5,7 @@ use std::sync::Arc;
 use grasp::Intrinsics;
 use grasp_picture::Mesh;
 use grasp_sim::TABLE_HEIGHT;
-use grasp_sim::camera::{Views, add_noise, look};
+use grasp_sim::camera::{Views, add_noise, add_stereo_noise, look};
 use grasp_sim::objects::Object;
 use grasp_sim::physics::World;
 use nalgebra::{Isometry3, Point3, Vector3};
@@ -111,4 +111,19 @@ fn noise_has_the_documented_magnitude() {
     assert!((18..=42).contains(&noisy.len()), "{} of 60 images have additive noise, about half must", noisy.len());
     // 5 mm on the coarse grid. Bilinear interpolation reduces it by two thirds in each direction on average.
     assert!(noisy.iter().all(|size| (0.0028..0.0042).contains(size)), "{noisy:?}");
+}
+
+#[test]
+fn stereo_noise_keeps_pixels_without_a_measurement() {
+    let pose = Isometry3::translation(0.15, 0.15, TABLE_HEIGHT + 0.02);
+    let world = world(Mesh::cuboid(Vector3::repeat(0.04)), &pose);
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    // In its upper rows the table is further away than the camera measures.
+    let clean = look(&world, &Views::Side { azimuth: 0.0 }.sample(&mut rng)).remove(0);
+    let mut noisy = clean.clone();
+    add_stereo_noise(&mut noisy, &mut rng);
+    let unmeasured: Vec<_> = clean.depth.iter().zip(&noisy.depth).filter(|(clean, _)| **clean == 0.0).collect();
+    assert!(unmeasured.len() > 1000 && unmeasured.iter().all(|(_, noisy)| **noisy == 0.0));
+    // Nothing is nearer than 0.3 m, and no pixel flies towards those without a measurement.
+    assert!(noisy.depth.iter().all(|&depth| depth == 0.0 || (0.3..2.1).contains(&depth)));
 }

@@ -1,6 +1,6 @@
 //! The commands of `grasp-sim`. `ORT_DYLIB_PATH` must name ONNX Runtime's library.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -146,6 +146,37 @@ fn all_formats_contain_the_same_data() {
 }
 
 #[test]
+fn conversions_keep_all_observations() {
+    let desk = Desk::new();
+    desk.run(&format!("{LABEL} --scenes 3 --out data"));
+    desk.run("convert --from data --out copy");
+    assert!(desk.scenes("copy") == desk.scenes("data"));
+    let error = desk.refused("convert --from data --format processed --out one");
+    assert!(error.contains("of data has 2 observations"), "{error}");
+    assert!(!desk.path("one").exists());
+}
+
+#[test]
+fn runs_that_would_lack_scenes_are_refused() {
+    let desk = Desk::new();
+    for format in ["packed", "processed"] {
+        let label = format!("label --points 2 --seed 4 --format {format} --out {format}");
+        desk.run(&format!("{label} --first 5 --scenes 3"));
+        let error = desk.refused(&format!("{label} --first 0 --scenes 5"));
+        assert!(error.contains("--first is 0") && error.contains("would be missing"), "{error}");
+        let error = desk.refused(&format!("{label} --first 12 --scenes 3"));
+        assert!(error.contains("--first is 12") && error.contains("would be missing"), "{error}");
+        let error = desk.refused(&format!("{label} --first 5 --scenes 6 --export scenes.jsonl"));
+        assert!(error.contains("--export scenes.jsonl lacks scenes"), "{error}");
+        assert!(!desk.path("scenes.jsonl").exists());
+        // The next scenes continue the run.
+        desk.run(&format!("{label} --first 8 --scenes 3"));
+        desk.run(&format!("label --points 2 --seed 4 --format {format} --out {format}-whole --first 5 --scenes 6"));
+        assert!(desk.scenes(format) == desk.scenes(&format!("{format}-whole")));
+    }
+}
+
+#[test]
 fn an_export_can_be_replayed() {
     let desk = Desk::new();
     desk.run("label --scene packed --objects train --points 10 --scenes 4 --seed 3 --out data --export scenes.jsonl");
@@ -242,6 +273,8 @@ fn a_benchmark_reports_every_attempt() {
         assert_eq!((ended, summary["seeds"]["gsr"]["n"].as_u64()), (2, Some(2)));
         assert!(summary["fusion_p50_ms"].as_f64().unwrap() > 0.0);
     }
+    let [of_random, of_network] = [0, 1].map(|planner: usize| &summaries[planner]["decoding"]);
+    assert!(of_random.is_null() && of_network["no_border"] == false, "{of_random} {of_network}");
     assert!(attempts.iter().any(|attempt| attempt["object"].is_string()), "attempts name their objects");
     let pictures: Vec<_> = fs::read_dir(desk.path("pictures")).unwrap().collect();
     assert_eq!(pictures.len(), attempts.len(), "a picture for each attempt");
@@ -304,11 +337,18 @@ fn the_first_failures_are_drawn_on_a_sheet() {
 #[test]
 fn all_planners_get_the_same_scenes() {
     let desk = Desk::new();
-    let objects = |planner: &str| -> Vec<u64> {
-        let lines = desk.run(&format!("bench --planner {planner} --scene pile --rounds 3 --seed 9"));
-        vec![serde_json::from_str::<Value>(&lines).unwrap()["objects"].as_u64().unwrap()]
+    // The number of objects at the start of each round. A round without a proposal has no attempt.
+    let objects = |planner: &str| -> BTreeMap<u64, u64> {
+        desk.run(&format!("bench --planner {planner} --rounds 12 --seed 9 --attempts {planner}.jsonl"));
+        let attempts = fs::read_to_string(desk.path(&format!("{planner}.jsonl"))).unwrap();
+        let attempts = attempts.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
+        let first = attempts.filter(|attempt| attempt["attempt"] == 0);
+        first.map(|attempt| (attempt["round"].as_u64().unwrap(), attempt["objects"].as_u64().unwrap())).collect()
     };
-    assert_eq!(objects("random"), objects("shaf"));
+    let (random, shaf) = (objects("random"), objects("shaf"));
+    let both = || random.iter().filter_map(|(round, count)| Some((count, shaf.get(round)?)));
+    assert!(both().count() >= 6 && both().all(|(count, other)| count == other), "{random:?} {shaf:?}");
+    assert!(both().map(|(count, _)| count).collect::<BTreeSet<_>>().len() > 1, "different scenes: {random:?}");
 }
 
 #[test]
@@ -411,6 +451,15 @@ fn conditions_of_the_tables_run_once() {
     fs::write(desk.path("zoo/vgn-packed.onnx"), network).unwrap();
     let (repeated, _) = missing(&desk);
     assert!(repeated > 5 && repeated < all, "{repeated} of {all}: conditions without the network are kept");
+
+    // The results of a network that is not in the folder stay, those of the earlier file do not.
+    let log = fs::read_to_string(desk.path("out/tables.jsonl")).unwrap();
+    let of_vgn = log.lines().find(|line| line.contains(r#""method":"vgn""#)).unwrap();
+    let of_other = of_vgn.replace(r#""key":""#, r#""key":"other-"#).replace(r#""method":"vgn""#, r#""method":"other""#);
+    fs::write(desk.path("out/tables.jsonl"), format!("{log}{of_other}\n")).unwrap();
+    assert_eq!(missing(&desk), (0, all));
+    let kept = fs::read_to_string(desk.path("out/tables.jsonl")).unwrap();
+    assert!(kept.lines().count() == all + 1 && kept.contains(r#""method":"other""#), "{kept}");
 }
 
 #[test]
@@ -447,7 +496,14 @@ fn errors_name_the_cause() {
         ("label --scenes 3 --scene pile --points 6 --format processed --out half".to_owned(), "half/setup.json"),
         ("bench --planner nowhere.onnx --rounds 1".to_owned(), "nowhere.onnx"),
         ("bench --planner grpc:127.0.0.1:1 --rounds 1".to_owned(), "127.0.0.1:1"),
+        ("bench --planner random --rounds 1 --threshold 2".to_owned(), "must be greater than 0 and at most 1"),
+        ("bench --planner random --rounds 1 --force nan".to_owned(), "must be greater than 0 and at most 1, or `none`"),
+        ("bench --planner random --rounds 1 --out-th 2".to_owned(), "must be from 0 to 1"),
+        ("bench --planner random --rounds 1 --views side:nan".to_owned(), "--views is `side:nan`"),
+        ("bench --planner random --rounds 1 --failures nowhere/sheet.png".to_owned(), "nowhere/sheet.png"),
         ("tables --models nowhere".to_owned(), "nowhere"),
+        ("tables --objects some/test".to_owned(), "--objects is some/test"),
+        ("tables --objects a/things --objects b/things".to_owned(), "--objects a/things and --objects b/things"),
         ("look data --views side --looks 2 --out never".to_owned(), "`look` is now `observe`"),
         ("label --scenes 1 --looks 2 --out never".to_owned(), "`--looks` is now `--observations`"),
         ("label --scenes 1 --objects endless --out never".to_owned(), "`endless` is now `generated`"),

@@ -34,12 +34,12 @@ class LabelJobsTest(unittest.TestCase):
         self.assertEqual(result.returncode, 0, result.stderr)
         return result.stdout
 
-    def files(self, folder):
-        """The content of a data set in the processed format: sorted grasps, and scene files by name."""
-        out = self.folder / f"{folder.name}-processed"
-        self.run_as(["grasp-sim", "convert", "--from", folder, "--format", "processed", "--out", out])
-        grasps = sorted((out / "grasps.csv").read_text().splitlines())
-        return grasps, {path.name: path.read_bytes() for path in (out / "scenes").iterdir()}
+    def scenes(self, folder):
+        """The content of a data set, in one file."""
+        out = self.folder / f"{folder.name}-converted"
+        self.run_as(["grasp-sim", "convert", "--from", folder, "--out", out])
+        (pack,) = out.glob("*.pack")
+        return pack.read_bytes()
 
     def test_the_manifests_are_valid(self):
         for name in ["label.yaml", "merge.yaml"]:
@@ -73,7 +73,7 @@ class LabelJobsTest(unittest.TestCase):
         self.assertIn("11 scenes from 8 folders", output)
         alone = self.folder / "alone"
         self.run_as(["grasp-sim", "label", *container["args"], "--points", 6, "--scenes", 11, "--out", alone])
-        self.assertEqual(self.files(data / "whole"), self.files(alone))
+        self.assertEqual(self.scenes(data / "whole"), self.scenes(alone))
 
     def test_slurm_tasks_label_every_scene_once(self):
         script = DEPLOY / "slurm.sbatch"

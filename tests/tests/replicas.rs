@@ -1,4 +1,4 @@
-//! Two servers behind a load balancer, one of which is killed.
+//! Two servers behind a load balancer, one of which is killed or drains.
 
 use std::net::{SocketAddr, TcpListener};
 use std::process::{Child, Command};
@@ -9,6 +9,7 @@ use std::time::Duration;
 use grasp_client::{Access, Arrivals, Client, DataType, Options, Retry, Until, load};
 use grasp_tests::{Server, TestModel, blobs};
 use nalgebra::Isometry3;
+use tokio::task::JoinSet;
 use tonic::Code;
 
 const RESOLUTION: usize = 40;
@@ -81,4 +82,32 @@ async fn requests_with_retries_succeed_when_a_replica_is_killed() {
     let report = calls.await.unwrap();
     assert_eq!((report.answered.len(), report.refusals()), (CALLS, 0), "{:?}", report.refused.keys());
     println!("{CALLS} calls, slowest {:?}", report.answered.last().unwrap());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn accepted_calls_succeed_while_a_replica_drains() {
+    // The eight inferences of a replica take longer than the balancer needs to mark it as down.
+    const CALLS: u32 = 16;
+    let replica = || {
+        let slow = TestModel::new("slow").convolutions(60);
+        Server::run(&[slow], &["--log", "warn", "--drain-timeout", "60"])
+    };
+    let (survivor, mut victim) = (replica(), replica());
+    let balancer = Balancer::run([&survivor, &victim]);
+    // This client does not retry: a call that the balancer ends fails.
+    let client = Client::wait_ready(balancer.address.to_string(), Duration::from_mins(1)).await.unwrap();
+    let volume = Arc::new(blobs(grasp_tests::RESOLUTION, Isometry3::identity(), &[[5, 5, 5]]));
+    let mut calls = JoinSet::new();
+    for _ in 0..CALLS {
+        let (client, volume) = (client.clone(), Arc::clone(&volume));
+        calls.spawn(async move { client.detect(&volume, Options::default()).await });
+    }
+    let accepted = "graspd_queued_total{model=\"slow 1\",priority=\"NORMAL\"}";
+    victim.wait_until(accepted, |by_victim| by_victim + survivor.metric(accepted) == f64::from(CALLS)).await;
+    assert!(victim.metric("graspd_queue_requests{model=\"slow 1\"}") > 0.0, "the victim has accepted calls");
+    victim.terminate().unwrap();
+    for outcome in calls.join_all().await {
+        assert_eq!(outcome.unwrap().grasps.len(), 1);
+    }
+    assert_eq!(victim.wait().unwrap().code(), Some(0));
 }

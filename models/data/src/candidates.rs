@@ -12,7 +12,7 @@ use npyz::npz::{NpzArchive, NpzWriter, file_name_from_array_name};
 use npyz::{AutoSerialize, Deserialize, NpyFile, WriterBuilder};
 
 use crate::error::{At, DataError};
-use crate::without_time;
+use crate::{finish, without_time};
 
 const EXPECTED: &str =
     "`images` u8 [n, shape…], `labels` u8 [n] of 0 and 1, and `scenes` u64 [n], as `grasp-sim candidates` writes them";
@@ -93,7 +93,8 @@ impl Candidates {
         let shape: Vec<u64> = [count].into_iter().chain(self.shape.iter().map(|&size| size as u64)).collect();
         write_array(&mut archive, "images", &shape, self.images.iter().copied())?;
         write_array(&mut archive, "labels", &[count], self.labels.iter().map(|&label| u8::from(label)))?;
-        write_array(&mut archive, "scenes", &[self.scenes.len() as u64], self.scenes.iter().copied())
+        write_array(&mut archive, "scenes", &[self.scenes.len() as u64], self.scenes.iter().copied())?;
+        finish(archive)
     }
 
     /// Reads a file.
@@ -127,7 +128,8 @@ fn write_array<T: AutoSerialize>(
     shape: &[u64],
     values: impl Iterator<Item = T>,
 ) -> io::Result<()> {
-    archive.zip_writer().start_file(file_name_from_array_name(name), without_time())?;
+    // The images of 100,000 candidates have more than 4 GiB.
+    archive.zip_writer().start_file(file_name_from_array_name(name), without_time().large_file(true))?;
     // Buffered: a call to the compressor for every pixel takes about as long as the trials.
     let mut file = io::BufWriter::with_capacity(1 << 16, archive.zip_writer());
     let mut array = npyz::WriteOptions::new().default_dtype().shape(shape).writer(&mut file).begin_nd()?;

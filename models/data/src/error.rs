@@ -52,6 +52,9 @@ pub enum DataError {
         .0.display()
     )]
     Empty(PathBuf),
+    /// Scenes are to be merged into a folder that has some.
+    #[error("{} already holds scenes; merge into another folder", .0.display())]
+    NotEmpty(PathBuf),
     /// The folder holds data of another setup.
     #[error("{} was written with other settings ({found}); use another folder, or the same settings", path.display())]
     OtherSetup {

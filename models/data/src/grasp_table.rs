@@ -75,7 +75,12 @@ impl TableWriter {
     pub(crate) fn open(folder: &Path, unit: LengthUnit) -> Result<(Self, Option<u64>), DataError> {
         let path = folder.join(FILE);
         let mut file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path).at(&path)?;
-        let (kept, last) = last_scene(&file).at(&path)?;
+        let (kept, last) = last_scene(&file).at(&path)?.map_err(|line| DataError::Row {
+            path: path.clone(),
+            line,
+            reason: "the scene id is not a number, so no rows can be appended; write into another folder".to_owned(),
+            columns: unit.columns(),
+        })?;
         if kept > 0 {
             check_columns(&path, unit)?;
         }
@@ -114,24 +119,30 @@ fn check_columns(path: &Path, unit: LengthUnit) -> Result<(), DataError> {
     Err(DataError::Row { path: path.to_owned(), line: 1, reason, columns: unit.columns() })
 }
 
-/// Length of the table without the rows of its last scene, which may be incomplete, and the number of that scene.
-fn last_scene(table: &File) -> io::Result<(u64, Option<u64>)> {
+/// Length of the table without the rows of its last scene, which may be incomplete, and the number of that scene. The
+/// error is the line of a scene whose id is not a number, as in VGN's own tables.
+fn last_scene(table: &File) -> io::Result<Result<(u64, Option<u64>), u64>> {
     let mut reader = BufReader::new(table);
     let mut line = String::new();
     let (mut offset, mut start, mut last) = (0, 0, None);
-    while reader.read_line(&mut line)? > 0 {
+    for number in 1.. {
+        line.clear();
+        if reader.read_line(&mut line)? == 0 {
+            break;
+        }
         // A row without a line end may be truncated within the scene number. It is counted with the previous scene.
-        if line.ends_with('\n')
-            && let Some(number) = line.split(',').next().and_then(|id| id.parse::<u64>().ok())
-            && last != Some(number)
-        {
-            last = Some(number);
-            start = offset;
+        if number > 1 && line.ends_with('\n') {
+            let Some(scene) = line.split(',').next().and_then(|id| id.parse::<u64>().ok()) else {
+                return Ok(Err(number));
+            };
+            if last != Some(scene) {
+                last = Some(scene);
+                start = offset;
+            }
         }
         offset += line.len() as u64;
-        line.clear();
     }
-    Ok((start, last))
+    Ok(Ok((start, last)))
 }
 
 #[derive(Deserialize)]

@@ -8,6 +8,11 @@
 //!
 //! A [`Dataset`] reads the last two for training. [`Candidates`] are the training data of GPD's classifier.
 
+use std::fs::File;
+use std::io::{self, BufWriter};
+
+use npyz::npz::NpzWriter;
+
 mod candidates;
 mod dataset;
 mod error;
@@ -56,6 +61,12 @@ pub fn value(byte: u8) -> f32 {
 fn edge_of(voxels: usize) -> Option<usize> {
     let edge = (voxels as f64).cbrt().round() as usize;
     (edge > 0 && edge.pow(3) == voxels).then_some(edge)
+}
+
+/// Writes the end of an archive. Dropping the writer would ignore errors, such as a full disk.
+fn finish(mut archive: NpzWriter<BufWriter<File>>) -> io::Result<()> {
+    archive.zip_writer().finish()?.into_inner().map_err(io::IntoInnerError::into_error)?;
+    Ok(())
 }
 
 /// Options of an archive entry without the time of day, so that the same data give the same bytes.

@@ -200,7 +200,9 @@ impl Reader {
     /// As [`open`](Self::open). Scenes that were read before stay available.
     pub fn refresh(&mut self) -> Result<usize, DataError> {
         let before = self.scenes.len();
-        for (index, path) in files(&self.folder)?.into_iter().enumerate() {
+        for path in files(&self.folder)? {
+            // Not the position in the folder: files without a complete header are skipped.
+            let index = self.files.iter().position(|file| file.path == path).unwrap_or(self.files.len());
             let known = self.files.get(index);
             let length = fs::metadata(&path).at(&path)?.len() as usize;
             if length < HEADER || known.is_some_and(|file| file.map.len() == length) {
@@ -382,8 +384,7 @@ pub fn merge(folders: &[PathBuf], into: &Path) -> Result<usize, DataError> {
     let Some(setup) = setup else { return Err(DataError::Empty(into.to_owned())) };
     setup.write_or_compare(into)?;
     if is_packed(into) {
-        let found = "the folder already holds scenes".to_owned();
-        return Err(DataError::OtherSetup { path: into.to_owned(), found });
+        return Err(DataError::NotEmpty(into.to_owned()));
     }
     for folder in folders {
         for source in files(folder)? {

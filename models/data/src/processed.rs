@@ -15,7 +15,7 @@ use rayon::prelude::*;
 
 use crate::error::{At, DataError};
 use crate::grasp_table::{self, LengthUnit, TableWriter};
-use crate::{Scene, Setup, Trial, edge_of, quantise, without_time};
+use crate::{Scene, Setup, Trial, edge_of, finish, quantise, without_time};
 
 const EXPECTED: &str = "`grid`, f32 [1, N, N, N] with values in [0, 1]";
 
@@ -82,7 +82,8 @@ fn write_volume(path: &Path, values: &[f32]) -> io::Result<()> {
     let array = archive.array("grid", without_time())?;
     let mut grid = array.default_dtype().shape(&[1, edge, edge, edge]).begin_nd()?;
     grid.extend(values.iter().copied())?;
-    grid.finish()
+    grid.finish()?;
+    finish(archive)
 }
 
 fn read_volume(path: &Path) -> Result<Vec<f32>, DataError> {

@@ -17,7 +17,7 @@ use npyz::npz::{NpzArchive, NpzWriter};
 
 use crate::error::{At, DataError};
 use crate::grasp_table::{self, LengthUnit, TableWriter};
-use crate::{Setup, Trial, without_time};
+use crate::{Setup, Trial, finish, without_time};
 
 const EXPECTED: &str = "`depth_imgs`, f32 [n, height, width], and `extrinsics`, [n, 7]";
 
@@ -166,5 +166,6 @@ fn write_views(path: &Path, views: &[View], [height, width]: [usize; 2]) -> io::
         let (q, t) = (view.camera_from_task.rotation.coords, view.camera_from_task.translation.vector);
         extrinsics.extend([q.x, q.y, q.z, q.w, t.x, t.y, t.z].map(|number| number as f32))?;
     }
-    extrinsics.finish()
+    extrinsics.finish()?;
+    finish(archive)
 }

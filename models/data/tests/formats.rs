@@ -159,9 +159,11 @@ fn an_interrupted_packed_run_continues_without_lost_or_duplicate_scenes() {
         setup().write_or_compare(folder.path()).unwrap();
         fs::write(folder.path().join("scenes-00000.pack"), &bytes[..length]).unwrap();
         pack(folder.path(), [0, 1, 3]);
-        let reader = packed::Reader::open(folder.path()).unwrap();
+        let mut reader = packed::Reader::open(folder.path()).unwrap();
         let numbers: Vec<u64> = (0..reader.len()).map(|index| reader.number(index)).collect();
         assert_eq!(numbers, [0, 1, 3], "cut after {length} bytes");
+        assert_eq!(reader.volume(2, 0), grasp_data::quantise(&volumes(3)[0]), "cut after {length} bytes");
+        assert_eq!(reader.refresh().unwrap(), 0, "cut after {length} bytes");
         assert_eq!(
             fs::read(folder.path().join("scenes-00000.pack")).unwrap(),
             bytes[..length],
@@ -260,6 +262,19 @@ fn an_interrupted_processed_run_continues_without_lost_or_duplicate_scenes() {
     assert_eq!(dataset.len(), 3);
     assert_eq!(dataset.volume(2, 0), grasp_data::quantise(&volumes(3)[0]));
     assert_same(&dataset.trials(2), &trials(3));
+}
+
+#[test]
+fn a_table_whose_scene_ids_are_not_numbers_is_not_continued() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut writer = processed::Writer::open(folder.path(), &setup()).unwrap();
+    // As VGN names its scenes.
+    writer.append("0c6a1f", &volumes(0)[0], &trials(0)).unwrap();
+    drop(writer);
+    let table = fs::read_to_string(folder.path().join("grasps.csv")).unwrap();
+    let error = processed::Writer::open(folder.path(), &setup()).err().unwrap().to_string();
+    assert!(error.contains("line 2: the scene id is not a number"), "{error}");
+    assert_eq!(fs::read_to_string(folder.path().join("grasps.csv")).unwrap(), table);
 }
 
 #[test]

@@ -41,8 +41,8 @@ pub(super) struct BatchSession {
     size: Option<usize>,
     /// Sizes that batches are padded to, smallest first; empty if they are not padded.
     padded_sizes: Vec<usize>,
-    /// Buffers by batch size, allocated once per size. Callers that only use [`batch_sizes`] need less than three times
-    /// the memory of the largest batch.
+    /// Buffers by batch size: the powers of two, and one other size. They need less than three times the memory of the
+    /// largest batch.
     buffers: BTreeMap<usize, Buffers>,
 }
 
@@ -170,6 +170,9 @@ impl BatchSession {
 
     fn session_and_buffers(&mut self, batch: usize, resolution: usize) -> ort::Result<(&mut Session, &mut Buffers)> {
         let size = self.size.unwrap_or_else(|| padded(batch, &self.padded_sizes));
+        if !size.is_power_of_two() && !self.buffers.contains_key(&size) {
+            self.buffers.retain(|size, _| size.is_power_of_two());
+        }
         let buffers = match self.buffers.entry(size) {
             btree_map::Entry::Occupied(entry) => entry.into_mut(),
             btree_map::Entry::Vacant(entry) => entry.insert(Buffers::new(&self.session, size, resolution)?),

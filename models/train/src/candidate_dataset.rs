@@ -11,8 +11,8 @@ pub struct CandidateDataset {
     images: Tensor,
     /// Whether each candidate succeeded.
     labels: Vec<bool>,
-    /// File index and scene number of each candidate.
-    scenes: Vec<(usize, u64)>,
+    /// Scene number of each candidate.
+    scenes: Vec<u64>,
 }
 
 impl CandidateDataset {
@@ -22,7 +22,7 @@ impl CandidateDataset {
     /// [`DataError`] names the file that cannot be used.
     pub fn read(files: &[PathBuf], shape: &[usize]) -> Result<Self, DataError> {
         let (mut images, mut labels, mut scenes) = (Vec::new(), Vec::new(), Vec::new());
-        for (file, path) in files.iter().enumerate() {
+        for path in files {
             let candidates = Candidates::read(path)?;
             if candidates.shape != shape {
                 let reason = format!("the images are of {:?}, the network needs {shape:?}", candidates.shape);
@@ -33,7 +33,7 @@ impl CandidateDataset {
             let sizes: Vec<i64> = sizes.into_iter().map(|size| size as i64).collect();
             images.push(Tensor::from_slice(&candidates.images).reshape(sizes));
             labels.extend(candidates.labels);
-            scenes.extend(candidates.scenes.into_iter().map(|scene| (file, scene)));
+            scenes.extend(candidates.scenes);
         }
         Ok(Self { images: Tensor::cat(&images, 0), labels, scenes })
     }
@@ -53,8 +53,7 @@ impl Examples for CandidateDataset {
     }
 
     fn scene(&self, index: usize) -> String {
-        let (file, scene) = self.scenes[index];
-        format!("{file}/{scene}")
+        self.scenes[index].to_string()
     }
 
     fn images(&self, indices: &[i64]) -> Tensor {

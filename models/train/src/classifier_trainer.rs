@@ -25,7 +25,8 @@ pub trait Examples {
     /// Number of classes.
     fn classes(&self) -> usize;
 
-    /// The scene of an example. Its examples are either all for training or all for validation.
+    /// The scene of an example. Its examples are either all for training or all for validation. Scenes of several files
+    /// with one name are not distinguished: with the same seed they are the same scene.
     fn scene(&self, index: usize) -> String;
 
     /// The images of examples, f32 `[n, shape…]` in [0, 1].

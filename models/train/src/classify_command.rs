@@ -37,7 +37,7 @@ pub(crate) struct Classify {
     #[arg(long)]
     out: PathBuf,
     /// Number of epochs.
-    #[arg(long, default_value_t = 10)]
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..))]
     epochs: u64,
     /// Candidates per step.
     #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u16).range(1..))]
@@ -112,6 +112,7 @@ impl Classify {
         }
         ensure!((0.0..1.0).contains(&self.val), "--val is {}, must be at least 0 and less than 1", self.val);
         ensure!(self.weight_decay >= 0.0, "--weight-decay is {}, must be at least 0", self.weight_decay);
+        ensure!(self.lr > 0.0, "--lr is {}, must be greater than 0", self.lr);
         if let Some(folder) = self.out.parent() {
             fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
         }
@@ -145,6 +146,13 @@ impl Classify {
             bar.finish_and_clear();
             let record = ClassifierEpochRecord { epoch, training, validation: trainer.validate()? };
             println!("{}", serde_json::to_string(&record)?);
+            let losses =
+                [Some(record.training), record.validation].map(|metrics| metrics.map_or(0.0, |metrics| metrics.loss));
+            ensure!(
+                losses.into_iter().all(f64::is_finite),
+                "the loss is not finite after epoch {epoch}; use a smaller --lr than {}",
+                self.lr
+            );
             let loss = record.validation.map_or(f64::NEG_INFINITY, |validation| validation.loss);
             if loss <= best {
                 best = loss;

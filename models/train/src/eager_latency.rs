@@ -3,9 +3,8 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
 use clap::Args;
-use grasp::RESOLUTION;
 use grasp_models::onnx::ModelProto;
-use grasp_models::{with_full_weights, with_published_heads};
+use grasp_models::{Metadata, with_full_weights, with_published_heads};
 use grasp_train::{ExecutionOptions, Executor};
 use serde::Serialize;
 use tch::{Device, Kind, Tensor};
@@ -44,18 +43,18 @@ impl EagerLatency {
         let model = ModelProto::read(&self.model)?;
         let published =
             with_published_heads(&with_full_weights(&model)?).context("--model must be a network of `grasp-train`")?;
-        let published_p50_ms = self.median(published)?;
-        let p50_ms = self.median(model)?;
+        let edge = Metadata::of(&model, &self.model)?.resolution as i64;
+        let published_p50_ms = self.median(published, edge)?;
+        let p50_ms = self.median(model, edge)?;
         let report = LatencyReport { calls: self.calls, threads: self.threads, p50_ms, published_p50_ms };
         println!("{}", serde_json::to_string(&report)?);
         Ok(())
     }
 
-    /// Median latency, milliseconds.
-    fn median(&self, model: ModelProto) -> Result<f64> {
+    /// Median latency for a volume of `edge`³ voxels, milliseconds.
+    fn median(&self, model: ModelProto, edge: i64) -> Result<f64> {
         let execution = ExecutionOptions { device: Device::Cpu, bf16: false, channels_last: false };
         let executor = Executor::new(model, execution)?.without_optimizations();
-        let edge = RESOLUTION as i64;
         let volume = Tensor::rand([1, 1, edge, edge, edge], (Kind::Float, Device::Cpu));
         let mut times = Vec::new();
         let _no_gradients = tch::no_grad_guard();

@@ -58,6 +58,22 @@ fn only_reader(graph: &GraphProto, node: usize, op: &str) -> Option<usize> {
 }
 
 fn is_number(graph: &GraphProto, name: &str, value: f32) -> bool {
-    let tensor = graph.initializer.iter().find(|tensor| tensor.name() == name && tensor.elements() == 1);
-    tensor.is_some_and(|tensor| tensor.to_f32().is_ok_and(|values| values == [value]))
+    graph.stored(name).is_some_and(|tensor| tensor.to_f32().is_ok_and(|values| values == [value]))
+}
+
+#[cfg(test)]
+mod tests {
+    use grasp_models::Architecture;
+
+    use super::*;
+
+    #[test]
+    fn every_gelu_of_the_transformer_is_found() {
+        let model = Architecture::TransformerSmall.build(16, 0).unwrap();
+        let graph = model.graph.unwrap();
+        let erfs = graph.node.iter().filter(|node| node.op_type() == "Erf").count();
+        let gelus = Gelus::of(&graph);
+        assert!(erfs > 0);
+        assert_eq!((gelus.inputs.len(), gelus.inner.len()), (erfs, 4 * erfs));
+    }
 }

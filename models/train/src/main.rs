@@ -70,7 +70,8 @@ struct TrainArgs {
     /// Before every epoch, read scenes that were added to the folders.
     #[arg(long)]
     follow: bool,
-    /// Output file of the model. Written beside it: .state (checkpoint), .jsonl (one record per epoch), .png (curves).
+    /// Output file of the model. Written beside it: .state (checkpoint), .jsonl (one record per epoch), .png (curves), and
+    /// with --evaluate .tried (the evaluated model).
     #[arg(long)]
     out: PathBuf,
     /// Continue from the .state file beside the model.
@@ -81,7 +82,7 @@ struct TrainArgs {
     #[arg(long, value_name = "SECONDS", default_value_t = 0.0)]
     save_every: f64,
     /// Number of epochs [default: 30 for vgn, 21 for the transformers].
-    #[arg(long)]
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     epochs: Option<u64>,
     /// Time after which the run ends, minutes; its last epoch is cut short. With it the default of --epochs is no limit,
     /// and the cosine schedule follows the time instead of the steps.
@@ -123,7 +124,7 @@ struct TrainArgs {
     #[arg(long, value_name = "COMMAND")]
     evaluate: Option<String>,
     /// Interval of --evaluate, epochs. The last epoch is always evaluated.
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, default_value_t = 1, requires = "evaluate", value_parser = clap::value_parser!(u64).range(1..))]
     evaluate_every: u64,
     /// Stop after this many consecutive results that are not better than the best. Results are those of --evaluate if it
     /// is given, otherwise the validation loss.

@@ -8,7 +8,7 @@ use grasp::{Maps, Volume};
 use grasp_data::Dataset;
 use grasp_models::onnx::ModelProto;
 use grasp_models::{
-    Metadata, Network, Options, averaged_over_rotations, with_full_weights, with_half_weights, with_int8,
+    Calibration, Metadata, Network, Options, averaged_over_rotations, with_full_weights, with_half_weights, with_int8,
 };
 use nalgebra::Isometry3;
 use serde::Serialize;
@@ -96,6 +96,13 @@ impl Export {
         ensure!(self.from != self.out, "--from and --out are the same file; use another --out");
         let model = ModelProto::read(&self.from)?;
         let data = if self.data.is_empty() { None } else { Some(Dataset::open(&self.data)?) };
+        if let Some(data) = &data {
+            let (resolution, needed) = (data.resolution(), Metadata::of(&model, &self.from)?.resolution);
+            ensure!(
+                resolution == needed,
+                "--data has volumes of {resolution}³ voxels, but the network needs {needed}³"
+            );
+        }
         let exported = self.exported(&model, data.as_ref()).with_context(|| self.from.display().to_string())?;
         exported.write(&self.out)?;
         let bytes = |path: &PathBuf| std::fs::metadata(path).map(|file| file.len());
@@ -123,7 +130,11 @@ impl Export {
         if self.average_rotations {
             note("averaged_over_rotations", "4");
         }
+        let calibration = Calibration::of(&model)?;
         metadata.write_to(&mut model);
+        if calibration != Calibration::default() {
+            calibration.write_to(&mut model);
+        }
         Ok(model)
     }
 

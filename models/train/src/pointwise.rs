@@ -41,14 +41,6 @@ fn ints<'a>(node: &'a NodeProto, name: &str) -> &'a [i64] {
     node.attribute(name).map_or(&[], |attribute| &attribute.ints)
 }
 
-/// The integers of a constant of the graph.
-fn constant(graph: &GraphProto, name: &str) -> Option<Vec<i64>> {
-    let initializer = || graph.initializer.iter().find(|tensor| tensor.name() == name);
-    let node = graph.node.iter().find(|node| node.op_type() == "Constant" && node.output.iter().any(|o| o == name));
-    let value = node.and_then(|node| node.attribute("value")?.t.as_ref()).or_else(initializer)?;
-    value.to_i64().ok()
-}
-
 /// Whether the node is a convolution with stride 1 that preserves the size.
 fn is_head(node: &NodeProto) -> bool {
     let kernel = ints(node, "kernel_shape");
@@ -65,7 +57,7 @@ fn is_pointwise(graph: &GraphProto, node: &NodeProto) -> bool {
     match node.op_type() {
         "Add" | "Clip" | "Div" | "Expand" | "LeakyRelu" | "Mul" | "Relu" | "Shape" | "Sigmoid" | "Sub" => true,
         "ReduceL2" => match node.input.get(1) {
-            Some(axes) => constant(graph, axes).is_some_and(|axes| axes == [1]),
+            Some(axes) => graph.stored(axes).is_some_and(|axes| axes.to_i64().is_ok_and(|axes| axes == [1])),
             None => ints(node, "axes") == [1],
         },
         "Concat" | "Split" => node.attribute("axis").is_some_and(|axis| axis.i() == 1),

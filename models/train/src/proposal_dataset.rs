@@ -31,7 +31,7 @@ impl ProposalDataset {
     /// [`DataError`] names the folder that cannot be used.
     pub fn read(folders: &[PathBuf]) -> Result<Self, DataError> {
         let mut all = Self { volumes: Vec::new(), scenes: Vec::new(), proposals: Vec::new() };
-        for (folder, path) in folders.iter().enumerate() {
+        for path in folders {
             let dataset = Dataset::open(std::slice::from_ref(path))?;
             let n = dataset.resolution();
             let voxel_size = WORKSPACE_SIZE / n as f64;
@@ -51,7 +51,7 @@ impl ProposalDataset {
                     all.proposals.push(Proposal { volume: all.volumes.len(), pose, class });
                 }
                 all.volumes.push(volume);
-                all.scenes.push(format!("{folder}/{}", dataset.id(scene)));
+                all.scenes.push(dataset.id(scene).to_owned());
             }
         }
         Ok(all)

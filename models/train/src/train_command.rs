@@ -32,12 +32,21 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
     ensure!(training.save_every >= 0.0, "--save-every is {}, must be at least 0 seconds", training.save_every);
     ensure!(training.weight_decay >= 0.0, "--weight-decay is {}, must be at least 0", training.weight_decay);
     ensure!(training.rotation_weight >= 0.0, "--rotation-weight is {}, must be at least 0", training.rotation_weight);
+    if let Some(lr) = training.lr {
+        ensure!(lr > 0.0, "--lr is {lr}, must be greater than 0");
+    }
     if let Some(minutes) = training.minutes {
         ensure!(minutes > 0.0, "--minutes is {minutes}, must be greater than 0");
     }
     if let Some(decay) = training.ema {
         ensure!((0.0..1.0).contains(&decay), "--ema is {decay}, must be at least 0 and less than 1");
     }
+    ensure!(
+        training.val > 0.0
+            || training.evaluate.is_some()
+            || training.patience.is_none() && training.keep == KeptWeights::Last,
+        "--patience and --keep best need results; give --evaluate, or --val greater than 0"
+    );
     ensure!(!training.augment.contains(&AugmentArg::Turns), "`--augment turns` is now `--augment rotate`");
     if let Some(command) = &training.evaluate {
         ensure!(
@@ -98,14 +107,21 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
         })?;
         bar.finish_and_clear();
         let mut better = best.cost.is_none();
-        let interrupted = matches!(epoch, EpochOutcome::Interrupted);
+        let mut interrupted = matches!(epoch, EpochOutcome::Interrupted);
+        // Returned after the checkpoint is written, so that the epoch is not lost.
+        let mut failure = None;
         if let EpochOutcome::Completed(mut record) = epoch {
             add_provenance(training, &settings, trainer.dataset(), &mut metadata);
             let last = trainer.epochs() == settings.epochs || trainer.is_over();
             let due = last || trainer.epochs().is_multiple_of(training.evaluate_every);
             if let Some(command) = training.evaluate.as_deref().filter(|_| due) {
                 write_model(&mut trainer, &metadata, Some(&record), &files.evaluated)?;
-                record.benchmark = Some(evaluate(command, &files.evaluated)?);
+                match evaluate(command, &files.evaluated) {
+                    Ok(rates) => record.benchmark = Some(rates),
+                    // Ctrl-C also ends the command.
+                    Err(_) if stop.load(Ordering::Relaxed) => interrupted = true,
+                    Err(error) => failure = Some(error),
+                }
             }
             println!("{}", serde_json::to_string(&record)?);
             better = best.update(training, &record);
@@ -114,7 +130,7 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
             learning_curves::draw(&files.curves, &records)?;
         }
         let BestResult { cost, results_since } = best;
-        let ends = interrupted || !continues(&trainer, results_since);
+        let ends = interrupted || failure.is_some() || !continues(&trainer, results_since);
         let due = ends || saved.elapsed().as_secs_f64() >= training.save_every;
         if better || training.keep == KeptWeights::Last && due {
             add_provenance(training, &settings, trainer.dataset(), &mut metadata);
@@ -123,6 +139,9 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
         if due {
             Checkpoint { best: cost, results_since_best: results_since, ..trainer.checkpoint() }.write(&files.state)?;
             saved = Instant::now();
+        }
+        if let Some(error) = failure {
+            return Err(error);
         }
         if interrupted {
             eprintln!("stopped after step {}; continue with --resume", trainer.steps());
@@ -182,6 +201,8 @@ fn initial_network(training: &TrainArgs) -> Result<(ModelProto, Metadata)> {
     };
     let path = training.from.as_deref().unwrap_or(&training.out);
     let mut metadata = Metadata::of(&model, path).with_context(|| path.display().to_string())?;
+    // The rest is about the weights before this run.
+    metadata.provenance.retain(|key, _| ["architecture", "orientation"].contains(&key.as_str()));
     let file_name = Metadata::defaults(&training.out, None).name;
     metadata.name = training.name.clone().unwrap_or(file_name);
     metadata.version.clone_from(&training.model_version);
@@ -332,6 +353,9 @@ impl RunFiles {
     fn write_log(&self, records: &[EpochRecord]) -> Result<()> {
         let lines =
             records.iter().map(|record| Ok(serde_json::to_string(record)? + "\n")).collect::<Result<String>>()?;
-        fs::write(&self.log, lines).with_context(|| self.log.display().to_string())
+        // Renamed, so that a run that is killed leaves no incomplete line.
+        let partial = self.log.with_extension("jsonl.partial");
+        let written = fs::write(&partial, lines).and_then(|()| fs::rename(&partial, &self.log));
+        written.with_context(|| self.log.display().to_string())
     }
 }

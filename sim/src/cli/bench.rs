@@ -1,6 +1,6 @@
 use std::collections::BTreeMap;
 use std::fmt;
-use std::fs::{self, File};
+use std::fs::{self, File, OpenOptions};
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
@@ -15,9 +15,9 @@ use grasp_sim::benchmark::{Benchmark, Event};
 use grasp_sim::planner::PlannerSpec;
 use grasp_sim::score::{Spread, Summary};
 use indicatif::ProgressBar;
-use serde::Serialize;
+use serde_json::{Value, json};
 
-use super::{SceneArgs, show};
+use super::{SceneArgs, parse_quality, parse_share, show};
 
 /// The scenes depend only on the seed, so that all planners are evaluated on the same scenes.
 #[derive(Args)]
@@ -25,7 +25,8 @@ pub struct Bench {
     /// Planner; can be repeated: `random`; the path of an .onnx network; `EVALUATOR.onnx:NETWORK.onnx`
     /// (a network and the evaluator of its grasps); `grpc:ADDRESS` (a running graspd); `shaf` (the
     /// highest candidate); `shaf:FILE` (the highest of a network's proposals with a quality above 0.5); `gpd:FILE`
-    /// (candidates scored by a classifier of `grasp-train classify`).
+    /// (candidates scored by a classifier of `grasp-train classify`). `grpc` uses only --threshold and --force of the
+    /// options of decoding, `shaf:FILE` only --out-th, --no-border and --clear; `random`, `shaf` and `gpd` use none.
     #[arg(long = "planner", required = true)]
     planners: Vec<String>,
 
@@ -81,10 +82,10 @@ enum Format {
 
 /// Decoding of a network's output; the defaults are those of GIGA's evaluation. A running graspd uses only the
 /// threshold and `force`.
-#[derive(Args, Serialize)]
+#[derive(Args)]
 struct DecodingArgs {
     /// Smallest quality of a grasp (ε).
-    #[arg(long, default_value_t = 0.9)]
+    #[arg(long, default_value_t = 0.9, value_parser = parse_quality)]
     threshold: f32,
 
     /// If no grasp reaches the threshold, execute the best grasp if its quality is at least this; `none` disables this.
@@ -92,7 +93,7 @@ struct DecodingArgs {
     force: Force,
 
     /// Values above this count as in front of a surface when grasps are decoded (out_th).
-    #[arg(long, default_value_t = 0.1)]
+    #[arg(long, default_value_t = 0.1, value_parser = parse_out_th)]
     out_th: f32,
 
     /// Keep grasps at the borders of the volume.
@@ -104,14 +105,21 @@ struct DecodingArgs {
     clear: bool,
 }
 
-#[derive(Clone, Copy, Serialize)]
+#[derive(Clone, Copy)]
 struct Force(Option<f32>);
 
 fn parse_force(text: &str) -> Result<Force, String> {
     match text {
         "none" => Ok(Force(None)),
-        number => number.parse().map(|floor| Force(Some(floor))).map_err(|_| "must be a number or `none`".to_owned()),
+        quality => match parse_quality(quality) {
+            Ok(floor) => Ok(Force(Some(floor))),
+            Err(expected) => Err(format!("{expected}, or `none`")),
+        },
     }
+}
+
+fn parse_out_th(text: &str) -> Result<f32, String> {
+    parse_share(text).map(|value| value as f32)
 }
 
 impl fmt::Display for DecodingArgs {
@@ -170,22 +178,20 @@ impl Bench {
         let params = self.decoding.params();
         let options = Options { provider: self.provider.0, precision: self.precision.0, ..Options::default() };
         if self.format == Format::Markdown {
-            println!("{setup}, {} seeds, {}\n\n{MARKDOWN_HEAD}", self.seeds, self.decoding);
+            println!("{setup}, {} seeds, networks with {}\n\n{MARKDOWN_HEAD}", self.seeds, self.decoding);
         }
         for name in &self.planners {
+            let planner = PlannerSpec::from(name.as_str());
             let progress = ProgressBar::new(self.rounds * self.seeds).with_message(name.clone());
             let mut conditions = Vec::new();
             for seed in benchmark.seed..benchmark.seed + self.seeds {
                 let benchmark = Benchmark { seed, ..benchmark.clone() };
-                let rounds = benchmark.run(&PlannerSpec::from(name.as_str()), &params, &options, |event| match event {
+                let rounds = benchmark.run(&planner, &params, &options, |event| match event {
                     Event::Round => progress.inc(1),
                     Event::Attempt { .. } => watcher.attempt(name, seed, &event),
                 });
                 conditions.push(rounds.with_context(|| format!("planner `{name}`"))?);
                 watcher.finish()?;
-            }
-            if let Some(path) = &self.failures {
-                watcher.draw_failures(path)?;
             }
             progress.finish_and_clear();
             let whole = Summary::of(&conditions.concat());
@@ -195,18 +201,35 @@ impl Bench {
             match self.format {
                 Format::Json => {
                     let mut line = serde_json::to_value(&whole)?;
-                    line["seeds"] = serde_json::json!({ "gsr": gsr, "dr": dr });
+                    line["seeds"] = json!({ "gsr": gsr, "dr": dr });
                     line["planner"] = name.as_str().into();
-                    line["decoding"] = serde_json::to_value(&self.decoding)?;
+                    line["decoding"] = decoding(&planner, &params);
                     line["provider"] = format!("{} {}", self.provider, self.precision).into();
                     line["setup"] = setup.as_str().into();
                     println!("{line}");
                 }
                 Format::Markdown => println!("{}", markdown(name, &whole, gsr, dr)),
             }
+            // After the figures, so that an error does not lose them.
+            if let Some(path) = &self.failures {
+                watcher.draw_failures(path)?;
+            }
         }
         Ok(())
     }
+}
+
+/// The decoding parameters that a planner uses; null for random grasps.
+fn decoding(planner: &PlannerSpec, params: &DecodeParams) -> Value {
+    let Some(params) = planner.decode_params(params) else { return Value::Null };
+    let DecodeParams { threshold, force, outside_above, border, clearance, .. } = params;
+    if let PlannerSpec::Server(_) = planner {
+        return json!({ "threshold": threshold, "force": force });
+    }
+    json!({
+        "threshold": threshold, "force": force, "out_th": outside_above, "no_border": border.is_none(),
+        "clear": clearance.is_some(),
+    })
 }
 
 const MARKDOWN_HEAD: &str = "\
@@ -261,6 +284,10 @@ impl<'a> Watcher<'a> {
         if let Some(folder) = pictures {
             fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
         }
+        if let Some(path) = failures {
+            // Written after the rounds; a wrong path is an error before them.
+            OpenOptions::new().append(true).create(true).open(path).with_context(|| path.display().to_string())?;
+        }
         Ok(Self {
             lines: attempts.as_deref().map(open).transpose()?,
             pictures: pictures.as_deref(),
@@ -282,7 +309,7 @@ impl<'a> Watcher<'a> {
             let Grasp { pose, width, quality } = attempt.grasp;
             let nearest = before.nearest(&pose.translation.vector.into());
             let object = nearest.map(|index| &before.objects()[index].object.name);
-            let line = serde_json::json!({
+            let line = json!({
                 "planner": planner, "seed": seed, "round": round, "attempt": number, "outcome": outcome,
                 "object": object, "short_by": attempt.short_by, "position": pose.translation.vector.as_slice(),
                 "quaternion_xyzw": pose.rotation.coords.as_slice(), "width": width, "quality": quality,
@@ -322,6 +349,9 @@ impl<'a> Watcher<'a> {
         let failures = std::mem::take(&mut *failures.lock().unwrap_or_else(PoisonError::into_inner));
         let pictures: Vec<&Picture> = failures.values().map(|(_, picture)| picture).collect();
         save_sheet(path, &pictures, FAILURES_IN_A_ROW)?;
+        if failures.is_empty() {
+            eprintln!("{}: not written, because no attempt failed", path.display());
+        }
         for ((seed, round, number), (outcome, _)) in &failures {
             eprintln!("{}: seed {seed}, round {round}, attempt {number}: {outcome}", path.display());
         }

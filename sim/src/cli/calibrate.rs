@@ -28,7 +28,8 @@ impl Calibrate {
     pub fn run(self) -> anyhow::Result<()> {
         let attempts = self.attempts.iter().map(|path| read(path)).collect::<anyhow::Result<Vec<_>>>()?.concat();
         let fitted = calibration(&attempts).context(
-            "the qualities of these attempts do not rise with their success rate; use more attempts, with failures",
+            "no calibration found: the success rate of these attempts does not rise with their quality; use more \
+             attempts, with successes and failures",
         )?;
         let mut model = ModelProto::read(&self.evaluator)?;
         let earlier = Calibration::of(&model).with_context(|| self.evaluator.display().to_string())?;

@@ -1,6 +1,6 @@
 use std::path::PathBuf;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use clap::Args;
 use grasp::{DepthImage, Fusion, RESOLUTION};
 use grasp_data::{DataFormat, Dataset, Setup, Trial, packed, processed, raw};
@@ -11,7 +11,7 @@ use nalgebra::Isometry3;
 use super::label::Format;
 
 /// From raw to processed or packed: fuses the depth images and drops grasps at the borders, as VGN's scripts do. Also
-/// between processed and packed.
+/// between processed and packed. The processed format has one observation per scene.
 #[derive(Args)]
 pub struct Convert {
     /// Input folder: a data set of VGN, GIGA or `label`.
@@ -35,17 +35,17 @@ impl Convert {
         if self.format == Format::Raw {
             bail!("--format raw is not possible: volumes have no depth images; use `grasp-sim label --format raw`");
         }
-        anyhow::ensure!(self.from != self.out, "--from and --out are the same folder; use another --out");
+        ensure!(self.from != self.out, "--from and --out are the same folder; use another --out");
         let setup = Setup::read(&self.from)?;
-        let mut writer = Writer::open(&self, &setup)?;
         match DataFormat::of(&self.from)? {
-            DataFormat::Raw => self.fuse(&setup, &mut writer),
-            DataFormat::Processed | DataFormat::Packed => self.copy(&mut writer),
+            DataFormat::Raw => self.fuse(&setup),
+            DataFormat::Processed | DataFormat::Packed => self.copy(&setup),
         }
     }
 
-    fn fuse(&self, setup: &Setup, writer: &mut Writer) -> anyhow::Result<()> {
+    fn fuse(&self, setup: &Setup) -> anyhow::Result<()> {
         let reader = raw::Reader::open(&self.from)?;
+        let mut writer = Writer::open(self, setup)?;
         let scenes: Vec<(&str, &[Trial])> = reader.trials().collect();
         let voxel_size = setup.size / RESOLUTION as f64;
         let (mut unseen, mut dropped) = (0, 0);
@@ -72,7 +72,7 @@ impl Convert {
                     })
                     .collect();
                 dropped += trials.len() - kept.len();
-                if kept.is_empty() { Ok(()) } else { writer.append(index, id, &volume, &kept) }
+                if kept.is_empty() { Ok(()) } else { writer.append(index, id, &[volume], &kept) }
             },
         )?;
         progress.finish_and_clear();
@@ -80,12 +80,24 @@ impl Convert {
         Ok(())
     }
 
-    fn copy(&self, writer: &mut Writer) -> anyhow::Result<()> {
+    fn copy(&self, setup: &Setup) -> anyhow::Result<()> {
         let dataset = Dataset::open(std::slice::from_ref(&self.from))?;
+        let several = (0..dataset.len()).find(|&index| dataset.volumes(index) != 1);
+        if let Some(index) = several.filter(|_| self.format == Format::Processed) {
+            bail!(
+                "scene {} of {} has {} observations, and --format processed stores one; use --format packed",
+                dataset.id(index),
+                self.from.display(),
+                dataset.volumes(index)
+            );
+        }
+        let mut writer = Writer::open(self, setup)?;
+        let values = |bytes: &[u8]| -> Vec<f32> { bytes.iter().map(|&byte| grasp_data::value(byte)).collect() };
         let progress = ProgressBar::new(dataset.len() as u64);
         for index in 0..dataset.len() {
-            let volume: Vec<f32> = dataset.volume(index, 0).iter().map(|&byte| grasp_data::value(byte)).collect();
-            writer.append(index as u64, &dataset.id(index), &volume, &dataset.trials(index))?;
+            let volumes: Vec<Vec<f32>> =
+                (0..dataset.volumes(index)).map(|observation| values(dataset.volume(index, observation))).collect();
+            writer.append(index as u64, &dataset.id(index), &volumes, &dataset.trials(index))?;
             progress.inc(1);
         }
         progress.finish_and_clear();
@@ -119,17 +131,16 @@ impl Writer {
             Self::Processed(writer) => writer.next().is_some(),
             Self::Packed(writer) => writer.next().is_some(),
         };
-        anyhow::ensure!(!begun, "--out {} already contains scenes; use another folder", convert.out.display());
+        ensure!(!begun, "--out {} already contains scenes; use another folder", convert.out.display());
         Ok(writer)
     }
 
-    /// Appends a scene. The packed format needs a number: `id` if it is one, else `index`.
-    fn append(&mut self, index: u64, id: &str, volume: &[f32], trials: &[Trial]) -> anyhow::Result<()> {
+    /// Appends a scene; the processed format takes its first volume. The packed format needs a number: `id` if it is
+    /// one, else `index`.
+    fn append(&mut self, index: u64, id: &str, volumes: &[Vec<f32>], trials: &[Trial]) -> anyhow::Result<()> {
         match self {
-            Self::Processed(writer) => writer.append(id, volume, trials)?,
-            Self::Packed(writer) => {
-                writer.append(id.parse().unwrap_or(index), std::slice::from_ref(&volume.to_vec()), trials)?;
-            }
+            Self::Processed(writer) => writer.append(id, &volumes[0], trials)?,
+            Self::Packed(writer) => writer.append(id.parse().unwrap_or(index), volumes, trials)?,
         }
         Ok(())
     }

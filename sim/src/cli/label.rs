@@ -1,11 +1,12 @@
+use std::fs;
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, bail, ensure};
 use clap::{Args, ValueEnum};
 use grasp::{RESOLUTION, WORKSPACE_SIZE};
 use grasp_data::{Setup, Trial, packed, processed, raw};
 use grasp_sim::export::{Export, Line};
-use grasp_sim::label::LabelledScene;
+use grasp_sim::label::{LabelledScene, SceneConfig};
 use grasp_sim::ordered;
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -24,6 +25,7 @@ pub struct Label {
     scenes: u64,
 
     /// Number of the first scene. To share the work, give each machine its own range and join the results with `merge`.
+    /// An interrupted run needs the same number again.
     #[arg(long, default_value_t = 0)]
     first: u64,
 
@@ -46,7 +48,8 @@ pub struct Label {
     #[arg(long, value_enum, default_value = "packed")]
     format: Format,
 
-    /// Also write every scene with its trials to this file, as JSON lines.
+    /// Also write every scene with its trials to this file, as JSON lines. A run that continues needs the file of the
+    /// interrupted one.
     #[arg(long)]
     export: Option<PathBuf>,
 }
@@ -62,30 +65,32 @@ pub enum Format {
 impl Label {
     pub fn run(self) -> anyhow::Result<()> {
         let several = self.observations != 1 && self.format != Format::Packed;
-        anyhow::ensure!(
+        ensure!(
             !several && self.observations > 0,
             "--observations is {}, must be greater than 0; only --format packed stores more than 1",
             self.observations
         );
-        anyhow::ensure!(
+        ensure!(
             self.export.is_none() || self.data.stretch.is_none(),
             "--export names the objects of each scene, and does not describe stretched ones; leave out --stretch"
         );
         let config = self.data.config(self.points, self.observations)?;
         let setup = Setup::benchmark(self.data.provenance(&config));
+        // Before the folder is opened, because the writers remove an incomplete scene.
+        self.check_continuation(&config)?;
         let mut writer = Writer::open(self.format, &self.out, &setup)?;
-        let next = writer.next().unwrap_or(0).max(self.first);
+        let next = writer.next().unwrap_or(self.first);
         let mut export = self.export.as_deref().map(|path| Export::open(path, next)).transpose()?;
 
         let end =
             self.first.checked_add(self.scenes).context("--first + --scenes exceeds 2^64 - 1; use smaller numbers")?;
         let style = "{wide_bar} {pos}/{len} scenes, {per_sec}, {eta} left";
         let progress = ProgressBar::new(self.scenes).with_style(ProgressStyle::with_template(style)?);
-        progress.set_position(next - self.first);
+        progress.set_position(next.saturating_sub(self.first));
         progress.reset_eta();
         ordered::for_each(
             next..end.max(next),
-            |number| config.label(number),
+            |number| self.label(&config, number),
             |number, scene| {
                 if let Some(scene) = scene {
                     if let Some(export) = &mut export {
@@ -100,6 +105,71 @@ impl Label {
         progress.finish();
         Ok(())
     }
+
+    /// Labels a scene. It has depth images only if the format stores them, because they are larger than the volumes and
+    /// many scenes wait to be written.
+    fn label(&self, config: &SceneConfig, number: u64) -> Option<LabelledScene> {
+        let mut scene = config.label(number)?;
+        if self.format != Format::Raw {
+            scene.observations.iter_mut().for_each(|observation| observation.views = Vec::new());
+        }
+        Some(scene)
+    }
+
+    /// Checks that this run continues that of the output folder, if there is one, without missing scenes.
+    fn check_continuation(&self, config: &SceneConfig) -> anyhow::Result<()> {
+        let Some((first, last)) = self.format.stored(&self.out)? else { return Ok(()) };
+        // Scenes whose cameras see no object are not stored, and do not count as missing.
+        let mut unstored = (self.first..first).chain(last + 1..self.first);
+        if let Some(missing) = unstored.find(|&number| config.label(number).is_some()) {
+            bail!(
+                "--first is {}, but {} has scenes from {first} to {last}, and scene {missing} would be missing; use a \
+                 number from {first} to {}, or another --out",
+                self.first,
+                self.out.display(),
+                last + 1
+            );
+        }
+        if let Some(export) = &self.export {
+            ensure!(
+                Export::last(export)? >= Some(last),
+                "--export {} lacks scenes that are already in {}; use another --out, or leave out --export",
+                export.display(),
+                self.out.display()
+            );
+        }
+        Ok(())
+    }
+}
+
+impl Format {
+    /// The numbers of the first and the last scene in a folder, if it has any.
+    fn stored(self, folder: &Path) -> anyhow::Result<Option<(u64, u64)>> {
+        if !folder.exists() {
+            return Ok(None);
+        }
+        let numbers: Vec<u64> = match self {
+            Self::Packed => {
+                let reader = packed::Reader::open(folder)?;
+                (0..reader.len()).map(|index| reader.number(index)).collect()
+            }
+            Self::Raw | Self::Processed => scene_files(&folder.join("scenes"))?,
+        };
+        Ok(numbers.iter().min().copied().zip(numbers.iter().max().copied()))
+    }
+}
+
+/// The numbers of the files NUMBER.npz in a folder, which may not exist.
+fn scene_files(folder: &Path) -> anyhow::Result<Vec<u64>> {
+    if !folder.exists() {
+        return Ok(Vec::new());
+    }
+    let mut numbers = Vec::new();
+    for file in fs::read_dir(folder).with_context(|| folder.display().to_string())? {
+        let name = file.with_context(|| folder.display().to_string())?.file_name();
+        numbers.extend(name.to_str().and_then(|name| name.strip_suffix(".npz")?.parse::<u64>().ok()));
+    }
+    Ok(numbers)
 }
 
 enum Writer {

@@ -111,12 +111,14 @@ impl Observe {
         let config = SceneConfig { views, observations: self.observations, noise, ..before };
         ordered::for_each(
             done as u64..scenes.len() as u64,
-            |place| config.observe_again(data.number(scenes[place as usize]), self.seed),
-            |place, observations| {
+            // Drops the depth images, which are larger than the volumes.
+            |place| -> Vec<Vec<f32>> {
+                let observations = config.observe_again(data.number(scenes[place as usize]), self.seed);
+                observations.into_iter().map(|observation| observation.volume).collect()
+            },
+            |place, volumes| {
                 let index = scenes[place as usize];
-                if !observations.is_empty() {
-                    let volumes: Vec<Vec<f32>> =
-                        observations.into_iter().map(|observation| observation.volume).collect();
+                if !volumes.is_empty() {
                     writer.append(data.number(index), &volumes, &data.trials(index))?;
                 }
                 progress.inc(1);

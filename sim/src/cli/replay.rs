@@ -89,6 +89,9 @@ impl Replay {
             });
             let pictures: Vec<Picture> = differences.take(DIFFERENCES).collect::<anyhow::Result<_>>()?;
             save_sheet(path, &pictures.iter().collect::<Vec<_>>(), DIFFERENCES_IN_A_ROW)?;
+            if pictures.is_empty() {
+                eprintln!("{}: not written, because no result differs", path.display());
+            }
         }
         Ok(())
     }

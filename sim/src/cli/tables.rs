@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use anyhow::Context;
+use anyhow::{Context, bail, ensure};
 use clap::Args;
 use grasp::DecodeParams;
 use grasp_models::onnx::ModelProto;
@@ -39,7 +39,8 @@ pub struct Tables {
     #[arg(long)]
     released: Option<PathBuf>,
 
-    /// Also evaluate on the objects of this folder of URDF files. The tables use the folder's name.
+    /// Also evaluate on the objects of this folder of URDF files. The tables use the folder's name, which must not be
+    /// `test` or that of another of these folders.
     #[arg(long, value_name = "DIR")]
     objects: Vec<PathBuf>,
 
@@ -103,6 +104,7 @@ struct Task {
 
 impl Tables {
     pub fn run(self) -> anyhow::Result<()> {
+        self.check_object_names()?;
         let entries = self.entries()?;
         let fingerprint = digest(&format!("{} {}", simulator(), decoding()));
         let tasks = self.tasks(&entries, &fingerprint)?;
@@ -125,12 +127,33 @@ impl Tables {
             log.append(measurement.with_context(|| format!("planner `{}`", task.planner))?)?;
         }
         progress.finish_and_clear();
-        log.keep(tasks.iter().map(|task| task.key.as_str()), |measurement| !self.measures(measurement))?;
+        let measured = tasks.iter().map(|task| (task.key.as_str(), &task.condition));
+        log.keep(measured, |measurement| !self.measures(&entries, measurement))?;
 
         let results = self.results(&entries, &tasks, &log)?;
         let text = self.head(&fingerprint) + &results.markdown();
         fs::write(&self.out, text).with_context(|| self.out.display().to_string())?;
         println!("{}", self.out.display());
+        Ok(())
+    }
+
+    /// Checks that the names of the object sets differ, because results are stored by name.
+    fn check_object_names(&self) -> anyhow::Result<()> {
+        for (index, folder) in self.objects.iter().enumerate() {
+            let name = name_of(folder);
+            ensure!(
+                name != TEST_OBJECTS,
+                "--objects is {}, but `{name}` is the name of the procedural test objects; rename the folder",
+                folder.display()
+            );
+            if let Some(other) = self.objects[..index].iter().find(|other| name_of(other) == name) {
+                bail!(
+                    "--objects {} and --objects {} have the same name, `{name}`; rename one of the folders",
+                    other.display(),
+                    folder.display()
+                );
+            }
+        }
         Ok(())
     }
 
@@ -280,11 +303,13 @@ impl Tables {
         Ok(tasks)
     }
 
-    /// Whether a measurement is one of those that this command makes, perhaps with another network.
-    fn measures(&self, Measurement { condition, seed, .. }: &Measurement) -> bool {
+    /// Whether a measurement is one of those that this command makes, perhaps with another version of its network.
+    fn measures(&self, entries: &[Entry], Measurement { condition, seed, .. }: &Measurement) -> bool {
+        let has_planner =
+            |entry: &Entry| entry.method == condition.method && entry.trained_on == condition.trained_on.as_deref();
         (condition.objects == TEST_OBJECTS || self.folder(condition).is_some())
             && (condition.simulator == Simulator::Rapier || self.pybullet.is_some())
-            && (condition.method != RELEASED || self.released.is_some())
+            && entries.iter().any(has_planner)
             && (self.seed..self.seed + self.seeds).contains(seed)
     }
 
@@ -366,15 +391,15 @@ impl Tables {
 
     fn results(&self, entries: &[Entry], tasks: &[Task], log: &Log) -> anyhow::Result<Results> {
         let mut results = Results::default();
-        for measurement in tasks.iter().filter_map(|task| log.measurements.get(&task.key)) {
+        for task in tasks {
+            let Some(measurement) = log.measurements.get(&task.key) else { continue };
+            // The names of the stored condition may be older than those of the task.
+            let condition = &task.condition;
             if let Some(summary) = &measurement.summary {
-                results.conditions.entry(measurement.condition.clone()).or_default().push(summary.clone());
+                results.conditions.entry(condition.clone()).or_default().push(summary.clone());
             }
             if let Some(milliseconds) = measurement.milliseconds {
-                results.times.insert(
-                    (measurement.condition.method.clone(), measurement.condition.scenario.clone()),
-                    milliseconds,
-                );
+                results.times.insert((condition.method.clone(), condition.scenario.clone()), milliseconds);
             }
         }
         for entry in entries.iter().filter(|entry| entry.method != RELEASED) {

@@ -58,17 +58,23 @@ impl Log {
         Ok(())
     }
 
-    /// Sorts the measurements by these keys, and removes the others, except those that `is_kept` returns true for.
+    /// Sorts the measurements by the keys of `tasks` and stores the conditions of `tasks` with them. Removes the
+    /// others, except those that `is_kept` returns true for.
     pub(super) fn keep<'a>(
         &mut self,
-        keys: impl Iterator<Item = &'a str>,
+        tasks: impl Iterator<Item = (&'a str, &'a Condition)>,
         is_kept: impl Fn(&Measurement) -> bool,
     ) -> anyhow::Result<()> {
         let context = || self.path.display().to_string();
-        let keys: Vec<&str> = keys.collect();
-        let others = self.measurements.values().filter(|line| is_kept(line) && !keys.contains(&line.key.as_str()));
-        let lines = keys.iter().filter_map(|&key| self.measurements.get(key)).chain(others);
-        let text = lines.map(|line| Ok(serde_json::to_string(line)? + "\n")).collect::<anyhow::Result<String>>()?;
+        let tasks: Vec<(&str, &Condition)> = tasks.collect();
+        let is_task = |line: &Measurement| tasks.iter().any(|(key, _)| *key == line.key);
+        let others = self.measurements.values().filter(|line| is_kept(line) && !is_task(line)).cloned();
+        let of_tasks = tasks.iter().filter_map(|&(key, condition)| {
+            let measurement = self.measurements.get(key)?.clone();
+            Some(Measurement { condition: condition.clone(), ..measurement })
+        });
+        let lines = of_tasks.chain(others);
+        let text = lines.map(|line| Ok(serde_json::to_string(&line)? + "\n")).collect::<anyhow::Result<String>>()?;
         let partial = self.path.with_extension("jsonl.partial");
         fs::write(&partial, text).with_context(context)?;
         fs::rename(&partial, &self.path).with_context(context)
