@@ -296,10 +296,19 @@ async fn one_caller_with_many_images_leaves_room_for_another() {
     }
     server.wait_until("graspd_refusals_total{model=\"mirror 1\",reason=\"full\"}", |refused| refused > 0.0).await;
     let client = server.client().await;
-    for _ in 0..10 {
-        client.detect_from_depth(&views[..1], &Workspace::default(), Options::default()).await.unwrap();
-    }
-    assert!(server.metric("graspd_refusals_total{model=\"mirror 1\",reason=\"displaced\"}") > 0.0);
+    let displaced = || server.metric("graspd_refusals_total{model=\"mirror 1\",reason=\"displaced\"}");
+    let answered = async {
+        // On a busy machine the other caller may leave places free for a while.
+        for answered in 1.. {
+            client.detect_from_depth(&views[..1], &Workspace::default(), Options::default()).await.unwrap();
+            if answered >= 10 && displaced() > 0.0 {
+                break;
+            }
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(60), answered)
+        .await
+        .expect("a request takes the place of one of the other caller");
     many.shutdown().await;
 }
 
