@@ -23,7 +23,9 @@ struct Limits {
 
 fn limits(precision: Precision) -> Limits {
     match precision {
-        Precision::Fp32 => Limits { quality: 1e-3, width: 0.005, rotation: 0.5 },
+        // Over an empty table the feature maps of a transformer are nearly constant. The instance normalization then sums
+        // 64,000 equal values in f32: against f64, ONNX Runtime's kernel is off by 2e-4 and OpenVINO's by 1e-3.
+        Precision::Fp32 => Limits { quality: 3e-3, width: 0.005, rotation: 0.5 },
         Precision::Fp16 => Limits { quality: 0.02, width: 0.05, rotation: 3.0 },
         Precision::Bf16 | Precision::Int8 => Limits { quality: 0.12, width: 0.3, rotation: 10.0 },
     }
