@@ -1,13 +1,10 @@
-use std::fs;
 use std::path::Path;
 
 use ort::session::Session;
 use ort::value::{Outlet, Tensor, TensorElementType};
-use tracing::warn;
 
-use super::backend::AvailableBackends;
-use super::batch_session::ModelFile;
-use super::{Backend, LoadError, LoadReason, Options, Provider, RuntimeError, run_error, runtime};
+use super::model_file::ModelFile;
+use super::{Backend, LoadError, LoadReason, Options, Provider, RuntimeError, loading, run_error};
 use crate::gpd::{INPUT, OUTPUT};
 use crate::{Calibration, Entry};
 
@@ -36,11 +33,7 @@ impl Classifier {
     /// # Errors
     /// [`LoadError`] names the file and the problem.
     pub fn load(path: &Path, shape: &'static [usize], options: &Options) -> Result<Self, LoadError> {
-        let load = || {
-            runtime()?;
-            Self::load_fastest(&ModelFile::new(path, &fs::read(path)?, options), shape, options)
-        };
-        load().map_err(|reason| LoadError { path: path.to_owned(), reason })
+        loading::load(path, options, |model, backend| Self::open_checked(model, backend, shape))
     }
 
     /// Loads an entry of a store `count` times, once per thread. All copies use the same backend.
@@ -53,37 +46,16 @@ impl Classifier {
         options: &Options,
         count: usize,
     ) -> Result<Vec<Self>, LoadError> {
-        let load = || {
-            runtime()?;
-            let bytes = entry.bytes()?;
-            let model = ModelFile::new(&entry.path, &bytes, options);
-            let first = Self::load_fastest(&model, shape, options)?;
-            let backend = first.backend;
-            let others = (1..count).map(|_| Self::open(&model, shape, backend));
-            std::iter::once(Ok(first)).chain(others).take(count).collect::<Result<_, LoadReason>>()
-        };
-        load().map_err(|reason| LoadError { path: entry.path.clone(), reason })
+        let checked = |model: &ModelFile<'_>, backend| Self::open_checked(model, backend, shape);
+        let others = |model: &ModelFile<'_>, backend| Self::open(model, backend, shape);
+        loading::load_several(entry, options, count, checked, others)
     }
 
-    /// Loads with the first allowed backend whose scores match the reference.
-    fn load_fastest(model: &ModelFile, shape: &'static [usize], options: &Options) -> Result<Self, LoadReason> {
-        let backends = AvailableBackends::here().backends(options.provider, options.precision, model.is_int8)?;
-        let (&last, others) = backends.split_last().ok_or(RuntimeError::EmptyBatch)?;
-        for &backend in others {
-            match Self::load_checked(model, shape, backend) {
-                Ok(classifier) => return Ok(classifier),
-                Err(error) => {
-                    warn!(model = %model.path.display(), %backend, %error, "backend rejected, trying the next one")
-                }
-            }
-        }
-        Self::load_checked(model, shape, last)
-    }
-
-    fn load_checked(model: &ModelFile, shape: &'static [usize], backend: Backend) -> Result<Self, LoadReason> {
-        let mut classifier = Self::open(model, shape, backend)?;
+    /// Loads with one backend and compares its scores with the reference, ONNX Runtime's CPU kernels.
+    fn open_checked(model: &ModelFile, backend: Backend, shape: &'static [usize]) -> Result<Self, LoadReason> {
+        let mut classifier = Self::open(model, backend, shape)?;
         if backend.provider != Provider::Cpu {
-            let mut reference = Self::open(model, shape, Backend::REFERENCE)?;
+            let mut reference = Self::open(model, Backend::REFERENCE, shape)?;
             let [got, expected] =
                 [&mut classifier, &mut reference].map(|classifier| classifier.score(BATCH + 1, write_sample));
             if let Some(what) = difference(&got?, &expected?) {
@@ -94,7 +66,7 @@ impl Classifier {
     }
 
     /// Loads the model and runs it once, so that buffers are allocated before the first request.
-    fn open(model: &ModelFile, shape: &'static [usize], backend: Backend) -> Result<Self, LoadReason> {
+    fn open(model: &ModelFile, backend: Backend, shape: &'static [usize]) -> Result<Self, LoadReason> {
         let session = model.open(backend, is_fixed(backend).then_some(BATCH))?;
         let wrong = |what| LoadReason::Classifier { what, shape };
         check(session.inputs(), INPUT, &shape.iter().map(|&size| size..=size).collect::<Vec<_>>()).map_err(wrong)?;

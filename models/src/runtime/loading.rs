@@ -1,0 +1,68 @@
+//! Loading a model with the fastest backend that computes what the reference computes.
+
+use std::fs;
+use std::path::Path;
+
+use tracing::warn;
+
+use super::backend::{AvailableBackends, Backend};
+use super::library::runtime;
+use super::model_file::ModelFile;
+use super::{LoadError, LoadReason, Options, RuntimeError};
+use crate::Entry;
+
+/// Loads a file. `open_checked` loads the model with one backend and compares its outputs with the reference.
+pub(super) fn load<T>(
+    path: &Path,
+    options: &Options,
+    open_checked: impl Fn(&ModelFile, Backend) -> Result<T, LoadReason>,
+) -> Result<T, LoadError> {
+    let load = || {
+        // Fails early if ONNX Runtime cannot be loaded.
+        runtime()?;
+        let (model, _) = fastest(&ModelFile::new(path, &fs::read(path)?, options), options, open_checked)?;
+        Ok(model)
+    };
+    load().map_err(|reason| LoadError { path: path.to_owned(), reason })
+}
+
+/// Loads an entry of a store `count` times. The first copy is checked; the others use its backend and are not.
+pub(super) fn load_several<T>(
+    entry: &Entry,
+    options: &Options,
+    count: usize,
+    open_checked: impl Fn(&ModelFile, Backend) -> Result<T, LoadReason>,
+    open: impl Fn(&ModelFile, Backend) -> Result<T, LoadReason>,
+) -> Result<Vec<T>, LoadError> {
+    let load = || {
+        runtime()?;
+        let bytes = entry.bytes()?;
+        let model = ModelFile::new(&entry.path, &bytes, options);
+        let (first, backend) = fastest(&model, options, open_checked)?;
+        let others = (1..count).map(|_| open(&model, backend));
+        std::iter::once(Ok(first)).chain(others).take(count).collect::<Result<_, LoadReason>>()
+    };
+    load().map_err(|reason| LoadError { path: entry.path.clone(), reason })
+}
+
+/// Loads with the first allowed backend that passes the check.
+fn fastest<T>(
+    model: &ModelFile,
+    options: &Options,
+    open_checked: impl Fn(&ModelFile, Backend) -> Result<T, LoadReason>,
+) -> Result<(T, Backend), LoadReason> {
+    if let Some(file) = &model.external_weights {
+        return Err(LoadReason::Split(file.clone()));
+    }
+    let backends = AvailableBackends::here().backends(options.provider, options.precision, model.is_int8)?;
+    let (&last, others) = backends.split_last().ok_or(RuntimeError::EmptyBatch)?;
+    for &backend in others {
+        match open_checked(model, backend) {
+            Ok(loaded) => return Ok((loaded, backend)),
+            Err(error) => {
+                warn!(model = %model.path.display(), %backend, %error, "backend rejected, trying the next one")
+            }
+        }
+    }
+    Ok((open_checked(model, last)?, last))
+}
