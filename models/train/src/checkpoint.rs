@@ -58,6 +58,9 @@ pub struct Checkpoint {
     /// Duration of the run so far, seconds.
     #[prost(double, tag = "12")]
     pub seconds: f64,
+    /// Whether the smallest cost is that of --evaluate.
+    #[prost(bool, tag = "13")]
+    pub evaluated: bool,
 }
 
 /// Why a run cannot be resumed from a checkpoint.

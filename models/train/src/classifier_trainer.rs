@@ -109,9 +109,10 @@ impl<'a> ClassifierTrainer<'a> {
         model: ModelProto,
         dataset: &'a dyn Examples,
         settings: ClassifierSettings,
+        device: Device,
     ) -> Result<Self, ExecuteError> {
         let ClassifierSettings { validation, seed, balance, bf16, .. } = settings;
-        let execution = ExecutionOptions { device: Device::cuda_if_available(), bf16, channels_last: false };
+        let execution = ExecutionOptions { device, bf16, channels_last: false };
         let executor = Executor::new(model, execution)?;
         let (training, validation) = dataset.split(validation);
         let class_weight = |class| {

@@ -18,6 +18,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use time::OffsetDateTime;
 
+use crate::device::{self, DeviceChoice};
+
 /// Prints one JSON object per epoch. Keeps the model with the smallest validation loss, or the last without validation.
 #[derive(Args)]
 pub(crate) struct Classify {
@@ -60,6 +62,9 @@ pub(crate) struct Classify {
     /// Version of the classifier in its metadata.
     #[arg(long, default_value = "1")]
     model_version: String,
+    /// Device: cpu, cuda, cuda:N, or auto: the first GPU, or the CPU if there is none.
+    #[arg(long, default_value = "auto")]
+    device: DeviceChoice,
     /// Threads of libtorch [default: all cores].
     #[arg(long)]
     threads: Option<usize>,
@@ -131,13 +136,15 @@ impl Classify {
             mirror: self.network == Kind::Evaluator,
             bf16: self.bf16,
         };
-        let mut trainer = ClassifierTrainer::new(self.initial_classifier()?, examples, settings)?;
+        let device = self.device.device()?;
+        let mut trainer = ClassifierTrainer::new(self.initial_classifier()?, examples, settings, device)?;
         let (training, held_out) = trainer.candidates();
         ensure!(training > 0, "--val is {}, which leaves no scene for training; use a smaller share", self.val);
         eprintln!(
             "{training} training candidates, {held_out} validation candidates, {} successes",
             examples.successes()
         );
+        eprintln!("device: {}", device::name(device));
 
         let mut best = f64::INFINITY;
         for epoch in 1..=self.epochs {

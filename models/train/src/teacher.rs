@@ -4,10 +4,14 @@
 //! and mirror images of the scenes, the student is trained on the mean of the teacher's outputs, which is more accurate
 //! than a single output.
 
+use std::fs;
+use std::path::Path;
+
 use grasp::{Volume, VolumeError, WORKSPACE_SIZE};
-use grasp_models::{Metadata, Network, RuntimeError};
+use grasp_models::{LoadError, Metadata, Network, Options, RuntimeError};
 use nalgebra::Isometry3;
 use rand::{Rng, RngExt};
+use sha2::{Digest, Sha256};
 use thiserror::Error;
 
 use crate::loss::Targets;
@@ -34,14 +38,26 @@ pub enum TeacherError {
 /// reads the batches.
 pub struct Teacher {
     network: Network,
+    /// SHA-256 of its file.
+    digest: [u8; 32],
     weight: f64,
 }
 
 impl Teacher {
-    /// `weight` is the weight of the mean loss to the teacher's outputs, relative to that of the trials.
+    /// Loads a network. `weight` is the weight of the mean loss to its outputs, relative to that of the trials.
+    ///
+    /// # Errors
+    /// [`LoadError`] names the file and the problem.
+    pub fn load(path: &Path, options: &Options, weight: f64) -> Result<Self, LoadError> {
+        let bytes = fs::read(path).map_err(|error| LoadError { path: path.to_owned(), reason: error.into() })?;
+        let network = Network::load(path, options)?;
+        Ok(Self { network, digest: Sha256::digest(bytes).into(), weight })
+    }
+
+    /// The metadata of its file.
     #[must_use]
-    pub fn new(network: Network, weight: f64) -> Self {
-        Self { network, weight }
+    pub fn metadata(&self) -> &Metadata {
+        self.network.metadata()
     }
 
     /// Weight of the teacher's outputs in the loss.
@@ -52,7 +68,8 @@ impl Teacher {
     /// A text that must be the same for a run to be resumed.
     pub(crate) fn fingerprint(&self) -> String {
         let Metadata { name, version, .. } = self.network.metadata();
-        format!("taught by {name} {version} ({}) at {}", self.network.backend(), self.weight)
+        let digest: String = self.digest.iter().take(8).map(|byte| format!("{byte:02x}")).collect();
+        format!("taught by {name} {version} (SHA-256 {digest}…, {}) at {}", self.network.backend(), self.weight)
     }
 
     /// Adds the teacher's outputs at random voxels in front of the surfaces of a volume `[N, N, N]`. `index` is the index

@@ -11,7 +11,7 @@ use anyhow::{Context, Result, ensure};
 use grasp::{RESOLUTION, VoxelOrigin};
 use grasp_data::Dataset;
 use grasp_models::onnx::ModelProto;
-use grasp_models::{Architecture, Metadata, Network, Options};
+use grasp_models::{Architecture, Metadata, Options};
 use grasp_train::{
     Augmentation, BenchmarkRates, Checkpoint, EpochOutcome, EpochRecord, ExecutionOptions, Teacher, Trainer,
     TrainingSettings, learning_curves,
@@ -79,6 +79,11 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
     if training.resume {
         let checkpoint = Checkpoint::read(&files.state)?;
         trainer.resume(&checkpoint)?;
+        ensure!(
+            checkpoint.best.is_none() || checkpoint.evaluated == training.evaluate.is_some(),
+            "the best result of the checkpoint is that of {}; give the same options, or start without --resume",
+            if checkpoint.evaluated { "--evaluate" } else { "the validation loss, without --evaluate" }
+        );
         best = BestResult { cost: checkpoint.best, results_since: checkpoint.results_since_best };
         records = files.read_log(trainer.epochs())?;
     }
@@ -137,7 +142,10 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
             write_model(&mut trainer, &metadata, records.last(), &training.out)?;
         }
         if due {
-            Checkpoint { best: cost, results_since_best: results_since, ..trainer.checkpoint() }.write(&files.state)?;
+            let evaluated = training.evaluate.is_some();
+            let checkpoint =
+                Checkpoint { best: cost, results_since_best: results_since, evaluated, ..trainer.checkpoint() };
+            checkpoint.write(&files.state)?;
             saved = Instant::now();
         }
         if let Some(error) = failure {
@@ -219,8 +227,8 @@ fn initial_network(training: &TrainArgs) -> Result<(ModelProto, Metadata)> {
 fn load_teacher(training: &TrainArgs, path: &Path, student: &Metadata) -> Result<(Teacher, String)> {
     let weight = training.teacher_weight;
     ensure!(weight >= 0.0, "--teacher-weight is {weight}, must be at least 0");
-    let network = Network::load(path, &Options::auto(1))?;
-    let Metadata { name, version, resolution, voxel_origin, .. } = network.metadata();
+    let teacher = Teacher::load(path, &Options::auto(1), weight)?;
+    let Metadata { name, version, resolution, voxel_origin, .. } = teacher.metadata();
     ensure!(
         *resolution == student.resolution,
         "--teacher needs {resolution}³ voxels, the trained network {0}³; use a teacher of the same resolution",
@@ -233,7 +241,7 @@ fn load_teacher(training: &TrainArgs, path: &Path, student: &Metadata) -> Result
         student.voxel_origin.name()
     );
     let name = format!("{name} {version} at {weight}");
-    Ok((Teacher::new(network, weight), name))
+    Ok((teacher, name))
 }
 
 /// Settings of the run. The defaults are those of VGN's released code (Adam with 3e-4, batches of 32, 30 epochs) and of

@@ -19,6 +19,7 @@ use grasp_sim::scene::SceneKind;
 use grasp_sim::score::Summary;
 use grasp_train::{CandidateDataset, ClassifierSettings, ClassifierTrainer, Examples};
 use nalgebra::{Isometry3, Point3, Vector3};
+use tch::Device;
 
 mod support;
 
@@ -65,7 +66,7 @@ fn a_small_data_set_is_memorized() {
         mirror: false,
         bf16: false,
     };
-    let mut trainer = ClassifierTrainer::new(gpd(1), &dataset, settings).unwrap();
+    let mut trainer = ClassifierTrainer::new(gpd(1), &dataset, settings, Device::Cpu).unwrap();
     let (training, held_out) = trainer.candidates();
     assert!(training + held_out == 48 && held_out > 0 && held_out % 4 == 0, "validation has whole scenes");
     let first = trainer.epoch(|| ()).unwrap();
@@ -180,6 +181,8 @@ fn an_evaluator_separates_full_from_empty_volumes() {
         ("--network evaluator --data proposals --out x.onnx", "--proposals-of"),
         ("--network evaluator --proposals-of vgn --data walls.npz --out x.onnx", "walls.npz: "),
         ("--data proposals --out x.onnx", "proposals: "),
+        ("--data walls.npz --out x.onnx --device cuda:99", "--device is cuda:99"),
+        ("--data walls.npz --out x.onnx --lr 1e30 --batch 2", "the loss is not finite after epoch 1"),
     ] {
         let output = classify(folder.path(), arguments);
         let stderr = String::from_utf8_lossy(&output.stderr);

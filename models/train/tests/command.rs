@@ -136,6 +136,22 @@ fn a_run_ends_after_the_patience_of_the_evaluation() {
     // A resumed run that has ended does nothing.
     let again = command(folder.path(), &format!("{arguments} --resume")).args(["--evaluate", script]).output().unwrap();
     assert!(again.status.success() && again.stdout.is_empty());
+    let without = command(folder.path(), &format!("{arguments} --resume")).output().unwrap();
+    assert!(!without.status.success() && stderr(&without).contains("that of --evaluate"), "{}", stderr(&without));
+}
+
+#[test]
+fn an_epoch_whose_evaluation_fails_is_not_lost() {
+    let folder = prepare();
+    let arguments = "train --from start.onnx --data data --threads 1 --epochs 2 --out out.onnx";
+    let failed = command(folder.path(), arguments).args(["--evaluate", "test ! -e {}"]).output().unwrap();
+    assert!(!failed.status.success() && stderr(&failed).contains("failed"), "{}", stderr(&failed));
+    let checkpoint = Checkpoint::read(&folder.path().join("out.state")).unwrap();
+    assert_eq!((checkpoint.epoch, checkpoint.batch), (1, 0));
+    let script = r#"test -e {} && echo '{"gsr":0.5,"dr":0.5}'"#;
+    let rest = command(folder.path(), &format!("{arguments} --resume")).args(["--evaluate", script]).output().unwrap();
+    assert!(rest.status.success(), "{}", stderr(&rest));
+    assert_eq!(String::from_utf8(rest.stdout).unwrap().lines().count(), 1, "the second epoch");
 }
 
 #[test]

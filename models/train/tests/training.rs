@@ -213,7 +213,7 @@ fn a_student_matches_its_teacher_where_there_are_no_trials() {
 
     // The student's scenes are not in the teacher's data. Most voxels near their surfaces have no trial.
     let scenes = || Dataset::of((100..108).map(|seed| support::scene(seed, N)).collect()).unwrap();
-    let teacher = || Teacher::new(Network::load(&path, &Options::default()).unwrap(), 10.0);
+    let teacher = || Teacher::load(&path, &Options::default(), 10.0).unwrap();
     let start = || {
         let model = Architecture::Vgn.build(N, 1).unwrap();
         Trainer::new(model, scenes(), settings.clone(), EXECUTION).unwrap()
@@ -244,8 +244,15 @@ fn a_student_matches_its_teacher_where_there_are_no_trials() {
     epoch(&mut resumed);
     epoch(&mut student);
     assert_eq!(resumed.model(), student.model(), "bit-identical");
-    let refused = start().resume(&student.checkpoint());
-    assert!(matches!(refused, Err(TrainError::Checkpoint(CheckpointError::Settings { .. }))), "the teacher is missing");
+    let is_refused = |mut trainer: Trainer| {
+        let result = trainer.resume(&student.checkpoint());
+        matches!(result, Err(TrainError::Checkpoint(CheckpointError::Settings { .. })))
+    };
+    assert!(is_refused(start()), "the teacher is missing");
+    let mut other = Architecture::Vgn.build(N, 2).unwrap();
+    metadata.write_to(&mut other);
+    other.write(&path).unwrap();
+    assert!(is_refused(start().with_teacher(teacher())), "another teacher with the same name and version");
 }
 
 #[test]

@@ -90,7 +90,7 @@ pub(super) struct Flags {
     #[arg(long, env = "GRASPD_MAX_BATCH", value_name = "N", default_value = "1", value_parser = count())]
     pub max_batch: u16,
 
-    /// Maximum time that a session waits for a batch to fill, from the arrival of its first volume, milliseconds. 0
+    /// Maximum time that a volume waits for a batch to fill, milliseconds; at most half of the time until its deadline. 0
     /// disables waiting.
     #[arg(
         long,

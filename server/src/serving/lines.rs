@@ -1,5 +1,5 @@
 use std::collections::VecDeque;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use grasp_proto::Priority;
 
@@ -25,7 +25,17 @@ struct Line<T> {
 struct Waiting<T> {
     number: u64,
     since: Instant,
+    deadline: Option<Instant>,
     job: T,
+}
+
+impl<T> Waiting<T> {
+    /// When a batch with this job must start if it waits at most `delay` for further jobs: not later than halfway to the
+    /// job's deadline.
+    fn start_by(&self, delay: Duration) -> Instant {
+        let half = self.deadline.map(|deadline| deadline.saturating_duration_since(self.since) / 2);
+        self.since + half.map_or(delay, |half| half.min(delay))
+    }
 }
 
 /// Whose job it is, and when it has to be done.
@@ -125,7 +135,7 @@ impl<T> Lines<T> {
 
     /// Appends a job with a number above those of all jobs before it.
     pub fn append(&mut self, ticket: Ticket, number: u64, job: T) {
-        let waiting = Waiting { number, since: Instant::now(), job };
+        let waiting = Waiting { number, since: Instant::now(), deadline: ticket.deadline, job };
         self.waiting += 1;
         let lines = &mut self.of_class[ticket.priority as usize];
         match lines.iter_mut().find(|line| line.caller == ticket.caller) {
@@ -171,8 +181,8 @@ impl<T> Lines<T> {
         Some(removed.job)
     }
 
-    /// When the job that has waited longest arrived.
-    pub fn oldest(&self) -> Option<Instant> {
-        self.of_class.iter().flatten().filter_map(|line| line.jobs.front()).map(|waiting| waiting.since).min()
+    /// When a batch of the waiting jobs must start if each waits at most `delay`; `None` if no job waits.
+    pub fn start_by(&self, delay: Duration) -> Option<Instant> {
+        self.of_class.iter().flatten().flat_map(|line| &line.jobs).map(|waiting| waiting.start_by(delay)).min()
     }
 }

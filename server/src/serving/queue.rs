@@ -38,7 +38,7 @@ pub(crate) struct QueueSlot<T> {
 pub(crate) struct Batching {
     /// Maximum batch size, jobs.
     pub max: usize,
-    /// Maximum time that a session waits for a batch to fill, from the arrival of its first job.
+    /// Maximum time that a job waits for a batch to fill. It waits at most half of the time until its deadline.
     pub delay: Duration,
 }
 
@@ -177,11 +177,11 @@ impl<T> Queue<T> {
         self.lock().free += 1;
     }
 
-    /// Waits until the batch is full, or the delay has passed since the arrival of its first job.
+    /// Waits until the batch is full, or one of its jobs can wait no longer.
     fn gather<'a>(&self, mut state: MutexGuard<'a, State<T>>, batching: Batching) -> MutexGuard<'a, State<T>> {
         while !state.closed && state.lines.len() < batching.max {
-            let Some(first) = state.lines.oldest() else { break };
-            let left = batching.delay.saturating_sub(first.elapsed());
+            let Some(start) = state.lines.start_by(batching.delay) else { break };
+            let left = start.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 break;
             }
@@ -316,6 +316,17 @@ mod tests {
         // After the delay it takes an incomplete batch.
         let _slot = push(&queue, 7).ok().unwrap();
         assert_eq!(queue.take(Batching { max: 3, delay: Duration::from_millis(1) }), Some(vec![7]));
+    }
+
+    #[test]
+    fn a_job_does_not_wait_for_its_batch_until_its_deadline() {
+        let (queue, _) = queue(1, 4);
+        let deadline = Some(Instant::now() + Duration::from_millis(200));
+        let urgent = Ticket { deadline, ..ticket(CALLER, Priority::Normal) };
+        let _slots =
+            [push(&queue, 1), queue.push(vec![2], urgent, Service::default()).map(|(mut slots, _)| slots.remove(0))];
+        // The delay would end after ten minutes.
+        assert_eq!(queue.take(Batching { max: 3, delay: Duration::from_secs(600) }), Some(vec![1, 2]));
     }
 
     #[test]
