@@ -258,3 +258,36 @@ fn node(op: &str, inputs: [&str; 3], output: &str, axis: Option<usize>) -> NodeP
         ..NodeProto::default()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bias_that_is_large_for_its_weights_keeps_its_value() {
+        const BIAS: f32 = 3.0;
+        let mut model = crate::build("vgn", 0).unwrap();
+        let ranges = quantized_activations(&model);
+        let ranges = ranges.into_iter().map(|name| (name, ActivationRange { low: 0.0, high: 1.0 })).collect();
+        let graph = model.graph.as_mut().unwrap();
+        let [weight, bias] = [1, 2].map(|input| graph.node[0].input[input].clone());
+        for tensor in &mut graph.initializer {
+            // In units of 1e-10 / 127 and 1 / 255, the bias would exceed i32.
+            match tensor.name() {
+                name if name == weight => tensor.set_f32(&vec![1e-10; tensor.elements()]),
+                name if name == bias => tensor.set_f32(&vec![BIAS; tensor.elements()]),
+                _ => {}
+            }
+        }
+        let int8 = with_int8(&model, &ranges).unwrap().graph.unwrap();
+        let stored = |name: String| int8.initializer.iter().find(|tensor| tensor.name() == name).unwrap();
+        let scales = stored(format!("{bias}.scale")).to_f32().unwrap();
+        let bytes = stored(format!("{bias}.i32")).raw_data().to_vec();
+        let values: Vec<i32> = bytes.as_chunks().0.iter().map(|&bytes| i32::from_le_bytes(bytes)).collect();
+        assert_eq!(values.len(), scales.len());
+        for (value, scale) in values.into_iter().zip(scales) {
+            assert!(value <= i32::MAX / 2 + 128, "room for the sums: {value}");
+            assert!((value as f32 * scale - BIAS).abs() < 1e-4, "{value} × {scale}");
+        }
+    }
+}

@@ -1,10 +1,13 @@
 //! Runs each planner on two boxes on a table. `ORT_DYLIB_PATH` must name the ONNX Runtime library.
 
 use std::cell::Cell;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use grasp::{DecodeParams, Decoded, DepthImage, Fusion, RESOLUTION, SurfacePoint, WORKSPACE_SIZE, seen_from};
-use grasp_models::{Backend, Network, Options, Precision, Store};
+use grasp_models::onnx::ModelProto;
+use grasp_models::{
+    ActivationRange, Backend, Network, Options, Precision, Store, quantized_activations, with_full_weights, with_int8,
+};
 use grasp_planner::{
     Evaluator, Gpd, HighestProposal, NetworkPlanner, PlanError, PlanParams, Planner, Scene, Shaf, Source,
 };
@@ -141,12 +144,22 @@ fn the_fastest_backend_of_gpd_agrees_with_the_reference() {
 }
 
 #[test]
-fn gpd_runs_beside_int8_networks() {
-    let store = Store::open(&zoo("classifiers")).unwrap();
-    let source = Source::Gpd(store.get("gpd", None).unwrap().clone());
-    let (planners, backend) =
-        source.load(&Options { precision: Some(Precision::Int8), ..Options::default() }, 2).unwrap();
+fn classifiers_run_beside_int8_networks() {
+    let entry = |folder: &Path, name: &str| Store::open(folder).unwrap().get(name, None).unwrap().clone();
+    let int8 = Options { precision: Some(Precision::Int8), ..Options::default() };
+    let gpd = Source::Gpd(entry(&zoo("classifiers"), "gpd"));
+    let (planners, backend) = gpd.load(&int8, 2).unwrap();
     assert_eq!((planners.len(), backend), (2, Backend::REFERENCE));
+
+    let folder = tempfile::tempdir().unwrap();
+    let network = with_full_weights(&ModelProto::read(&zoo("vgn-packed.onnx")).unwrap()).unwrap();
+    let range = |name| (name, ActivationRange { low: -5.0, high: 5.0 });
+    let ranges = quantized_activations(&network).into_iter().map(range).collect();
+    with_int8(&network, &ranges).unwrap().write(&folder.path().join("vgn-packed.onnx")).unwrap();
+    let network = entry(folder.path(), "vgn-packed");
+    let evaluated = Source::Evaluated { network, evaluator: entry(&zoo("evaluators"), "graspd") };
+    let (planners, backend) = evaluated.load(&int8, 2).unwrap();
+    assert_eq!((planners.len(), backend.precision), (2, Precision::Int8));
 }
 
 #[test]

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use grasp::VoxelOrigin;
 use grasp_models::onnx::ModelProto;
-use grasp_models::{Architecture, Metadata, Orientation, Store};
+use grasp_models::{Architecture, Calibration, Metadata, Orientation, Store};
 use grasp_train::{Checkpoint, EpochRecord};
 
 const N: usize = 16;
@@ -260,6 +260,21 @@ fn rotation_averaging_is_exported_in_every_precision() {
         "{}",
         stderr(&output)
     );
+}
+
+#[test]
+fn an_exported_classifier_keeps_its_calibration() {
+    let folder = tempfile::tempdir().unwrap();
+    assert!(command(folder.path(), "init --network gpd --out random.onnx").status().unwrap().success());
+    let read = |name: &str| ModelProto::read(&folder.path().join(name)).unwrap();
+    let calibration = Calibration { slope: 0.5, offset: -0.25 };
+    let mut model = read("random.onnx");
+    calibration.write_to(&mut model);
+    model.write(&folder.path().join("calibrated.onnx")).unwrap();
+    let output =
+        command(folder.path(), "export --from calibrated.onnx --precision fp16 --out half.onnx").output().unwrap();
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert_eq!(Calibration::of(&read("half.onnx")), Ok(calibration));
 }
 
 #[test]
