@@ -56,8 +56,8 @@ pub struct Tables {
     #[arg(long, default_value = "docs/tables.md")]
     out: PathBuf,
 
-    /// Results of all benchmark runs, JSON lines. Runs found in it are not repeated. Results of networks, objects,
-    /// simulators and seeds that this command does not measure stay in it.
+    /// Results of all benchmark runs, JSON lines. Runs found in it are not repeated, except for timings on another
+    /// processor. Results of networks, objects, simulators and seeds that this command does not measure stay in it.
     #[arg(long, default_value = "models/tables.jsonl")]
     results: PathBuf,
 
@@ -225,6 +225,7 @@ impl Tables {
 
     fn tasks(&self, entries: &[Entry], fingerprint: &str) -> anyhow::Result<Vec<Task>> {
         let mut tasks = Vec::new();
+        let machine = machine();
         let object_sets =
             self.objects.iter().map(|folder| Ok((name_of(folder), hash_folder(folder, &["urdf", "obj"])?)));
         let object_sets: Vec<(String, String)> = object_sets.collect::<anyhow::Result<_>>()?;
@@ -258,8 +259,10 @@ impl Tables {
                     let on = (scenario, views, epsilon, forced, seed, scenes, timed);
                     let simulator = pybullet_files.as_ref().filter(|_| condition.simulator == Simulator::PyBullet);
                     let corrected = if *is_scale_corrected { " corrected" } else { "" };
+                    // All times of a table are measured on one machine.
+                    let machine = if timed { format!(" {machine}") } else { String::new() };
                     let key = digest(&format!(
-                        "{kind:?} {:?} {on:?} {fingerprint} {of_objects} {simulator:?}{corrected}",
+                        "{kind:?} {:?} {on:?} {fingerprint} {of_objects} {simulator:?}{corrected}{machine}",
                         entry.sha256
                     ));
                     tasks.push(Task { key, condition, planner: entry.planner.clone(), seed, timed });
@@ -444,12 +447,11 @@ impl Tables {
              \x20 These transformers have 3.0 M parameters, the paper's has 87 M; our network of that size is not in these tables\n\
              \x20 ([card](../models/large/transformer.md)). VGN-R: VGN's released weights. graspd: the evaluator with the grasps of\n\
              \x20 `vgn-packed`, in both scenarios.\n\
-             - Times: {} with {} cores, ONNX Runtime's CPU provider, one observation at a time. The paper's times are for an\n\
+             - Times: {}, ONNX Runtime's CPU provider, one observation at a time. The paper's times are for an\n\
              \x20 RTX 3090.\n\
              - Simulator and decoding {}.{pybullet}\n\n",
             self.rounds,
-            processor(),
-            std::thread::available_parallelism().map_or(1, |n| n.get()),
+            machine(),
             &fingerprint[..12],
         )
     }
@@ -478,10 +480,20 @@ fn thousands(number: &str) -> String {
     text
 }
 
-fn processor() -> String {
+/// The processor and its number of cores. Names of processors in virtual machines are short, so family and model follow.
+fn machine() -> String {
     let text = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let name = text.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
-    name.map_or_else(|| "unknown processor".to_owned(), |(_, name)| name.trim().to_owned())
+    let value = |key: &str| {
+        let mut pairs = text.lines().filter_map(|line| line.split_once(':'));
+        pairs.find_map(|(name, value)| (name.trim() == key).then(|| value.trim().to_owned()))
+    };
+    let cores = std::thread::available_parallelism().map_or(1, |n| n.get());
+    match [value("model name"), value("cpu family"), value("model")] {
+        [Some(name), Some(family), Some(model)] => {
+            format!("{name} (family {family}, model {model}) with {cores} cores")
+        }
+        [name, ..] => format!("{} with {cores} cores", name.as_deref().unwrap_or("unknown processor")),
+    }
 }
 
 #[cfg(test)]
