@@ -73,10 +73,12 @@ impl Client {
         let address = address.into();
         let tls = access.tls(&address);
         let scheme = if tls.is_some() { "https" } else { "http" };
-        let uri = if address.contains("://") || address.starts_with("unix:") {
-            address.clone()
+        // With `http://`, tonic would not use TLS.
+        let name = address.strip_prefix("http://").unwrap_or(&address);
+        let uri = if name.contains("://") || name.starts_with("unix:") {
+            name.to_owned()
         } else {
-            format!("{scheme}://{address}")
+            format!("{scheme}://{name}")
         };
         let connect = async || {
             let mut endpoint = Endpoint::from_shared(uri)?;
@@ -306,7 +308,7 @@ impl Client {
     pub async fn track(&self, workspace: Workspace) -> Result<Tracking, Error> {
         let (requests, waiting) = mpsc::channel(1);
         let replies = self.grasps().track_grasps(ReceiverStream::new(waiting)).await?.into_inner();
-        Ok(Tracking { requests, replies, workspace: Some(workspace), half_life: None })
+        Ok(Tracking { requests, replies, unanswered: 0, workspace: Some(workspace), half_life: None })
     }
 
     /// Opens a tracked volume for a scene that moves: in each voxel the weight of a measurement halves with every
@@ -413,6 +415,8 @@ impl Client {
 pub struct Tracking {
     requests: mpsc::Sender<pb::TrackGraspsRequest>,
     replies: Streaming<pb::DetectGraspsStreamResponse>,
+    /// Requests without a reply yet: those of cancelled calls.
+    unanswered: usize,
     /// `None` once the server has accepted it.
     workspace: Option<Workspace>,
     /// Half-life of the measurements, views.
@@ -420,26 +424,36 @@ pub struct Tracking {
 }
 
 impl Tracking {
-    /// Adds views to the volume and detects grasps in everything observed so far. Calls are not retried.
+    /// Adds views to the volume and detects grasps in everything observed so far. Calls are not retried. If the returned
+    /// future is dropped before it is ready, the views may have been added, and the next call waits for both replies.
     ///
     /// # Errors
-    /// [`Error::Refused`]. An invalid view does not end the tracking. With [`Code::ResourceExhausted`] the views have
-    /// been added nevertheless: retry without them.
+    /// [`Error::Refused`]. An invalid view does not end the tracking. If [`Error::views_added`], retry without the views.
     pub async fn add(&mut self, views: &[DepthView], options: Options) -> Result<Detection, Error> {
+        while self.unanswered > 0 {
+            // The result of a cancelled call.
+            let _ = self.reply().await?;
+        }
         let request = options.track_request(views, self.workspace.as_ref(), self.half_life);
         // If the server has closed the stream, its last reply holds the reason.
-        let _ = self.requests.send(request).await;
+        if let Ok(place) = self.requests.reserve().await {
+            place.send(request);
+            self.unanswered += 1;
+        }
+        self.reply().await?
+    }
+
+    /// The next reply; the outer error ends the stream.
+    async fn reply(&mut self) -> Result<Result<Detection, Error>, Error> {
         let reply = self.replies.message().await?;
-        let detection =
-            outcome(reply.ok_or_else(|| Status::unavailable("the server closed the stream; start tracking again"))?);
-        // The server returns these two codes only after it has added the views. Sending the workspace again would start
-        // another volume.
-        let was_added = [Code::ResourceExhausted, Code::Internal];
-        if detection.as_ref().map_or_else(|error| error.code().is_some_and(|code| was_added.contains(&code)), |_| true)
-        {
+        let reply = reply.ok_or_else(|| Status::unavailable("the server closed the stream; start tracking again"))?;
+        self.unanswered = self.unanswered.saturating_sub(1);
+        let detection = outcome(reply);
+        // Sending the workspace again would start another volume.
+        if detection.as_ref().map_or_else(Error::views_added, |_| true) {
             self.workspace = None;
         }
-        detection
+        Ok(detection)
     }
 }
 

@@ -39,6 +39,8 @@ pub enum Error {
         field: Option<String>,
         /// Id of the request in the server's log. `None` if the request did not reach the server.
         request_id: Option<String>,
+        /// Whether the views of a request of [`Tracking`](crate::Tracking) are in the volume.
+        views_added: bool,
     },
     /// The server's reply violates the protocol.
     #[error("invalid reply from the server: {0}; check that client and server have the same version")]
@@ -82,6 +84,13 @@ impl Error {
         }
     }
 
+    /// Whether the views of a request of [`Tracking`](crate::Tracking) are in the volume although it was refused: repeat the
+    /// request without them.
+    #[must_use]
+    pub fn views_added(&self) -> bool {
+        matches!(self, Self::Refused { views_added: true, .. })
+    }
+
     /// The same error with the id of the request. In a stream the reply contains it, not its error.
     pub(crate) fn of_request(mut self, id: String) -> Self {
         if let Self::Refused { request_id, .. } = &mut self {
@@ -104,6 +113,7 @@ impl From<Status> for Error {
             retry_after: milliseconds.map(Duration::from_millis),
             field: violation.map(|violation| violation.field),
             request_id: request_id.filter(|id| !id.is_empty()),
+            views_added: false,
         }
     }
 }
@@ -116,6 +126,7 @@ impl From<pb::Error> for Error {
             retry_after: error.retry_after.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok()),
             field: Some(error.field).filter(|field| !field.is_empty()),
             request_id: None,
+            views_added: error.views_added,
         }
     }
 }

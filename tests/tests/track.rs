@@ -99,8 +99,8 @@ async fn views_are_fused_while_the_queue_is_full() {
             callers.spawn(async move { client.detect(&volume, Options::default()).await });
         }
         server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 1.0).await;
-        let (status, message) = code(tracking.add(&views[seen - 1..seen], low()).await);
-        assert_eq!(status, Code::ResourceExhausted, "{message}");
+        let refused = tracking.add(&views[seen - 1..seen], low()).await.unwrap_err();
+        assert!(refused.code() == Some(Code::ResourceExhausted) && refused.views_added(), "{refused:?}");
         callers.join_all().await;
 
         let kept = tracking.add(&[], low()).await.unwrap();
@@ -186,12 +186,29 @@ async fn each_cube_of_a_tracked_workspace_counts() {
     assert_eq!(server.metric(TRACKED), 4.0);
 
     let mut second = client.track(of([0.6, 0.4])).await.unwrap();
-    let (status, message) = code(second.add(&views, low()).await);
-    assert!(status == Code::ResourceExhausted && message.contains("--max-tracked"), "{message}");
+    let refused = second.add(&views, low()).await.unwrap_err();
+    assert!(refused.code() == Some(Code::ResourceExhausted) && !refused.views_added(), "{refused:?}");
+    assert!(refused.to_string().contains("--max-tracked"), "{refused}");
     assert_eq!(server.metric(TRACKED), 5.0, "a stream without a volume has one place");
     let mut third = client.track(of([0.4, 0.4])).await.unwrap();
     third.add(&views, low()).await.unwrap();
     assert_eq!(server.metric(TRACKED), 9.0);
     drop(large);
     server.wait_for(TRACKED, 5.0).await;
+    drop(third);
+    server.wait_for(TRACKED, 1.0).await;
+    assert!(second.add(&views, low()).await.is_ok(), "the client sends its workspace again");
+}
+
+#[tokio::test]
+async fn a_cancelled_addition_does_not_shift_the_replies() {
+    let server = Server::run(&[TestModel::new("slow").convolutions(60)], &[]);
+    let client = server.client().await;
+    let views = [-90.0, 90.0].map(|azimuth| view(&camera(40.0, azimuth)));
+    let mut tracking = client.track(Workspace::default()).await.unwrap();
+    let first = tokio::time::timeout(Duration::from_millis(1), tracking.add(&views[..1], low())).await;
+    assert!(first.is_err(), "an inference takes longer than a millisecond");
+    let both = tracking.add(&views[1..], low()).await.unwrap();
+    let again = tracking.add(&[], low()).await.unwrap();
+    assert_eq!(both.grasps, again.grasps);
 }

@@ -54,7 +54,7 @@ impl GraspRpc {
         let replies = ReceiverStream::new(calls).then(async |pending: Result<PendingCall, Status>| {
             let pending = pending?;
             let id = pending.call.id.clone();
-            Ok(response(id, pending.finish().await))
+            Ok(response(id, pending.finish().await, false))
         });
         Ok(Response::new(Box::pin(replies)))
     }
@@ -95,12 +95,14 @@ impl GraspRpc {
                 };
                 let id = std::mem::take(&mut request.request_id);
                 let result = async {
-                    let submit =
-                        async |call: &mut Call| service.submit_track(request, &mut track, &mut permit, call).await;
+                    let mut views_added = false;
+                    let submit = async |call: &mut Call| {
+                        service.submit_track(request, &mut track, &mut permit, &mut views_added, call).await
+                    };
                     // A request cannot be repeated without those before it.
                     let pending = service.begin(id, context.clone(), Pending::none(), submit).await;
                     let id = pending.call.id.clone();
-                    response(id, pending.finish().await)
+                    response(id, pending.finish().await, views_added)
                 };
                 tokio::select! {
                     // Polls the request first, so that it is opened and counted.
@@ -115,12 +117,14 @@ impl GraspRpc {
         Ok(Response::new(Box::pin(ReceiverStream::new(sent))))
     }
 
-    /// Integrates the views of a request into the stream's volume, and queues the scene.
+    /// Integrates the views of a request into the stream's volume, and queues the scene. A request that is refused later
+    /// leaves `views_added` true.
     async fn submit_track(
         &self,
         request: pb::TrackGraspsRequest,
         track: &mut Option<Track>,
         volumes: &mut TrackPermit,
+        views_added: &mut bool,
         call: &mut Call,
     ) -> Result<PendingReply, Refusal> {
         let pb::TrackGraspsRequest { mut views, workspace, options, half_life, stamp, .. } = request;
@@ -144,7 +148,7 @@ impl GraspRpc {
             Ok(Track::integrate(old, &selected, of_request, start, &mut views, stamp, is_wanted))
         })
         .await?;
-        *track = new;
+        (*track, *views_added) = (new, fused.is_ok());
         self.tracked_volumes.resize(volumes, track.as_ref().map_or(1, Track::volumes))?;
         let ((scenes, observed), origin) = fused?;
         PendingReply::detect(call, Prepared { engine, scenes, observed, origin }, params)
@@ -152,10 +156,14 @@ impl GraspRpc {
 }
 
 /// One response of a stream. The stream continues after a refusal.
-fn response(request_id: String, outcome: Result<pb::DetectGraspsResponse, Refusal>) -> pb::DetectGraspsStreamResponse {
+fn response(
+    request_id: String,
+    outcome: Result<pb::DetectGraspsResponse, Refusal>,
+    views_added: bool,
+) -> pb::DetectGraspsStreamResponse {
     let outcome = match outcome {
         Ok(response) => Outcome::Response(response),
-        Err(refusal) => Outcome::Error((&refusal).into()),
+        Err(refusal) => Outcome::Error(pb::Error { views_added, ..(&refusal).into() }),
     };
     pb::DetectGraspsStreamResponse { request_id, outcome: Some(outcome) }
 }

@@ -99,6 +99,7 @@ impl From<&Refusal> for pb::Error {
             retry_after: refusal.retry_after().map(|after| after.as_secs_f64()),
             field: refusal.field().unwrap_or_default().to_owned(),
             message: refusal.to_string(),
+            views_added: false,
         }
     }
 }

@@ -199,8 +199,9 @@ class Tracking:
         `options` of None the options of the previous call apply. `stamp` is the time of the views, nanoseconds since
         1970; None: that of the previous call, or of the workspace.
 
-        An invalid view does not end the tracking. `Aborted` ends it. `ResourceExhausted` at the first call ends it too:
-        the server's limit of tracked volumes is reached. Calls are not retried.
+        An invalid view does not end the tracking. If the error has `views_added`, repeat the call without the views.
+        `Aborted` ends the tracking, and so does `ResourceExhausted` if the server's limit of tracked volumes is reached
+        when it starts. Calls are not retried.
         """
         self._requests.put(self._adding.request(views, options, request_id, stamp))
         try:

@@ -25,6 +25,8 @@ class Error(Exception):
     """The server's retry hint, seconds."""
     request_id: str | None = None
     """Id of the request in the server's log; None if the request did not reach the server."""
+    views_added: bool = False
+    """Whether the views of a refused `add` of a tracked volume are in the volume: repeat it without them."""
 
     def __str__(self) -> str:
         return f"{self.code.name}: {self.message}"
@@ -98,6 +100,7 @@ def from_reply(reply: pb.DetectGraspsStreamResponse) -> Error:
     error = make(CODES[reply.error.code], reply.error.message)
     error.field = reply.error.field or None
     error.request_id = reply.request_id
+    error.views_added = reply.error.views_added
     if reply.error.HasField("retry_after"):
         error.retry_after = reply.error.retry_after
     return error

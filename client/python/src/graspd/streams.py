@@ -53,11 +53,6 @@ class Detecting:
             raise ended()
 
 
-# The server returns these codes only after it has added the views. Sending the workspace again would start another
-# volume.
-WAS_ADDED = (StatusCode.RESOURCE_EXHAUSTED, StatusCode.INTERNAL)
-
-
 class Adding:
     """The state of a tracked volume."""
 
@@ -76,7 +71,8 @@ class Adding:
         if reply is None:
             raise ended()
         outcome = methods.TRACK.answer(reply)
-        if not isinstance(outcome, Error) or outcome.code in WAS_ADDED:
+        # Sending the workspace again would start another volume.
+        if not isinstance(outcome, Error) or outcome.views_added:
             self._workspace = None
         if isinstance(outcome, Error):
             raise outcome
