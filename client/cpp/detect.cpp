@@ -34,6 +34,14 @@ std::unique_ptr<pb::GraspService::Stub> connect(const std::string &server) {
     arguments.SetServiceConfigJSON(SERVICE_CONFIG);
     // gRPC retries only requests that fit its retry buffer. The default of 256 KiB is smaller than most images.
     arguments.SetInt(GRPC_ARG_PER_RPC_RETRY_BUFFER_SIZE, 16 << 20);
+    // A low threshold can return tens of thousands of grasps.
+    arguments.SetMaxReceiveMessageSize(-1);
+    // Reconnect soon. By default gRPC waits for up to two minutes after an outage.
+    arguments.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, 100);
+    arguments.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, 500);
+    // Detect servers that disappear without closing the connection.
+    arguments.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, 30000);
+    arguments.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, 10000);
     return pb::GraspService::NewStub(grpc::CreateCustomChannel(server, grpc::InsecureChannelCredentials(), arguments));
 }
 

@@ -128,9 +128,10 @@ pub fn quality_at(
         // The inverse of `grasp_at`.
         let pose = params.hand.map_or(*pose, |hand| before(pose, FINGER_DEPTH - hand.depth));
         let position = volume.pose().inverse_transform_point(&pose.translation.vector.into());
-        let cell = position.coords.map(|c| (c / volume.voxel_size() - params.origin.offset()).round());
-        let is_inside = cell.iter().all(|c| (0.0..n as f64).contains(c));
-        let [x, y, z]: [usize; 3] = cell.map(|c| c as usize).into();
+        let position = position.coords / volume.voxel_size();
+        let is_inside = position.iter().all(|c| (0.0..=n as f64).contains(c));
+        let nearest = |c: f64| (c - params.origin.offset()).round().clamp(0.0, (n - 1) as f64) as usize;
+        let [x, y, z]: [usize; 3] = position.map(nearest).into();
         if is_inside { smooth[(x * n + y) * n + z] } else { 0.0 }
     };
     Ok(poses.iter().map(quality).collect())
@@ -267,6 +268,25 @@ mod tests {
 
     fn sharp() -> DecodeParams {
         DecodeParams { sigma: 0.0, ..DecodeParams::default() }
+    }
+
+    #[test]
+    fn a_pose_has_the_quality_of_the_nearest_voxel_of_its_volume() {
+        let mut arrays = Arrays::new();
+        arrays.quality[index(N - 1, 3, 3)] = 0.75;
+        let maps = Maps { quality: &arrays.quality, rotation: &arrays.rotation, width: &arrays.width };
+        let volume = slab();
+        let at = |x: f64| {
+            let pose = volume.pose() * Isometry3::translation(x * 0.0075, 3.0 * 0.0075, 3.0 * 0.0075);
+            quality_at(&volume, &maps, &[pose], &DecodeParams { origin: VoxelOrigin::Corner, ..sharp() }).unwrap()[0]
+        };
+        // The last voxel ends at 16; its corner, the origin of its grasp, is at 15.
+        assert_eq!([14.4, 14.6, 15.0, 15.9, 16.1].map(at), [0.0, 0.75, 0.75, 0.75, 0.0]);
+        arrays.quality[index(0, 3, 3)] = 0.5;
+        let maps = Maps { quality: &arrays.quality, rotation: &arrays.rotation, width: &arrays.width };
+        let before = volume.pose() * Isometry3::translation(-0.3 * 0.0075, 3.0 * 0.0075, 3.0 * 0.0075);
+        let params = DecodeParams { origin: VoxelOrigin::Corner, ..sharp() };
+        assert_eq!(quality_at(&volume, &maps, &[before], &params).unwrap(), [0.0], "outside");
     }
 
     #[test]

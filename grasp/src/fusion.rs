@@ -245,6 +245,9 @@ impl Fusion {
         const FEWEST: usize = 100;
         /// Distance in front of a surface from which space counts as free, metres: beyond the noise of depth cameras.
         const FREE: f32 = 0.024;
+        if self.voxels.iter().all(|voxel| voxel.weight <= 0.0) {
+            return None;
+        }
         // With small voxels no distance is as large.
         let free = FREE.min(0.8 * self.truncation);
         let size = self.voxel_size * self.resolution as f64;

@@ -169,9 +169,9 @@ impl Hand {
     pub fn lowest_point(&self, pose: &Isometry3<f64>) -> f64 {
         let (x, y) = (self.height / 2.0, self.outer_diameter / 2.0);
         let fingers = [[-x, -y, 0.0], [x, y, self.depth]];
-        let down = pose.rotation.inverse() * Vector3::z();
+        let up = pose.rotation.inverse() * Vector3::z();
         let lowest = |[lower, upper]: [[f64; 3]; 2]| -> f64 {
-            (0..3).map(|axis| (down[axis] * lower[axis]).min(down[axis] * upper[axis])).sum()
+            (0..3).map(|axis| (up[axis] * lower[axis]).min(up[axis] * upper[axis])).sum()
         };
         pose.translation.z + lowest(fingers).min(lowest(self.palm))
     }

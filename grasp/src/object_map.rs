@@ -27,12 +27,14 @@ impl ObjectMap {
         frame_from_task: &Isometry3<f64>,
         wanted: BTreeSet<u16>,
     ) -> Self {
-        let mut votes = HashMap::<[i32; 3], BTreeMap<u16, u32>>::new();
-        for (point, label) in points {
-            *votes.entry(cell(&point)).or_default().entry(label).or_default() += 1;
-        }
-        let label = |votes: BTreeMap<u16, u32>| most(votes).filter(|label| *label > 0);
-        let cells = votes.into_iter().filter_map(|(cell, votes)| Some((cell, label(votes)?))).collect();
+        // Sorted, which needs less memory than a map of maps for a cloud of millions of points.
+        let mut votes: Vec<([i32; 3], u16)> = points.map(|(point, label)| (cell(&point), label)).collect();
+        votes.sort_unstable();
+        let of_cell = |votes: &[([i32; 3], u16)]| {
+            let most = votes.chunk_by(|(_, a), (_, b)| a == b).max_by_key(|same| same.len())?;
+            most.first().copied().filter(|(_, label)| *label > 0)
+        };
+        let cells = votes.chunk_by(|(a, _), (b, _)| a == b).filter_map(of_cell).collect();
         Self { map_from_frame: frame_from_task.inverse(), cells, wanted: Some(wanted).filter(|set| !set.is_empty()) }
     }
 
@@ -49,7 +51,8 @@ impl ObjectMap {
     pub fn object(&self, pose: &Isometry3<f64>, hand: &Hand) -> Option<u16> {
         /// Most steps between the points along an axis. It bounds the time for large hands; the Panda's has 11.
         const STEPS: f64 = 16.0;
-        let map_from_hand = self.map_from_frame * pose;
+        // A matrix, because hundreds of points are rotated.
+        let map_from_hand = (self.map_from_frame * pose).to_homogeneous();
         let range = |from: f64, to: f64| {
             let steps = ((to - from) / CELL).ceil().clamp(1.0, STEPS);
             (0..=steps as u32).map(move |step| from + (to - from) * f64::from(step) / steps)
@@ -58,7 +61,7 @@ impl ObjectMap {
         for x in range(-hand.height / 2.0, hand.height / 2.0) {
             for y in range(-hand.half_opening(), hand.half_opening()) {
                 for z in range(0.0, hand.depth) {
-                    if let Some(label) = self.cells.get(&cell(&(map_from_hand * Point3::new(x, y, z)))) {
+                    if let Some(label) = self.cells.get(&cell(&map_from_hand.transform_point(&Point3::new(x, y, z)))) {
                         *votes.entry(*label).or_default() += 1;
                     }
                 }

@@ -1,5 +1,3 @@
-use std::collections::BTreeMap;
-
 use nalgebra::{Isometry3, Point3};
 
 use crate::{Hand, Volume, before};
@@ -18,7 +16,7 @@ pub struct Clearance {
     pub table: Option<f64>,
     /// Smallest distance between the hand and the obstacles, metres.
     pub margin: f64,
-    /// Whether voxels that lie behind a surface in every view are obstacles, too.
+    /// Whether voxels that lie behind a surface in a view and were measured by none are obstacles, too.
     pub hidden: bool,
 }
 
@@ -60,21 +58,26 @@ impl Obstacles {
         let (n, size) = (volume.resolution(), volume.voxel_size());
         let behind = 0.5 - clearance.behind / 2.0;
         let place = |cell: [f64; 3]| volume.pose() * Point3::from(cell.map(|c| c * size));
-        let mut blocks = BTreeMap::<[usize; 3], Vec<Point3<f64>>>::new();
+        let side = n.div_ceil(BLOCK);
+        let mut blocks = vec![Vec::new(); side.pow(3)];
         let hidden = volume.hidden().filter(|_| clearance.hidden);
         for (index, &value) in volume.values().iter().enumerate() {
             if value > 0.0 && value <= behind || hidden.is_some_and(|hidden| hidden[index]) {
                 let cell = [index / (n * n), index / n % n, index % n];
-                blocks.entry(cell.map(|c| c / BLOCK)).or_default().push(place(cell.map(|c| c as f64 + 0.5)));
+                let [x, y, z] = cell.map(|c| c / BLOCK);
+                blocks[(x * side + y) * side + z].push(place(cell.map(|c| c as f64 + 0.5)));
             }
         }
-        let block = |(block, points): ([usize; 3], _)| Block {
-            centre: place(block.map(|c| (c as f64 + 0.5) * BLOCK as f64)),
+        let block = |(index, points): (usize, Vec<Point3<f64>>)| Block {
+            centre: place(
+                [index / (side * side), index / side % side, index % side].map(|c| (c as f64 + 0.5) * BLOCK as f64),
+            ),
             radius: 0.5 * 3.0_f64.sqrt() * BLOCK as f64 * size,
             points,
         };
+        let blocks = blocks.into_iter().enumerate().filter(|(_, points)| !points.is_empty()).map(block).collect();
         let hand = clearance.hand.grown(clearance.margin);
-        Self { clearance, hand, blocks: blocks.into_iter().map(block).collect(), pose: *volume.pose() }
+        Self { clearance, hand, blocks, pose: *volume.pose() }
     }
 
     /// Whether the open hand collides on its way from the pre-grasp to `pose` (frame of the volume's pose).

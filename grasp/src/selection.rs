@@ -97,7 +97,7 @@ impl<'a> Selection<'a> {
     }
 }
 
-/// Filters the grasps of a planner without a network by threshold, constraints and clearance. `grasps` are in the frame
+/// Filters grasps that are not decoded from maps by threshold, constraints and clearance. `grasps` are in the frame
 /// of `volume`'s pose, best first, and already planned for the hand of `params`.
 #[must_use]
 pub fn select(grasps: &[Grasp], volume: &Volume, params: &DecodeParams) -> Decoded {

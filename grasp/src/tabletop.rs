@@ -10,7 +10,7 @@ use crate::{DEPTH_MAX, DepthImage, WORKSPACE_SIZE};
 pub struct Tabletop {
     /// `T_camera_task`: the workspace, a cube of [`WORKSPACE_SIZE`], holds what stands on the table near the middle of
     /// the image. Its z axis is the normal of the table, its x axis points to the right in the image, and the table is
-    /// at the height that was asked for.
+    /// at the height that [`find`](Self::find) was given.
     pub camera_from_task: Isometry3<f64>,
     /// Distance of the camera from the plane of the table, metres.
     pub distance: f64,
@@ -99,15 +99,16 @@ struct Plane {
 }
 
 impl Tabletop {
-    /// Finds the largest plane near the middle of the image. `gravity` is the direction of gravity in the camera frame,
-    /// as an accelerometer measures it in rest with the sign reversed; with it only level planes are considered, else a
-    /// wall that fills the image is taken for a table. `height` is the height of the table in the workspace, metres.
+    /// Finds the largest plane near the middle of the image. `gravity` is the direction of gravity in the camera frame; an
+    /// accelerometer at rest measures the opposite. With it only level planes are considered, else a wall that fills the
+    /// image is taken for a table. `height` is the height of the table in the workspace, metres.
     ///
     /// # Errors
     /// [`NoTabletop`] if there is no plane large enough.
     pub fn find(image: &DepthImage, gravity: Option<Unit<Vector3<f64>>>, height: f64) -> Result<Self, NoTabletop> {
         let samples = samples(image);
-        let pixels = image.depth().len() as f64 / stride(image, POINTS).pow(2) as f64;
+        let (camera, step) = (image.intrinsics(), stride(image, POINTS));
+        let pixels = (camera.width.div_ceil(step) * camera.height.div_ceil(step)) as f64;
         let share = samples.len() as f64 / pixels;
         if share < FEWEST {
             return Err(NoTabletop::FewReadings { share });
@@ -146,7 +147,7 @@ impl Tabletop {
     }
 }
 
-/// Step between pixels along both axes of the image, of which `count` are visited.
+/// Step along both axes of the image with which about `count` pixels are visited.
 fn stride(image: &DepthImage, count: f64) -> usize {
     ((image.depth().len() as f64 / count).sqrt() as usize).max(1)
 }

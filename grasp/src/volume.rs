@@ -107,7 +107,7 @@ impl Volume {
         Ok(Self { resolution, voxel_size, pose, values, hidden: None, objects: None })
     }
 
-    /// The volume with the voxels that lie behind a surface in every view.
+    /// The volume with its hidden voxels: those that lie behind a surface in a view and were measured by none.
     pub(crate) fn with_hidden(self, hidden: Vec<bool>) -> Self {
         Self { hidden: Some(hidden), ..self }
     }

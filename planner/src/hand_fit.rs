@@ -40,7 +40,10 @@ impl HandFit {
     #[must_use]
     pub fn params(hand: Hand, table: f64) -> Params {
         let aperture = APERTURE_MARGIN..=(2.0 * hand.half_opening() - APERTURE_MARGIN);
-        Params { hand, aperture, ..Params::above(table + TABLE_CLEARANCE) }
+        let of_gpd = Params::above(table + TABLE_CLEARANCE);
+        // Fingers may be shorter than GPD's.
+        let bite = of_gpd.bite.min(hand.depth);
+        Params { hand, aperture, bite, ..of_gpd }
     }
 
     /// Fits the hand to the points of the scene.

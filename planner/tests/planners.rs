@@ -3,7 +3,7 @@
 use std::cell::Cell;
 use std::path::{Path, PathBuf};
 
-use grasp::{DecodeParams, Decoded, DepthImage, Fusion, RESOLUTION, SurfacePoint, WORKSPACE_SIZE, seen_from};
+use grasp::{DecodeParams, Decoded, DepthImage, Fusion, Hand, RESOLUTION, SurfacePoint, WORKSPACE_SIZE, seen_from};
 use grasp_models::onnx::ModelProto;
 use grasp_models::{
     ActivationRange, Backend, Network, Options, Precision, Store, quantized_activations, with_full_weights, with_int8,
@@ -160,6 +160,13 @@ fn classifiers_run_beside_int8_networks() {
     let evaluated = Source::Evaluated { network, evaluator: entry(&zoo("evaluators"), "graspd") };
     let (planners, backend) = evaluated.load(&int8, 2).unwrap();
     assert_eq!((planners.len(), backend.precision), (2, Precision::Int8));
+}
+
+#[test]
+fn fingers_shorter_than_the_first_bite_of_gpd_find_grasps() {
+    let hand = Hand { depth: 0.008, ..Hand::GPD };
+    let decode = DecodeParams { hand: Some(hand), ..Shaf::decode_params() };
+    assert!(!plan(&mut Shaf, &scene(Isometry3::identity()), decode).grasps.is_empty());
 }
 
 #[test]

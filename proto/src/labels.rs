@@ -64,5 +64,13 @@ mod tests {
         assert_eq!(of_points.to_string(), "type is LABEL_TYPE_PNG, which is only for images");
         let other_size = labels(&png::grey_png(&[0; 6], 2), pb::LabelType::Png);
         assert_eq!(refused(&other_size), "data: the PNG has 2 × 3 pixels, the camera has 3 × 2");
+        // Of 1 bit: values 0 and 1.
+        let mut file = Vec::new();
+        let mut encoder = ::png::Encoder::new(&mut file, 3, 2);
+        encoder.set_color(::png::ColorType::Grayscale);
+        encoder.set_depth(::png::BitDepth::One);
+        encoder.write_header().unwrap().write_image_data(&[0b1010_0000, 0b0100_0000]).unwrap();
+        let reason = "data: the PNG has the type Grayscale of 1 bits, must be grey of 8 or 16 bits";
+        assert_eq!(refused(&labels(&file, pb::LabelType::Png)), reason);
     }
 }

@@ -174,7 +174,7 @@ impl TryFrom<&pb::Options> for DetectParams {
             max_grasps: limit(options.max_grasps),
             max_grasps_per_object: limit(options.max_grasps_per_object),
             objects: objects(&options.objects)?,
-            margin: margin("options.margin", options.margin)?,
+            margin: length("options.margin", options.margin, MAX_MARGIN)?.unwrap_or_default(),
             priority: priority(options.priority)?,
             explain: options.explain,
             constraints: Constraints {
@@ -186,10 +186,10 @@ impl TryFrom<&pb::Options> for DetectParams {
             hand: options.gripper.as_ref().map(hand).transpose()?,
             collision: mode(&collision)?,
             table: Some(table).filter(|height| *height >= 0.0),
-            clearance: margin("options.collision.clearance", collision.clearance)?,
+            clearance: length("options.collision.clearance", collision.clearance, MAX_MARGIN)?.unwrap_or_default(),
             hidden: collision.hidden,
             convention: options.convention.as_ref().map(convention).transpose()?.unwrap_or_default(),
-            pregrasp: distance("options.pregrasp_distance", options.pregrasp_distance)?.unwrap_or(PREGRASP),
+            pregrasp: length("options.pregrasp_distance", options.pregrasp_distance, REACH)?.unwrap_or(PREGRASP),
             retreat: options
                 .retreat
                 .as_ref()
@@ -222,10 +222,11 @@ fn number(field: &'static str, value: Option<f64>) -> Result<Option<f64>, FieldE
     }
 }
 
-fn distance(field: &'static str, value: Option<f64>) -> Result<Option<f64>, FieldError> {
+/// A length of at most `most` metres.
+fn length(field: &'static str, value: Option<f64>, most: f64) -> Result<Option<f64>, FieldError> {
     match value {
-        Some(value) if !(0.0..=REACH).contains(&value) => {
-            Err(FieldError::new(field, value, format_args!("must be from 0 to {REACH} m")))
+        Some(value) if !(0.0..=most).contains(&value) => {
+            Err(FieldError::new(field, value, format_args!("must be from 0 to {most} m")))
         }
         value => Ok(value),
     }
@@ -247,15 +248,6 @@ fn corners(bounds: &pb::Box, field: &'static str) -> Result<[[f64; 3]; 2], Field
 /// A largest number; 0 means no limit.
 fn limit(count: u32) -> usize {
     if count == 0 { usize::MAX } else { count as usize }
-}
-
-fn margin(field: &'static str, value: Option<f64>) -> Result<f64, FieldError> {
-    match value {
-        Some(value) if !(0.0..=MAX_MARGIN).contains(&value) => {
-            Err(FieldError::new(field, value, format_args!("must be from 0 to {MAX_MARGIN} m")))
-        }
-        value => Ok(value.unwrap_or_default()),
-    }
 }
 
 fn objects(labels: &[u32]) -> Result<BTreeSet<u16>, FieldError> {
@@ -359,9 +351,9 @@ fn convention(convention: &pb::Convention) -> Result<Convention, FieldError> {
 }
 
 fn retreat(retreat: &pb::Retreat) -> Result<Retreat, FieldError> {
-    let length = distance("options.retreat.distance", retreat.distance)?;
+    let distance = length("options.retreat.distance", retreat.distance, REACH)?;
     let towards = retreat.direction.map(|vector| direction(Some(vector), "options.retreat.direction")).transpose()?;
-    Ok(Retreat { distance: length.unwrap_or(RETREAT), direction: towards })
+    Ok(Retreat { distance: distance.unwrap_or(RETREAT), direction: towards })
 }
 
 #[cfg(test)]

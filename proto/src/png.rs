@@ -1,6 +1,6 @@
 use std::io::Cursor;
 
-use png::{BitDepth, ColorType, Decoder, Limits, Transformations};
+use png::{BitDepth, ColorType, Decoder, Limits};
 
 /// Most pixels of an image that is sent as PNG. A small file can contain a large image.
 const MAX_PIXELS: usize = 1 << 24;
@@ -20,8 +20,7 @@ fn decoded(file: &[u8], width: usize, height: usize, depths: &[BitDepth]) -> Res
     if pixels > MAX_PIXELS {
         return Err(format!("an image of {width} × {height} pixels is too large for PNG, at most {MAX_PIXELS} in all"));
     }
-    let mut decoder = Decoder::new_with_limits(Cursor::new(file), Limits { bytes: 4 * MAX_PIXELS });
-    decoder.set_transformations(Transformations::EXPAND);
+    let decoder = Decoder::new_with_limits(Cursor::new(file), Limits { bytes: 4 * MAX_PIXELS });
     let not_png = |error: png::DecodingError| format!("not a valid PNG file: {error}");
     let mut reader = decoder.read_info().map_err(not_png)?;
     let info = reader.info();

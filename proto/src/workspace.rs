@@ -62,7 +62,7 @@ impl TryFrom<pb::Workspace> for Workspace {
 }
 
 impl Workspace {
-    /// Finds the table in the first of the request's views, if the request asks for it, and sets the pose of the
+    /// Finds the table in the first of the request's views, if `find_table` is set, and sets the pose of the
     /// workspace. The table is at `height` in it, and a workspace without an extent is a cube with this `edge`, metres.
     ///
     /// # Errors
@@ -74,13 +74,15 @@ impl Workspace {
         edge: f64,
     ) -> Result<Option<pb::FoundTable>, FieldError> {
         let is_only = views.len() == 1;
-        match views.first_mut() {
-            Some(first) if self.find_table => {
-                let found = self.find_table_in(first, is_only, height, edge);
-                found.map(Some).map_err(|error| error.inside("views[0]"))
-            }
-            _ => Ok(None),
+        let Some((first, others)) = views.split_first_mut().filter(|_| self.find_table) else { return Ok(None) };
+        let in_task = |view: &pb::DepthView| matches!(view.extrinsics, Some(Extrinsics::CameraFromTask(_)));
+        if let Some(index) = others.iter().position(in_task) {
+            let needed = "must be frame_from_camera with workspace.find_table, which determines the task frame";
+            let error = FieldError::new("extrinsics", "camera_from_task", needed);
+            return Err(error.inside(format_args!("views[{}]", index + 1)));
         }
+        let found = self.find_table_in(first, is_only, height, edge);
+        found.map(Some).map_err(|error| error.inside("views[0]"))
     }
 
     /// Finds the table in a view and sets the pose of the workspace. If it is the only view and has no extrinsics, it
@@ -110,7 +112,7 @@ impl Workspace {
         found.map_err(|error| FieldError::refused("data", error))
     }
 
-    /// Finds the table in the first of the request's point clouds, if the request asks for it, and sets the pose of the
+    /// Finds the table in the first of the request's point clouds, if `find_table` is set, and sets the pose of the
     /// workspace.
     ///
     /// # Errors

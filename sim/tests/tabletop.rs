@@ -113,6 +113,7 @@ fn the_table_is_found_in_point_clouds() {
             let seen = overview(&points, &(cloud_from_camera * Point3::origin())).unwrap();
             let rendered = DepthImage::new(seen.intrinsics, &seen.depth).unwrap();
             let found = Tabletop::find(&rendered, None, TABLE_HEIGHT).unwrap();
+            assert!(found.share <= 1.0, "{}", found.share);
             let true_from_found = task_from_cloud * seen.camera_from_task.inverse() * found.camera_from_task;
             let middle = true_from_found * Point3::new(WORKSPACE_SIZE / 2.0, WORKSPACE_SIZE / 2.0, TABLE_HEIGHT);
             let height = (middle.z - TABLE_HEIGHT).abs();

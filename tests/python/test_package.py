@@ -533,6 +533,17 @@ class RetryTest(unittest.TestCase):
                 self.assertTrue(call.result().grasps)
                 self.assertLess(time.monotonic() - started, 1.5)
 
+    def test_a_client_waits_until_the_server_is_ready(self):
+        with Server() as server:
+            client = self.enterContext(graspd.Client(server.grpc))
+            client.wait_ready(30)
+        with self.assertRaisesRegex(graspd.Unavailable, "not ready within 0.2 s: UNAVAILABLE"):
+            client.wait_ready(0.2)
+        with ThreadPoolExecutor(1) as thread:
+            waiting = thread.submit(client.wait_ready, 60)
+            with Server(listen=server.grpc):
+                waiting.result()
+
     def test_pauses_grow_up_to_the_longest_and_attempts_are_limited(self):
         retry = graspd.Retry(attempts=6, pause=0.1, longest=0.4)
         busy = graspd.ResourceExhausted(grpc.StatusCode.RESOURCE_EXHAUSTED, "busy")
@@ -647,6 +658,7 @@ class AsyncioTest(unittest.IsolatedAsyncioTestCase):
                 self.assertEqual(found.grasps, call(other).grasps)
             self.assertEqual(await self.client.models(), other.models())
         self.assertTrue(await self.client.health())
+        await self.client.wait_ready(30)
 
     async def test_calls_run_concurrently_and_are_retried(self):
         volume = scene.volume(*CAMERAS)

@@ -640,6 +640,8 @@ async fn the_table_is_found_in_the_first_view() {
     let any = FindTable::default();
     refused(&[view(&camera_from_task)], any, "views[0].extrinsics is camera_from_task, must be frame_from_camera")
         .await;
+    let second = [views[0].clone(), view(&camera_from_task)];
+    refused(&second, any, "views[1].extrinsics is camera_from_task, must be frame_from_camera").await;
     let sideways = FindTable { gravity: Some([1.0, 0.0, 0.0]) };
     refused(&views[..1], sideways, "views[0].data: the largest level plane near the middle").await;
     let nowhere = FindTable { gravity: Some([0.0; 3]) };

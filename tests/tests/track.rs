@@ -80,6 +80,11 @@ async fn an_invalid_view_ends_neither_the_stream_nor_the_volume() {
     let reply = replies.into_inner().message().await.unwrap().unwrap();
     let Some(pb::detect_grasps_stream_response::Outcome::Error(error)) = reply.outcome else { panic!("{reply:?}") };
     assert_eq!(error.message, "workspace is absent, must be given in the first request of a stream");
+    let request = pb::TrackGraspsRequest { half_life: Some(10.0), ..Default::default() };
+    let replies = server.raw().await.track_grasps(tokio_stream::iter([request])).await.unwrap();
+    let reply = replies.into_inner().message().await.unwrap().unwrap();
+    let Some(pb::detect_grasps_stream_response::Outcome::Error(error)) = reply.outcome else { panic!("{reply:?}") };
+    assert_eq!(error.message, "half_life is 10, must be absent without a workspace");
 
     let (status, message) = code(client.track(Workspace::default()).await.unwrap().add(&[], low()).await);
     assert_eq!((status, &*message), (Code::InvalidArgument, "views is a list of 0, must have from 1 to 64"));

@@ -296,6 +296,10 @@ async fn a_margin_keeps_grasps_away_from_the_sides() {
         let between = |grasp: &Proposal| (grasp.pose * Point3::from(Vector3::z() * 0.05)).x - 0.11;
         grasps.iter().map(between).fold(f64::INFINITY, f64::min)
     };
+    let small = Workspace { size: Some(0.15), ..workspace };
+    let wide = DetectOptions { margin: Some(0.1), model: "shaf".to_owned(), ..DetectOptions::default() };
+    let message = refusal(client.detect_from_depth(&views, &small, options(wide)).await);
+    assert_eq!(message, "options.margin is 0.1, must be below 0.075 m, half of the cube's edge");
     let (all, inner) = (detect(None).await, detect(Some(0.05)).await);
     assert!(!all.is_empty() && nearest(&all) < 0.05, "{}", nearest(&all));
     assert!(nearest(&inner) >= 0.05, "{}", nearest(&inner));

@@ -15,7 +15,7 @@ use tonic::{Request, Response, Status, Streaming};
 
 use crate::rpc::call::{Call, CallContext, Calls};
 use crate::rpc::pending::{PendingReply, Prepared};
-use crate::serving::cubes::{CubeScene, Cubes, edge};
+use crate::serving::cubes::{CubeScene, Cubes, check_margin, edge};
 use crate::serving::engine::Engine;
 use crate::serving::frame_stamp::FrameStamp;
 use crate::serving::job::EngineError;
@@ -139,6 +139,7 @@ impl GraspRpc {
             blocking(turn, call.deadline, move |_| Ok(Volume::try_from(&volume)?)).await?
         };
         check_voxel_size(&checked, &engine)?;
+        check_margin(params.margin, checked.resolution() as f64 * checked.voxel_size())?;
         let mut params = params.clone();
         if params.margin > 0.0 {
             params.constraints.workspace = Some(checked.within(params.margin));

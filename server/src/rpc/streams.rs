@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use grasp_proto::DetectParams;
 use grasp_proto::pb;
 use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::recording::Request as Recorded;
+use grasp_proto::{DetectParams, FieldError};
 use tokio::sync::mpsc;
 use tokio_stream::StreamExt;
 use tokio_stream::wrappers::ReceiverStream;
@@ -135,6 +135,9 @@ impl GraspRpc {
         };
         let engine = self.models.select(&params.model, &params.version, None)?;
         call.set_model(&engine);
+        if let (None, Some(half_life)) = (&workspace, half_life) {
+            return Err(FieldError::new("half_life", half_life, "must be absent without a workspace").into());
+        }
         let start = workspace.map(|workspace| Start::checked(workspace, half_life)).transpose()?;
         let turn = self.conversion(&engine, call.ticket(params.priority)).await?;
         if let Some(start) = &start {

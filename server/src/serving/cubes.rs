@@ -89,8 +89,9 @@ impl Cubes {
         let Workspace { frame_from_task, size, extent, .. } = *workspace;
         // Checks the size of the request.
         FusionGrid::of(source, &frame_from_task, size, &[])?;
-        let Some(extent) = extent else { return Ok(1) };
-        let (edge, margin) = (edge(source, size), margin.max(Tile::MARGIN));
+        let edge = edge(source, size);
+        let Some(extent) = extent else { return check_margin(margin, edge).map(|()| 1) };
+        let margin = margin.max(Tile::MARGIN);
         if edge <= 2.0 * margin {
             let value = format_args!("given, for cubes with an edge of {edge} m");
             let needed =
@@ -145,13 +146,14 @@ impl Cubes {
         let started = Instant::now();
         params.check_objects(observation.is_labelled())?;
         let (depth_factors, mut warnings) = self.correct_depth_scale(&mut observation, params.table)?;
-        let points = self.integrate(&observation, &mut warnings, is_wanted)?;
+        // Before the views are added, because a tracked volume keeps them.
         let objects = observation.objects(&self.frame_from_task, &params.objects)?;
+        let points = self.integrate(&observation, &mut warnings, is_wanted)?;
         let scenes = self.scenes(points, objects.as_ref(), params)?;
         Ok((scenes, Observed { fusion: Some(started.elapsed()), warnings, table: found, depth_factors }))
     }
 
-    /// Corrects the scale of the depths if the workspace asks for it, so that the table is at the height `table`, metres.
+    /// Corrects the scale of the depths if `correct_depth_scale` is set, so that the table is at the height `table`, metres.
     /// Returns the factor of each view, and warnings.
     fn correct_depth_scale(
         &self,
@@ -276,6 +278,18 @@ impl Cube {
         let frame = *frame_from_task;
         Some(Region { frame, lower: [lower[0], lower[1], 0.0], upper: [upper[0], upper[1], size] })
     }
+}
+
+/// Checks that a margin leaves space for grasps in a cube with this edge, metres.
+pub(crate) fn check_margin(margin: f64, edge: f64) -> Result<(), FieldError> {
+    if 2.0 * margin < edge {
+        return Ok(());
+    }
+    Err(FieldError::new(
+        "options.margin",
+        margin,
+        format_args!("must be below {} m, half of the cube's edge", edge / 2.0),
+    ))
 }
 
 /// Edge of a cube, metres: that of the request, or the planner's.

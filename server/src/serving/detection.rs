@@ -80,7 +80,7 @@ impl Detection {
         };
         grasps.truncate(params.max_grasps);
         let over_limit = found - grasps.len();
-        let obstacles = obstacles(&volume, params);
+        let obstacles = if grasps.is_empty() { None } else { obstacles(&volume, params) };
         let detected = |grasp: Grasp| Detected {
             collides: obstacles
                 .as_ref()
@@ -91,7 +91,8 @@ impl Detection {
             grasp,
         };
         let grasps = grasps.into_iter().map(detected).collect();
-        Self { grasps, dropped, over_limit, volumes: vec![volume] }
+        // The volume is kept for the page, which shows only its surface.
+        Self { grasps, dropped, over_limit, volumes: vec![volume.with_objects(None)] }
     }
 
     /// The grasps of all cubes of a workspace. `threshold` is the smallest quality without `force`.

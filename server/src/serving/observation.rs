@@ -35,7 +35,7 @@ pub(crate) struct Observed {
 const SAMPLES: usize = 100_000;
 
 impl Observation {
-    /// Depth images. If the workspace asks for it, its pose is determined from the table in the first of them, with the
+    /// Depth images. If `find_table` is set, its pose is determined from the table in the first of them, with the
     /// table at the height `table` in cubes with this edge, metres.
     pub fn of_depth(
         views: &mut [pb::DepthView],

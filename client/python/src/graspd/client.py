@@ -15,11 +15,12 @@ from graspd import grasp_pb2 as pb
 from graspd import methods, wire
 from graspd.connection import ChannelOptions, Connection
 from graspd.detection import Detection, FoundTable, Model, Scores
-from graspd.errors import Error, from_status
+from graspd.errors import DeadlineExceeded, Error, Unavailable, from_status
 from graspd.geometry import PoseLike
 from graspd.methods import Answer, Method, Request, Response
 from graspd.options import Candidate, Options
 from graspd.seen import CloudView, DepthView, Volume, Workspace
+from graspd.retry import Waiting
 from graspd.streams import Adding, Detecting
 
 if TYPE_CHECKING:
@@ -125,7 +126,7 @@ class Client(Connection[grpc.Channel]):
         request_id: str = "",
     ) -> FoundTable:
         """Finds the table in a depth image or a point cloud, and the workspace over what stands on it. Of `workspace`
-        only `gravity`, `extent`, `frame_id` and `stamp` are used. `table_height` is the height of the table above the
+        only `size`, `extent`, `gravity`, `frame_id` and `stamp` are used. `table_height` is the height of the table above the
         bottom of the workspace, metres; None: 0.05."""
         return self._call(methods.FIND_TABLE, wire.table_request(view, workspace, table_height, request_id))
 
@@ -136,6 +137,19 @@ class Client(Connection[grpc.Channel]):
     def health(self) -> bool:
         """Whether the server is ready; False while it is warming up or shutting down."""
         return self._call(methods.CHECK, HealthCheckRequest())
+
+    def wait_ready(self, timeout: float) -> None:
+        """Waits until the server is reachable and ready, for at most `timeout` seconds.
+
+        Raises `Unavailable` with the last failure."""
+        waiting = Waiting(timeout)
+        while True:
+            try:
+                if self.health():
+                    return
+            except (Unavailable, DeadlineExceeded) as failure:
+                waiting.failed(failure)
+            time.sleep(waiting.pause())
 
     def _open(
         self, target: str, credentials: grpc.ChannelCredentials | None, options: ChannelOptions

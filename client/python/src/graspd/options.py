@@ -58,7 +58,7 @@ class CollisionCheck:
     clearance: float | None = None
     """Smallest distance between the hand and the obstacles, metres; None: 0."""
     hidden: bool = False
-    """Also treat as an obstacle what lies behind a surface in every view. Other unobserved space counts as free. Needs
+    """Also treat as an obstacle what lies behind a surface in a view and was measured by none. Other unobserved space counts as free. Needs
     depth images or point clouds."""
 
 

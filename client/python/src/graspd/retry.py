@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import random
+import time
 from dataclasses import dataclass
 from typing import ClassVar
+
+from grpc import StatusCode
 
 from graspd.errors import Error, ResourceExhausted, Unavailable
 
@@ -38,3 +41,26 @@ class Retry:
 
 Retry.NONE = Retry(attempts=1, pause=0.0, longest=0.0)
 Retry.RECOMMENDED = Retry(attempts=6, pause=0.02, longest=0.5)
+
+
+class Waiting:
+    """Waits for a server that is not ready yet."""
+
+    PAUSE: ClassVar[float] = 0.05
+
+    def __init__(self, timeout: float) -> None:
+        self._timeout = timeout
+        self._end = time.monotonic() + timeout
+        self._last = "its health status is NOT_SERVING"
+
+    def failed(self, failure: Error) -> None:
+        """Notes why the server did not answer."""
+        self._last = str(failure)
+
+    def pause(self) -> float:
+        """The pause before the next attempt, seconds. Raises after the timeout."""
+        if time.monotonic() >= self._end:
+            raise Unavailable(
+                StatusCode.UNAVAILABLE, f"the server was not ready within {self._timeout} s: {self._last}"
+            )
+        return self.PAUSE

@@ -6,10 +6,12 @@ import logging
 import struct
 import zlib
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from google.protobuf.timestamp_pb2 import Timestamp
+from grpc import StatusCode
 from grpc_health.v1.health_pb2 import HealthCheckResponse
 from numpy.typing import DTypeLike, NDArray
 
@@ -136,7 +138,8 @@ def table_request(
         request_id=request_id,
         view=None if isinstance(view, CloudView) else depth_message(view),
         cloud=cloud_message(view) if isinstance(view, CloudView) else None,
-        workspace=workspace_message(workspace),
+        # The server refuses both with a search.
+        workspace=workspace_message(replace(workspace, pose=None, correct_depth_scale=False)),
         table_height=table_height,
     )
 
@@ -402,7 +405,7 @@ def found_table(message: pb.FindTableResponse) -> FoundTable:
 
 def table(message: pb.FoundTable) -> FoundTable:
     return FoundTable(
-        workspace=pose(message.workspace),
+        workspace=pose(message, "workspace"),
         distance=message.distance,
         angle=message.angle,
         share=message.share,
@@ -426,19 +429,27 @@ def warning(message: pb.GeometryWarning) -> GeometryWarning:
 
 def grasp(message: pb.Grasp) -> Grasp:
     return Grasp(
-        pose=pose(message.pose),
+        pose=pose(message, "pose"),
         width=message.width,
         quality=message.quality,
-        pregrasp=pose(message.pregrasp),
-        retreat=pose(message.retreat),
+        pregrasp=pose(message, "pregrasp"),
+        retreat=pose(message, "retreat"),
         collides=message.collides if message.HasField("collides") else None,
         object=message.object if message.HasField("object") else None,
         open_width=message.open_width if message.HasField("open_width") else None,
     )
 
 
-def pose(message: pb.Pose) -> Pose:
-    p, q = message.position, message.orientation
+def pose(message: Any, field: str) -> Pose:
+    # Not the identity: a robot would move there.
+    if not message.HasField(field):
+        name = message.DESCRIPTOR.name
+        raise errors.make(
+            StatusCode.INTERNAL,
+            f"invalid reply: {name}.{field} is absent; check that client and server have the same version",
+        )
+    found: pb.Pose = getattr(message, field)
+    p, q = found.position, found.orientation
     return Pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
 
 

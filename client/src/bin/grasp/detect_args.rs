@@ -82,7 +82,8 @@ pub(crate) struct DetectArgs {
     #[arg(long, value_name = "METRES")]
     clearance: Option<f64>,
 
-    /// In the collision check, also treat as an obstacle what lies behind a surface in every view.
+    /// In the collision check, also treat as an obstacle what lies behind a surface in a view and was measured
+    /// by none.
     #[arg(long)]
     hidden: bool,
 
@@ -147,6 +148,10 @@ impl DetectArgs {
         ensure!(
             self.parent_from_grasp.is_none() || self.origin == Origin::Parent,
             "--parent-from-grasp needs --origin parent"
+        );
+        ensure!(
+            !matches!(self.collision, Collision::Off) || self.clearance.is_none() && !self.hidden,
+            "--clearance and --hidden need --collision flag or --collision filter"
         );
         let parent_from_grasp = self.parent_from_grasp.as_ref().map(Poses::one).transpose()?;
         let vector = |[x, y, z]: [f64; 3]| Some(pb::Vector3 { x, y, z });

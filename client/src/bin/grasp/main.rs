@@ -32,6 +32,7 @@ use grasp_client::{
     load,
 };
 use indicatif::{ProgressBar, ProgressStyle};
+use serde_json::json;
 use tonic::Code;
 
 use crate::detect_args::DetectArgs;
@@ -158,7 +159,8 @@ struct Score {
     #[command(flatten)]
     detect: DetectArgs,
 
-    /// T_frame_grasp of each grasp, in the convention of --origin and --closing. Formats as for --camera-from-task.
+    /// T_frame_grasp of each grasp, in the convention of --origin and --closing. Formats as for --camera-from-task, and the
+    /// output of `grasp detect --json`. JSON objects may have a `width`, metres, which is checked too.
     #[arg(long, value_name = "FILE|NUMBERS", allow_hyphen_values = true)]
     grasps: Poses,
 }
@@ -268,8 +270,11 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             let client = connect().await?;
             let stamps = || args.files().map(|path| fs::metadata(path)?.modified()).collect::<io::Result<Vec<_>>>();
             let (mut seen, mut answers) = (None, 0);
+            // A missing file is not an error: it may be written later.
+            if let Some(missing) = args.files().find(|path| !path.exists()) {
+                eprintln!("grasp: {} not found; waiting for it", missing.display());
+            }
             while count.is_none_or(|count| answers < count) {
-                // A missing file is not an error: it may be written later.
                 let now = stamps().ok();
                 if now.is_some() && now != seen {
                     let answer = async {
@@ -292,13 +297,14 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             }
         }
         Command::Score(Score { scene: args, detect, grasps }) => {
-            let (scene, detect, grasps) = (args.read()?, detect.read()?, grasps.all()?);
+            let (scene, detect, grasps) = (args.read()?, detect.read()?, grasps.candidates()?);
             let scores = scene.score(&connect().await?, &grasps, options(&args, detect)).await?;
             show::print(&if json { show::scores_json(&scores) } else { show::scores(&scores) })?;
         }
         Command::View(View { scene: args, detect, view }) => {
             // The drawing needs the finger base frame, so that --origin and --closing do not apply.
             let (scene, detect) = (args.read()?, DetectOptions { convention: None, ..detect.read()? });
+            view.check(&scene)?;
             let table = detect.collision.and_then(|collision| collision.table_height);
             let depth = detect.gripper.as_ref().map(|gripper| gripper.finger_depth);
             let detection = scene.detect(&connect().await?, options(&args, detect)).await?;
@@ -306,7 +312,12 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
                 Some(path) => path,
                 None => view.write(&scene.volume(&detection)?, table, depth, &detection)?,
             };
-            show::print(&format!("{} grasps in {}", detection.grasps.len(), path.display()))?;
+            let grasps = detection.grasps.len();
+            show::print(&if json {
+                json!({ "grasps": grasps, "file": path }).to_string()
+            } else {
+                format!("{grasps} grasps in {}", path.display())
+            })?;
         }
         Command::Bench(Bench { scene: args, detect, callers, rate, seconds }) => {
             let scene = Arc::new(args.read()?);

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use anyhow::{Context, anyhow, bail, ensure};
+use grasp_client::Candidate;
 use nalgebra::{Isometry3, Matrix3, Matrix4, Quaternion, Rotation3, Translation3, UnitQuaternion, Vector3};
 use serde_json::Value;
 
@@ -58,11 +59,11 @@ impl Poses {
         }
     }
 
-    /// All poses.
-    pub fn all(&self) -> anyhow::Result<Vec<Isometry3<f64>>> {
+    /// All poses as grasps, each with its `width` if the file has one. The file may be the output of `grasp detect --json`.
+    pub fn candidates(&self) -> anyhow::Result<Vec<Candidate>> {
         match self {
-            Self::Numbers(pose) => Ok(vec![*pose]),
-            Self::File(path) => in_file(path, poses),
+            Self::Numbers(pose) => Ok(vec![Candidate::from(*pose)]),
+            Self::File(path) => in_file(path, candidates),
         }
     }
 
@@ -190,6 +191,24 @@ fn poses(path: &Path) -> anyhow::Result<Vec<Isometry3<f64>>> {
     }
 }
 
+fn candidates(path: &Path) -> anyhow::Result<Vec<Candidate>> {
+    if has_extension(path, "npy") {
+        return Ok(poses(path)?.into_iter().map(Candidate::from).collect());
+    }
+    let value = json(path)?;
+    let candidate = |value: &Value| {
+        let pose = named(value)?;
+        let width = value.get("width").filter(|width| !width.is_null());
+        let width = width.map(|width| width.as_f64().with_context(|| format!("`width` is {width}, must be a number")));
+        Ok(Candidate { pose, width: width.transpose()? })
+    };
+    match value.get("grasps").unwrap_or(&value) {
+        value @ Value::Object(_) => Ok(vec![candidate(value)?]),
+        Value::Array(values) if values.iter().all(Value::is_object) => values.iter().map(candidate).collect(),
+        value => Ok(matrices(&flat(value))?.into_iter().map(Candidate::from).collect()),
+    }
+}
+
 fn named(value: &Value) -> anyhow::Result<Isometry3<f64>> {
     let part = |key: &str| value.get(key).map(flat).unwrap_or_default();
     // `grasp detect --json` writes `orientation_xyzw`.
@@ -283,6 +302,29 @@ mod tests {
             assert!(error.starts_with(&format!("`{key}`: the norm of the quaternion is 2")), "{error}");
         }
         assert!(named(&serde_json::json!({ "position": [1, 2, 3] })).is_err());
+    }
+
+    #[test]
+    fn grasps_have_a_width_if_the_file_has_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("grasps.json");
+        let read = |text: &str| {
+            std::fs::write(&path, text).unwrap();
+            let found = Poses::File(path.clone()).candidates()?;
+            anyhow::Ok(found.into_iter().map(|candidate| candidate.width).collect::<Vec<_>>())
+        };
+        let with = r#"{"position": [1, 2, 3], "orientation_xyzw": [0, 0, 0, 1], "width": 0.04}"#;
+        let without = r#"{"position": [1, 2, 3], "orientation_xyzw": [0, 0, 0, 1], "width": null}"#;
+        assert_eq!(read(with).unwrap(), [Some(0.04)]);
+        assert_eq!(read(&format!("[{with}, {without}]")).unwrap(), [Some(0.04), None]);
+        assert_eq!(
+            read(&format!(r#"{{"model": "graspd", "grasps": [{without}, {with}]}}"#)).unwrap(),
+            [None, Some(0.04)]
+        );
+        assert_eq!(read(r#"{"grasps": []}"#).unwrap(), []);
+        assert_eq!(read("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]").unwrap(), [None]);
+        let error = format!("{:#}", read(&with.replace("0.04", r#""wide""#)).unwrap_err());
+        assert!(error.contains(r#"`width` is "wide""#), "{error}");
     }
 
     #[test]

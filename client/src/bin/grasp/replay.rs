@@ -4,7 +4,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use clap::Args;
 use grasp_client::pb::recording::Answer;
 use grasp_client::pb::{DetectGraspsResponse, Recording, ScoreGraspsResponse};
@@ -20,6 +20,9 @@ const EXTENSION: &str = "recording";
 
 /// Codes that say nothing about a request.
 const OVERLOAD: [Code; 4] = [Code::ResourceExhausted, Code::Unavailable, Code::DeadlineExceeded, Code::Cancelled];
+
+/// After this many requests in a row for which the server was not available, the replay ends.
+const MAX_UNAVAILABLE: u64 = 3;
 
 #[derive(Args)]
 pub(crate) struct Replay {
@@ -51,7 +54,7 @@ enum Outcome {
     /// The recorded answer says nothing about the request, or the server has deleted the recording.
     Skipped,
     /// The server is overloaded or not ready.
-    Unanswered(String),
+    Unanswered(Error),
 }
 
 /// Seconds of the inference, recorded and now.
@@ -63,8 +66,12 @@ impl Replay {
         let files = files(&self.recordings)?;
         let (mut same, mut skipped, mut unanswered, mut changes) = (0, 0, 0, Vec::new());
         let (mut before, mut now) = (Vec::new(), Vec::new());
+        let mut unavailable = 0;
         for file in &files {
             let (outcome, inference) = self.repeat(client, file).await.with_context(|| file.display().to_string())?;
+            if !matches!(outcome, Outcome::Unanswered(_)) {
+                unavailable = 0;
+            }
             if let Some((recorded, repeated)) = inference {
                 before.push(recorded);
                 now.push(repeated);
@@ -72,9 +79,14 @@ impl Replay {
             match outcome {
                 Outcome::Same => same += 1,
                 Outcome::Skipped => skipped += 1,
-                Outcome::Unanswered(reason) => {
+                Outcome::Unanswered(error) => {
                     unanswered += 1;
-                    eprintln!("grasp: {}: {reason}", file.display());
+                    eprintln!("grasp: {}: {error}", file.display());
+                    unavailable = if error.code() == Some(Code::Unavailable) { unavailable + 1 } else { 0 };
+                    ensure!(
+                        unavailable < MAX_UNAVAILABLE,
+                        "the server was not available for {unavailable} requests in a row"
+                    );
                 }
                 Outcome::Changed(what) => {
                     let name = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -127,10 +139,8 @@ impl Replay {
         }
         let repeated = match client.replay(request, self.model.as_deref()).await {
             Ok(repeated) => Ok(repeated),
-            // The server cannot be asked at all.
-            Err(error @ Error::Connect { .. }) => return Err(error.into()),
             Err(error) if error.code().is_some_and(|code| OVERLOAD.contains(&code)) => {
-                return Ok((Outcome::Unanswered(error.to_string()), None));
+                return Ok((Outcome::Unanswered(error), None));
             }
             Err(error) => Err(error),
         };

@@ -4,8 +4,8 @@ use anyhow::{Context, bail, ensure};
 use clap::Args;
 use grasp::{DepthImage, Fusion, RESOLUTION, View, Volume, WORKSPACE_SIZE, overview, seen_from};
 use grasp_client::{
-    Client, CloudView, Depth, DepthView, Detection, Error, Extrinsics, FindTable, Observation, Options, Scores,
-    Workspace,
+    Candidate, Client, CloudView, Depth, DepthView, Detection, Error, Extrinsics, FindTable, Observation, Options,
+    Scores, Workspace,
 };
 use grasp_proto::Points;
 use nalgebra::Isometry3;
@@ -232,18 +232,13 @@ impl Scene {
     }
 
     /// Scores grasps in the observation.
-    pub async fn score(
-        &self,
-        client: &Client,
-        candidates: &[Isometry3<f64>],
-        options: Options,
-    ) -> Result<Scores, Error> {
+    pub async fn score(&self, client: &Client, candidates: &[Candidate], options: Options) -> Result<Scores, Error> {
         let observation = match self {
             Self::Volume(volume) => Observation::Volume(volume),
             Self::Depth(views, workspace) => Observation::Depth(views, workspace),
             Self::Clouds(views, workspace) => Observation::Clouds(views, workspace),
         };
-        client.score(observation, candidates, options).await
+        client.score_candidates(observation, candidates, options).await
     }
 
     /// The volume to draw: the given one, or the fused images or points, with depths corrected as in the server.

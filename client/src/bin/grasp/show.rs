@@ -3,6 +3,8 @@ use std::time::Duration;
 
 use anyhow::Context;
 use comfy_table::{Cell, CellAlignment, Table, presets};
+use grasp_client::pb::geometry_warning;
+use grasp_client::pb::score::Violation;
 use grasp_client::{Detection, Dropped, FoundTable, GeometryWarning, Latency, Model, Report, Score, Scores};
 use nalgebra::Isometry3;
 use serde_json::{Value, json};
@@ -136,10 +138,12 @@ pub(crate) fn scores_json(scores: &Scores) -> String {
 
 /// The names of the violations of a score.
 fn violations(score: &Score) -> Vec<String> {
-    let name = |violation: grasp_client::pb::score::Violation| {
-        violation.as_str_name().trim_start_matches("VIOLATION_").to_lowercase()
+    // A newer server may know more of them.
+    let name = |&number: &i32| match Violation::try_from(number) {
+        Ok(violation) => violation.as_str_name().trim_start_matches("VIOLATION_").to_lowercase(),
+        Err(_) => number.to_string(),
     };
-    score.violations().map(name).collect()
+    score.violations.iter().map(name).collect()
 }
 
 fn table_json(table: &FoundTable) -> Value {
@@ -163,8 +167,11 @@ fn warning_json(warning: &GeometryWarning) -> Value {
     })
 }
 
-fn warning_code(warning: &GeometryWarning) -> &'static str {
-    warning.code().as_str_name().trim_start_matches("CODE_")
+fn warning_code(warning: &GeometryWarning) -> String {
+    match geometry_warning::Code::try_from(warning.code) {
+        Ok(code) => code.as_str_name().trim_start_matches("CODE_").to_owned(),
+        Err(_) => warning.code.to_string(),
+    }
 }
 
 fn pose(pose: &Isometry3<f64>) -> Value {

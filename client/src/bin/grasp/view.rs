@@ -1,6 +1,6 @@
 use std::path::{Path, PathBuf};
 
-use anyhow::bail;
+use anyhow::{bail, ensure};
 use clap::Args;
 use grasp::{FINGER_DEPTH, Fusion, SurfaceMesh, SurfacePoint, Volume};
 use grasp_client::Detection;
@@ -40,6 +40,18 @@ pub(crate) struct ViewArgs {
 }
 
 impl ViewArgs {
+    /// Checks the output file and the kind of the observation, before the server is asked.
+    pub fn check(&self, scene: &Scene) -> anyhow::Result<()> {
+        let extension = self.out.extension().and_then(|extension| extension.to_str());
+        match (&self.color, extension) {
+            (_, Some("png")) | (None, Some("mcap")) => {}
+            (Some(_), _) => bail!("--out {}: the extension must be .png with --color", self.out.display()),
+            (None, _) => bail!("--out {}: the extension must be .png or .mcap", self.out.display()),
+        }
+        ensure!(self.color.is_none() || matches!(scene, Scene::Depth(..)), "--color needs depth images");
+        Ok(())
+    }
+
     /// Draws the grasps over the colour image, if one is given. Returns the path of the picture.
     pub fn write_over_color(
         &self,
@@ -65,10 +77,10 @@ impl ViewArgs {
     ) -> anyhow::Result<&Path> {
         let field = Fusion::of(volume);
         let (table, depth) = (table.unwrap_or(TABLE_HEIGHT), depth.unwrap_or(FINGER_DEPTH));
-        match self.out.extension().and_then(|extension| extension.to_str()) {
-            Some("png") => draw(volume, field.mesh(), table, depth, detection).save(&self.out)?,
-            Some("mcap") => record::write(&self.out, &placed(&field.surface(), volume.pose()), depth, detection)?,
-            _ => bail!("--out {}: the extension must be .png or .mcap", self.out.display()),
+        if self.out.extension().is_some_and(|extension| extension == "mcap") {
+            record::write(&self.out, &placed(&field.surface(), volume.pose()), depth, detection)?;
+        } else {
+            draw(volume, field.mesh(), table, depth, detection).save(&self.out)?;
         }
         Ok(&self.out)
     }
