@@ -311,8 +311,8 @@ impl Client {
         Ok(Tracking { requests, replies, unanswered: 0, workspace: Some(workspace), half_life: None })
     }
 
-    /// Opens a tracked volume for a scene that moves: in each voxel the weight of a measurement halves with every
-    /// `half_life` further ones, and with every one that contradicts it. 10 suits most scenes.
+    /// Opens a tracked volume for a scene that moves: in each voxel the weight of a measurement halves after
+    /// `half_life` further measurements, and with each one that contradicts it. 10 suits most scenes.
     ///
     /// # Errors
     /// [`Error::Refused`] when the server's limit of tracked volumes is reached.

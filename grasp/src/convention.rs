@@ -30,7 +30,7 @@ pub enum ClosingAxis {
     /// ±y, as in VGN's code and in this crate.
     #[default]
     Y,
-    /// ±x, as in GraspNet and Isaac.
+    /// ±x, as in GraspNet and GraspGen.
     X,
 }
 

@@ -97,8 +97,8 @@ class Client(Connection[grpc.Channel]):
 
     def track(self, workspace: Workspace = Workspace(), *, half_life: float | None = None) -> Tracking:
         """Opens a tracked volume for a moving camera. For a scene that moves: with `half_life` the weight of a measurement
-        halves with every so many further ones, and with every one that contradicts it; 10 suits most scenes. None: all
-        views have the same weight."""
+        halves after `half_life` further measurements, and with each one that contradicts it; 10 suits most scenes.
+        None: all views have the same weight."""
         return Tracking(lambda requests: self._stream(methods.TRACK, requests), workspace, half_life)
 
     def score(
