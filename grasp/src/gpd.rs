@@ -33,8 +33,8 @@ pub fn is_on_an_object(position: &Point3<f64>, size: f64, table: f64) -> bool {
     inner.contains(&position.x) && inner.contains(&position.y) && (table + SKIN..=size).contains(&position.z)
 }
 
-/// The candidates as grasps, best first. A score is the logit of success minus the logit of failure; the quality is its
-/// sigmoid, the probability of success.
+/// The candidates as grasps, best first. A score is the calibrated log-odds of success; the quality is its sigmoid, the
+/// probability of success.
 #[must_use]
 pub fn scored(candidates: &[Candidate], scores: &[f32]) -> Vec<Grasp> {
     let grasp = |(candidate, &score): (&Candidate, &f32)| Grasp {
