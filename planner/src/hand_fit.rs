@@ -41,8 +41,8 @@ impl HandFit {
     pub fn params(hand: Hand, table: f64) -> Params {
         let aperture = APERTURE_MARGIN..=(2.0 * hand.half_opening() - APERTURE_MARGIN);
         let of_gpd = Params::above(table + TABLE_CLEARANCE);
-        // Fingers may be shorter than GPD's.
-        let bite = of_gpd.bite.min(hand.depth);
+        // Fingers may be shorter than GPD's, and the palm must not touch the object.
+        let bite = of_gpd.bite.min(hand.depth / 2.0);
         Params { hand, aperture, bite, ..of_gpd }
     }
 

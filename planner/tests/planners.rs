@@ -164,7 +164,7 @@ fn classifiers_run_beside_int8_networks() {
 
 #[test]
 fn fingers_shorter_than_the_first_bite_of_gpd_find_grasps() {
-    let hand = Hand { depth: 0.008, ..Hand::GPD };
+    let hand = Hand { depth: 0.009, ..Hand::GPD };
     let decode = DecodeParams { hand: Some(hand), ..Shaf::decode_params() };
     assert!(!plan(&mut Shaf, &scene(Isometry3::identity()), decode).grasps.is_empty());
 }
