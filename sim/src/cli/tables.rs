@@ -447,8 +447,8 @@ impl Tables {
              \x20 These transformers have 3.0 M parameters, the paper's has 87 M; our network of that size is not in these tables\n\
              \x20 ([card](../models/large/transformer.md)). VGN-R: VGN's released weights. graspd: the evaluator with the grasps of\n\
              \x20 `vgn-packed`, in both scenarios.\n\
-             - Times: {}, ONNX Runtime's CPU provider, one observation at a time. The paper's times are for an\n\
-             \x20 RTX 3090.\n\
+             - Times: {}, one thread of ONNX Runtime's CPU provider in fp32, one observation\n\
+             \x20 at a time. The paper's times are for an RTX 3090.\n\
              - Simulator and decoding {}.{pybullet}\n\n",
             self.rounds,
             machine(),
