@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use grasp::VoxelOrigin;
 use grasp_data::{Dataset, Setup, Trial, packed};
 use grasp_models::onnx::ModelProto;
-use grasp_models::{Architecture, Metadata, Network, Options, Orientation};
+use grasp_models::{Architecture, Metadata, Options, Orientation};
 use grasp_train::{
     Augmentation, Checkpoint, CheckpointError, EpochOutcome, EpochRecord, ExecutionOptions, Executor, LossWeights,
     NetworkOutputs, QualityTarget, Targets, Teacher, TrainError, Trainer, TrainingSettings,
