@@ -1,5 +1,6 @@
 mod fingerprint;
 mod log;
+mod machine;
 mod pybullet;
 
 use std::fs;
@@ -24,6 +25,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::{Scene, parse_views};
 use fingerprint::{decoding, digest, hash, hash_folder, simulator};
 use log::{Log, Measurement};
+use machine::machine;
 use pybullet::{FOLDER, PyBullet, model};
 
 /// Measures the paper's tables and writes them with the published figures. Each benchmark run is stored in --results
@@ -478,22 +480,6 @@ fn thousands(number: &str) -> String {
         .filter(|place| (number.len() - place).is_multiple_of(3))
         .for_each(|place| text.insert(place, ','));
     text
-}
-
-/// The processor and its number of cores. Names of processors in virtual machines are short, so family and model follow.
-fn machine() -> String {
-    let text = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let value = |key: &str| {
-        let mut pairs = text.lines().filter_map(|line| line.split_once(':'));
-        pairs.find_map(|(name, value)| (name.trim() == key).then(|| value.trim().to_owned()))
-    };
-    let cores = std::thread::available_parallelism().map_or(1, |n| n.get());
-    match [value("model name"), value("cpu family"), value("model")] {
-        [Some(name), Some(family), Some(model)] => {
-            format!("{name} (family {family}, model {model}) with {cores} cores")
-        }
-        [name, ..] => format!("{} with {cores} cores", name.as_deref().unwrap_or("unknown processor")),
-    }
 }
 
 #[cfg(test)]
