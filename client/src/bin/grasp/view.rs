@@ -40,7 +40,7 @@ pub(crate) struct ViewArgs {
 }
 
 impl ViewArgs {
-    /// Checks the output file and the kind of the observation, before the server is asked.
+    /// Checks the output file and the kind of the observation, before the request is sent.
     pub fn check(&self, scene: &Scene) -> anyhow::Result<()> {
         let extension = self.out.extension().and_then(|extension| extension.to_str());
         match (&self.color, extension) {
