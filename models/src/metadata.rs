@@ -43,6 +43,12 @@ pub enum MetadataError {
         /// Valid values.
         expected: &'static str,
     },
+    /// A property is not known. Ignoring a misspelt one would change the grasps.
+    #[error(
+        "the model's property `graspd.{0}` is not known; the properties are name, version, resolution, voxel_size, \
+         value_convention, voxel_origin, camera_azimuth, network, calibration and provenance.…"
+    )]
+    Unknown(String),
     /// The resolution, from the property or from the shape of the input, is out of range.
     #[error(
         "the model's resolution is {0}, must be from 1 to {max}; export it for a volume of at most {max}³ voxels",
@@ -92,6 +98,7 @@ impl Metadata {
         defaults: Self,
     ) -> Result<Self, MetadataError> {
         let mut metadata = Self { resolution: check_resolution(defaults.resolution)?, ..defaults };
+        let mut voxel_size = None;
         for (key, value) in properties {
             let Some(key) = key.strip_prefix(PREFIX) else { continue };
             match key {
@@ -103,7 +110,7 @@ impl Metadata {
                 }
                 "voxel_size" => {
                     let valid = |&size: &f64| size.is_finite() && size > 0.0;
-                    metadata.voxel_size = parse("voxel_size", &value, "a number of metres above 0", valid)?;
+                    voxel_size = Some(parse("voxel_size", &value, "a number of metres above 0", valid)?);
                 }
                 // Only VGN's convention is supported: (tsdf + 1) / 2 near an observed surface, 0 elsewhere.
                 "value_convention" if value == "vgn" => {}
@@ -132,13 +139,13 @@ impl Metadata {
                         return Err(MetadataError::Property { key: "calibration", value, expected });
                     }
                 }
-                _ => {
-                    if let Some(key) = key.strip_prefix(PROVENANCE) {
-                        metadata.provenance.insert(key.to_owned(), value);
-                    }
-                }
+                _ => match key.strip_prefix(PROVENANCE) {
+                    Some(key) => _ = metadata.provenance.insert(key.to_owned(), value),
+                    None => return Err(MetadataError::Unknown(on_one_line(key))),
+                },
             }
         }
+        metadata.voxel_size = voxel_size.unwrap_or(WORKSPACE_SIZE / metadata.resolution as f64);
         Ok(metadata)
     }
 
@@ -185,11 +192,16 @@ fn fixed_resolution(input: &ValueInfoProto) -> Option<usize> {
 /// Names and versions are labels of metrics and parts of log lines, so their length and characters are limited.
 fn printable(key: &'static str, value: String) -> Result<String, MetadataError> {
     let is_printable = |character: char| !character.is_control() && !character.is_whitespace() || character == ' ';
-    if value.len() <= MAX_NAME && value.chars().all(is_printable) {
+    if (1..=MAX_NAME).contains(&value.len()) && value.chars().all(is_printable) {
         return Ok(value);
     }
-    let value = format!("{}…", value.chars().take(20).collect::<String>().escape_debug());
-    Err(MetadataError::Property { key, value, expected: "at most 128 bytes of printable characters" })
+    Err(MetadataError::Property { key, value: on_one_line(&value), expected: "1 to 128 bytes of printable characters" })
+}
+
+/// The beginning of a text, for error messages.
+fn on_one_line(text: &str) -> String {
+    let start: String = text.chars().take(20).collect();
+    format!("{}{}", start.escape_debug(), if start.len() < text.len() { "…" } else { "" })
 }
 
 /// Checked when the file is read, so that a server does not start with a network that no request can use.

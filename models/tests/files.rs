@@ -4,8 +4,8 @@ use std::fs;
 use std::path::Path;
 
 use grasp::VoxelOrigin;
-use grasp_models::onnx::{Dimension, ModelProto, ValueInfoProto};
-use grasp_models::{Architecture, Metadata, Store, StoreError};
+use grasp_models::onnx::{Dimension, ModelProto, StringStringEntryProto, ValueInfoProto};
+use grasp_models::{Architecture, INPUT, Metadata, Store, StoreError};
 
 fn vgn() -> ModelProto {
     Architecture::Vgn.build(8, 0).unwrap()
@@ -52,6 +52,13 @@ fn a_file_without_metadata_follows_vgns_conventions() {
     assert_eq!((read.name.as_str(), read.version.as_str()), ("vgn_pile", "1"));
     assert_eq!(read.voxel_origin, VoxelOrigin::Corner);
     assert_eq!(Metadata::defaults(Path::new("x.onnx"), None).resolution, 40);
+    // The input's N is dynamic, so that it is in a property only.
+    let mut model = Architecture::Vgn.build(80, 0).unwrap();
+    model.metadata_props.retain(|property| property.key() == "graspd.resolution");
+    let input = &mut model.graph.as_mut().unwrap().input[0];
+    *input = ValueInfoProto::tensor(INPUT, ["batch", "channels", "x", "y", "z"].map(Dimension::named).to_vec());
+    let read = Metadata::of(&model, Path::new("x.onnx")).unwrap();
+    assert_eq!((read.resolution, read.voxel_size), (80, 0.3 / 80.0));
 }
 
 #[test]
@@ -70,6 +77,18 @@ fn invalid_metadata_is_an_error_that_names_the_property() {
         let error = Metadata::of(&model, Path::new("vgn.onnx")).unwrap_err().to_string();
         assert!(error.contains(key) && error.contains(&format!("`{value}`")), "{error}");
     }
+}
+
+#[test]
+fn an_unknown_property_and_an_empty_name_are_errors() {
+    let error = |key: &str, value: &str| {
+        let mut model = vgn();
+        let (key, value) = (Some(format!("graspd.{key}")), Some(value.to_owned()));
+        model.metadata_props.push(StringStringEntryProto { key, value });
+        Metadata::of(&model, Path::new("vgn.onnx")).unwrap_err().to_string()
+    };
+    assert!(error("voxel_orign", "center").contains("`graspd.voxel_orign` is not known"));
+    assert!(error("name", "").contains("`graspd.name` is ``, must be 1 to 128 bytes"), "{}", error("name", ""));
 }
 
 #[test]
