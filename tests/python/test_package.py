@@ -11,6 +11,7 @@ import os
 import pickle
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -475,6 +476,20 @@ class TrackTest(ServerTest):
                 self.assertEqual(caught.exception.field, "views[0]")
                 kept = tracking.add([good], LOW)
             self.assertEqual(tracking.add().grasps, kept.grasps)
+        self.wait_until_none_is_tracked()
+
+    def test_a_keyboard_interrupt_ends_the_tracking(self):
+        def interrupted_while_waiting():
+            yield from views()[:1] * 12
+            signal.setitimer(signal.ITIMER_REAL, 0.01)
+
+        self.addCleanup(signal.signal, signal.SIGALRM, signal.signal(signal.SIGALRM, signal.default_int_handler))
+        with self.client.track() as tracking:
+            self.assertTrue(tracking.add(views(), LOW).grasps)
+            with self.assertRaises(KeyboardInterrupt):
+                tracking.add(interrupted_while_waiting())
+            with self.assertRaisesRegex(graspd.Error, "CANCELLED"):
+                tracking.add()
         self.wait_until_none_is_tracked()
 
     def test_tracked_volumes_are_limited_and_expire(self):

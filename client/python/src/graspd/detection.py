@@ -56,7 +56,7 @@ class Latency:
     """Duration of each stage in the server, seconds."""
 
     queue: float
-    """Time in the queue of the model."""
+    """Wait for conversion and fusion, and in the queue of the model."""
     preprocessing: float
     """Validation and conversion of the input."""
     fusion: float
