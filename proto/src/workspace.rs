@@ -86,7 +86,7 @@ impl Workspace {
     }
 
     /// Finds the table in a view and sets the pose of the workspace. If it is the only view and has no extrinsics, it
-    /// gets those of a camera at the origin of the caller's frame.
+    /// gets those of a camera at the origin of the caller's frame. A PNG is replaced by its depths.
     ///
     /// # Errors
     /// [`FieldError`] names the field of the view.
@@ -107,6 +107,11 @@ impl Workspace {
         };
         let frame_from_camera = pose::decode(pose, &FRAME_FROM_CAMERA)?;
         let (intrinsics, depth) = image(view)?;
+        if view.unit() == pb::DepthUnit::PngMillimetres {
+            // So that the fusion does not decode the file again.
+            view.data = depth.iter().flat_map(|depth| depth.to_le_bytes()).collect();
+            view.set_unit(pb::DepthUnit::F32Metres);
+        }
         let image = DepthImage::new(intrinsics, &depth).map_err(|error| FieldError::refused("camera", error))?;
         let found = self.place_on_table(&image, &frame_from_camera, height, edge);
         found.map_err(|error| FieldError::refused("data", error))
