@@ -90,7 +90,7 @@ bench-gpu: ## measure latency and throughput of the server on an NVIDIA GPU, bes
 	$(RELEASE)/grasp-sim label --scene packed --scenes 1 --points 1 --seed 51 --format processed \
 		--out $(CARGO_TARGET_DIR)/bench-gpu/scene
 	ORT_DYLIB_PATH="$$($(PYTHON) deploy/native.py onnxruntime-gpu)" $(RELEASE)/examples/gpu $(RELEASE)/graspd \
-		$(CARGO_TARGET_DIR)/bench-gpu/scene/scenes/00000000.npz 3 $(CARGO_TARGET_DIR)/bench-gpu/results.json \
+		$(CARGO_TARGET_DIR)/bench-gpu/scene/scenes/s00000000.npz 3 $(CARGO_TARGET_DIR)/bench-gpu/results.json \
 		$(CARGO_TARGET_DIR)/bench-gpu/transformer.onnx models/zoo/vgn-packed.onnx
 	if [ "$(PYTORCH)" ]; then for model in $(CARGO_TARGET_DIR)/bench-gpu/transformer.onnx models/zoo/vgn-packed.onnx; do \
 		for precision in fp16 fp32; do $(PYTORCH) tests/peers/pytorch_latency.py $$model --precision $$precision \

@@ -279,10 +279,15 @@ fn a_benchmark_reports_every_attempt() {
     let pictures: Vec<_> = fs::read_dir(desk.path("pictures")).unwrap().collect();
     assert_eq!(pictures.len(), attempts.len(), "a picture for each attempt");
 
-    let line = desk.run("reliability here=attempts.jsonl --out reliability.png");
+    let error = desk.refused("reliability here=attempts.jsonl");
+    assert!(error.contains("attempts.jsonl has attempts of several planners (random, "), "{error}");
+    let of_network = attempts.iter().filter(|attempt| attempt["planner"] == summaries[1]["planner"]);
+    let of_network: Vec<String> = of_network.map(|attempt| format!("{attempt}\n")).collect();
+    fs::write(desk.path("one.jsonl"), of_network.concat()).unwrap();
+    let line = desk.run("reliability here=one.jsonl --out reliability.png");
     let reliability: Value = serde_json::from_str(&line).unwrap();
     let whole = &reliability["reliability"]["whole"];
-    assert_eq!((&reliability["name"], whole["attempts"].as_u64()), (&"here".into(), Some(attempts.len() as u64)));
+    assert_eq!((&reliability["name"], whole["attempts"].as_u64()), (&"here".into(), Some(of_network.len() as u64)));
     assert!((0.0..=1.0).contains(&reliability["reliability"]["error"].as_f64().unwrap()));
     assert!(fs::read(desk.path("reliability.png")).unwrap().starts_with(b"\x89PNG"));
 

@@ -146,6 +146,9 @@ fn read_array<T: Deserialize>(
     let file = file.map_err(|error| io::Error::other(format!("`{name}`: {error}")))?;
     // Buffered, to avoid a call to the decompressor for every pixel.
     let array = NpyFile::new(io::BufReader::with_capacity(1 << 16, file))?;
+    if array.order() != npyz::Order::C {
+        return Err(io::Error::other(format!("`{name}` is in Fortran order; save it in C order")));
+    }
     Ok((array.shape().to_vec(), array.into_vec()?))
 }
 

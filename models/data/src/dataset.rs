@@ -29,7 +29,7 @@ impl DataFormat {
         if packed::is_packed(folder) {
             return Ok(Self::Packed);
         }
-        match LengthUnit::of(folder) {
+        match LengthUnit::of(folder)? {
             Some(LengthUnit::Metres) => Ok(Self::Raw),
             Some(LengthUnit::Voxels) => Ok(Self::Processed),
             None => Err(DataError::Empty(folder.to_owned())),
@@ -209,8 +209,8 @@ impl Dataset {
         })
     }
 
-    /// A hash of 16 hexadecimal digits over the names, trials and order of the scenes. The volumes are not hashed,
-    /// because they are a thousand times larger, and a data set with other volumes also has other trials.
+    /// A hash of 16 hexadecimal digits over the names, trials, volumes and order of the scenes. Of the volumes only
+    /// checksums are hashed, because they are a thousand times larger than the trials.
     #[must_use]
     pub fn fingerprint(&self) -> String {
         let mut hash = Sha256::new();
@@ -221,9 +221,29 @@ impl Dataset {
             hash.update(&id);
             hash.update((trials.len() as u64).to_le_bytes());
             hash.update((self.volumes(scene) as u64).to_le_bytes());
+            hash.update(self.checksum(scene).to_le_bytes());
             update(&mut hash, &trials);
         }
         hash.finalize().iter().take(8).map(|byte| format!("{byte:02x}")).collect()
+    }
+
+    /// A checksum of the volumes of scene `index`.
+    fn checksum(&self, index: usize) -> u32 {
+        let (source, scene) = self.scenes[index];
+        match &self.sources[source] {
+            Source::Packed(reader) => reader.checksum(scene),
+            Source::Memory(scenes) => {
+                let mut hasher = crc32fast::Hasher::new();
+                scenes[scene].volumes.iter().for_each(|volume| hasher.update(volume));
+                hasher.finalize()
+            }
+        }
+    }
+
+    /// Whether all folders are packed.
+    #[must_use]
+    pub fn is_packed(&self) -> bool {
+        self.sources.iter().all(|source| matches!(source, Source::Packed(_)))
     }
 
     /// Indices of the scenes, each once: of a scene that was observed again into another folder, which has the same name

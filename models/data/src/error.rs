@@ -52,6 +52,9 @@ pub enum DataError {
         .0.display()
     )]
     Empty(PathBuf),
+    /// The trials are not grasps that a network proposed.
+    #[error("{}: its grasps are not those of a network; use data of `grasp-sim proposals`", .0.display())]
+    NoProposals(PathBuf),
     /// Scenes are to be merged into a folder that has some.
     #[error("{} already holds scenes; merge into another folder", .0.display())]
     NotEmpty(PathBuf),

@@ -12,7 +12,7 @@ use nalgebra::{Point3, Quaternion, UnitQuaternion};
 use serde::{Deserialize, Deserializer};
 
 use crate::error::{At, DataError};
-use crate::{MAX_CLEARANCE, Trial};
+use crate::{MAX_CLEARANCE, Trial, scene_number};
 
 pub(crate) const FILE: &str = "grasps.csv";
 
@@ -50,11 +50,24 @@ impl LengthUnit {
         }
     }
 
-    /// The unit of a folder's table, from its header.
-    pub(crate) fn of(folder: &Path) -> Option<Self> {
-        let mut reader = csv::Reader::from_path(folder.join(FILE)).ok()?;
-        let header = reader.headers().ok()?;
-        [Self::Metres, Self::Voxels].into_iter().find(|unit| unit.missing(header).is_none())
+    /// The unit of a folder's table, from its header; `None` if there is no table.
+    pub(crate) fn of(folder: &Path) -> Result<Option<Self>, DataError> {
+        let path = folder.join(FILE);
+        let file = match File::open(&path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            file => file.at(&path)?,
+        };
+        let mut reader = csv::Reader::from_reader(file);
+        let wrong =
+            |reason, unit: Self| DataError::Row { path: path.clone(), line: 1, reason, columns: unit.columns() };
+        let header = reader.headers().map_err(|error| wrong(error.to_string(), Self::Voxels))?;
+        if [Self::Metres, Self::Voxels].iter().all(|unit| unit.missing(header).is_some()) {
+            // The position tells which of the units is meant.
+            let unit = if header.iter().any(|column| column == "x") { Self::Metres } else { Self::Voxels };
+            let column = unit.missing(header).unwrap_or_default();
+            return Err(wrong(format!("the column `{column}` is missing"), unit));
+        }
+        Ok([Self::Metres, Self::Voxels].into_iter().find(|unit| unit.missing(header).is_none()))
     }
 
     /// A required column that is missing.
@@ -78,7 +91,7 @@ impl TableWriter {
         let (kept, last) = last_scene(&file).at(&path)?.map_err(|line| DataError::Row {
             path: path.clone(),
             line,
-            reason: "the scene id is not a number, so no rows can be appended; write into another folder".to_owned(),
+            reason: "the scene id has no number, so no rows can be appended; write into another folder".to_owned(),
             columns: unit.columns(),
         })?;
         if kept > 0 {
@@ -120,7 +133,7 @@ fn check_columns(path: &Path, unit: LengthUnit) -> Result<(), DataError> {
 }
 
 /// Length of the table without the rows of its last scene, which may be incomplete, and the number of that scene. The
-/// error is the line of a scene whose id is not a number, as in VGN's own tables.
+/// error is the line of a scene whose id has no number, as in VGN's own tables.
 fn last_scene(table: &File) -> io::Result<Result<(u64, Option<u64>), u64>> {
     let mut reader = BufReader::new(table);
     let mut line = String::new();
@@ -132,7 +145,7 @@ fn last_scene(table: &File) -> io::Result<Result<(u64, Option<u64>), u64>> {
         }
         // A row without a line end may be truncated within the scene number. It is counted with the previous scene.
         if number > 1 && line.ends_with('\n') {
-            let Some(scene) = line.split(',').next().and_then(|id| id.parse::<u64>().ok()) else {
+            let Some(scene) = line.split(',').next().and_then(scene_number) else {
                 return Ok(Err(number));
             };
             if last != Some(scene) {

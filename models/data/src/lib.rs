@@ -41,6 +41,19 @@ pub struct Scene {
     pub trials: Vec<Trial>,
 }
 
+/// The name of scene `number` in the formats of VGN and GIGA. It begins with a letter, because their code reads names of
+/// digits as integers and then fails.
+#[must_use]
+pub fn scene_id(number: u64) -> String {
+    format!("s{number:08}")
+}
+
+/// The number of a scene from its [name](scene_id); also without the letter, as in data of earlier versions.
+#[must_use]
+pub fn scene_number(id: &str) -> Option<u64> {
+    id.strip_prefix('s').unwrap_or(id).parse().ok()
+}
+
 /// Quantises the values of a volume, in [0, 1], to bytes.
 ///
 /// The error is at most 1/510, which is 0.12 mm for 40³ voxels over 0.3 m. The noise of depth cameras is in the order

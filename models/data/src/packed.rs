@@ -177,6 +177,8 @@ struct SceneLocation {
     volumes: usize,
     /// Offset of the trials.
     start: usize,
+    /// Checksum of the record.
+    checksum: u32,
 }
 
 impl Reader {
@@ -244,6 +246,11 @@ impl Reader {
     #[must_use]
     pub fn number(&self, index: usize) -> u64 {
         self.scenes[index].number
+    }
+
+    /// Checksum of scene `index`, with its volumes.
+    pub(crate) fn checksum(&self, index: usize) -> u32 {
+        self.scenes[index].checksum
     }
 
     /// Number of volumes of scene `index`.
@@ -317,7 +324,7 @@ impl PackFile {
                 )));
             }
             let number = u64::from(u32_at(content, 0)) | u64::from(u32_at(content, 4)) << 32;
-            scenes.push(SceneLocation { file, number, trials, volumes, start: start + 16 });
+            scenes.push(SceneLocation { file, number, trials, volumes, start: start + 16, checksum });
             self.end = start + length;
         }
         Ok(scenes)
@@ -359,7 +366,8 @@ fn f32_at(bytes: &[u8], offset: usize) -> f32 {
 /// Copies the packed files of several folders with the same setup into one folder, and returns the number of scenes.
 ///
 /// # Errors
-/// [`DataError`] names a folder with another setup, or two folders with the same scene. `into` is not changed then.
+/// [`DataError`] names a folder with another setup or without packed files, or two folders with the same scene. `into` is
+/// not changed then.
 pub fn merge(folders: &[PathBuf], into: &Path) -> Result<usize, DataError> {
     let mut seen = BTreeMap::new();
     let mut setup: Option<Setup> = None;
@@ -371,6 +379,9 @@ pub fn merge(folders: &[PathBuf], into: &Path) -> Result<usize, DataError> {
                 return Err(DataError::OtherSetup { path: folder.join("setup.json"), found });
             }
             _ => setup = Some(found),
+        }
+        if !is_packed(folder) {
+            return Err(DataError::Empty(folder.clone()));
         }
         let reader = Reader::open(folder)?;
         for index in 0..reader.len() {

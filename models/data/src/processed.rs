@@ -1,6 +1,6 @@
 //! The processed format of VGN and GIGA:
 //!
-//! - `setup.json`: [`Setup`];
+//! - `setup.json`: [`Setup`]; VGN's own data sets have none;
 //! - `grasps.csv`: `scene_id,qx,qy,qz,qw,i,j,k,width,label,share,clearance`, one row per trial; i, j, k = position /
 //!   voxel size, width in voxels, clearance in metres; VGN and GIGA have no `share` and no `clearance`, see [`Trial`];
 //! - `scenes/ID.npz`: `grid`, `[1, N, N, N]` f32, the observed volume.

@@ -100,13 +100,19 @@ impl Setup {
     /// The setup with the benchmark's workspace, camera and hand.
     #[must_use]
     pub fn benchmark(provenance: Provenance) -> Self {
+        Self { provenance: Some(provenance), ..Self::unknown() }
+    }
+
+    /// The setup of the benchmark for data of unknown provenance.
+    #[must_use]
+    pub fn unknown() -> Self {
         let Intrinsics { width, height, fx, fy, cx, cy } = Intrinsics::BENCHMARK;
         Self {
             size: WORKSPACE_SIZE,
             intrinsic: Intrinsic { width, height, k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0] },
             max_opening_width: MAX_OPENING,
             finger_depth: FINGER_DEPTH,
-            provenance: Some(provenance),
+            provenance: None,
         }
     }
 

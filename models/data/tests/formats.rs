@@ -273,7 +273,7 @@ fn a_table_whose_scene_ids_are_not_numbers_is_not_continued() {
     drop(writer);
     let table = fs::read_to_string(folder.path().join("grasps.csv")).unwrap();
     let error = processed::Writer::open(folder.path(), &setup()).err().unwrap().to_string();
-    assert!(error.contains("line 2: the scene id is not a number"), "{error}");
+    assert!(error.contains("line 2: the scene id has no number"), "{error}");
     assert_eq!(fs::read_to_string(folder.path().join("grasps.csv")).unwrap(), table);
 }
 
@@ -369,7 +369,7 @@ fn columns_are_found_by_name_and_share_and_clearance_are_optional() {
     assert_eq!(read(one).unwrap(), [(0.25, 0.0)]);
     let other = "scene_id,qx,qy,qz,qw,i,j,k,width,clearance,label\n00000001,0,0,0,1,1,2,3,4,0.01,1\n";
     assert_eq!(read(other).unwrap(), [(1.0, 0.01)]);
-    assert!(read(&other.replace("width", "wide")).unwrap_err().to_string().contains("holds no grasps"));
+    assert!(read(&other.replace("width", "wide")).unwrap_err().to_string().contains("the column `width` is missing"));
 
     // Rows of the current version are not appended to a table with an older header.
     let old = format!("{old}00000002,0,0,0,1,1,2,3,4,1\n");

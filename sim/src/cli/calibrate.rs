@@ -1,9 +1,9 @@
 use std::path::PathBuf;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use clap::Args;
-use grasp_models::Calibration;
 use grasp_models::onnx::ModelProto;
+use grasp_models::{Calibration, gpd};
 use grasp_sim::reliability::{Reliability, calibration};
 
 use super::reliability::read;
@@ -32,6 +32,14 @@ impl Calibrate {
              attempts, with successes and failures",
         )?;
         let mut model = ModelProto::read(&self.evaluator)?;
+        let input = model.graph.as_ref().and_then(|graph| graph.input.first()).map(|input| input.name().to_owned());
+        ensure!(
+            input.as_deref() == Some(gpd::INPUT),
+            "--evaluator {} is not an evaluator: its input is `{}`, must be `{}`",
+            self.evaluator.display(),
+            input.unwrap_or_default(),
+            gpd::INPUT
+        );
         let earlier = Calibration::of(&model).with_context(|| self.evaluator.display().to_string())?;
         let all = fitted.after(&earlier);
         all.write_to(&mut model);

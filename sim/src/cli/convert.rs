@@ -1,9 +1,10 @@
+use std::fs;
 use std::path::PathBuf;
 
 use anyhow::{Context, bail, ensure};
 use clap::Args;
 use grasp::{DepthImage, Fusion, RESOLUTION};
-use grasp_data::{DataFormat, Dataset, Setup, Trial, packed, processed, raw};
+use grasp_data::{DataFormat, Dataset, Setup, Trial, packed, processed, raw, scene_id, scene_number};
 use grasp_sim::ordered;
 use indicatif::ProgressBar;
 use nalgebra::Isometry3;
@@ -35,11 +36,14 @@ impl Convert {
         if self.format == Format::Raw {
             bail!("--format raw is not possible: volumes have no depth images; use `grasp-sim label --format raw`");
         }
-        ensure!(self.from != self.out, "--from and --out are the same folder; use another --out");
-        let setup = Setup::read(&self.from)?;
+        let same = fs::canonicalize(&self.from).ok().is_some_and(|from| fs::canonicalize(&self.out).ok() == Some(from));
+        ensure!(!same, "--from and --out are the same folder; use another --out");
         match DataFormat::of(&self.from)? {
-            DataFormat::Raw => self.fuse(&setup),
-            DataFormat::Processed | DataFormat::Packed => self.copy(&setup),
+            DataFormat::Raw => self.fuse(&Setup::read(&self.from)?),
+            DataFormat::Packed => self.copy(&Setup::read(&self.from)?),
+            // VGN's and GIGA's own data sets have none.
+            DataFormat::Processed if !self.from.join("setup.json").exists() => self.copy(&Setup::unknown()),
+            DataFormat::Processed => self.copy(&Setup::read(&self.from)?),
         }
     }
 
@@ -135,12 +139,15 @@ impl Writer {
         Ok(writer)
     }
 
-    /// Appends a scene; the processed format takes its first volume. The packed format needs a number: `id` if it is
-    /// one, else `index`.
+    /// Appends a scene; the processed format takes its first volume. The packed format needs a number: that of `id`, else
+    /// `index`.
     fn append(&mut self, index: u64, id: &str, volumes: &[Vec<f32>], trials: &[Trial]) -> anyhow::Result<()> {
         match self {
-            Self::Processed(writer) => writer.append(id, &volumes[0], trials)?,
-            Self::Packed(writer) => writer.append(id.parse().unwrap_or(index), volumes, trials)?,
+            Self::Processed(writer) => {
+                let id = scene_number(id).map_or_else(|| id.to_owned(), scene_id);
+                writer.append(&id, &volumes[0], trials)?;
+            }
+            Self::Packed(writer) => writer.append(scene_number(id).unwrap_or(index), volumes, trials)?,
         }
         Ok(())
     }

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail, ensure};
 use clap::{Args, ValueEnum};
 use grasp::{RESOLUTION, WORKSPACE_SIZE};
-use grasp_data::{Setup, Trial, packed, processed, raw};
+use grasp_data::{DataFormat, Setup, Trial, packed, processed, raw, scene_id, scene_number};
 use grasp_sim::export::{Export, Line};
 use grasp_sim::label::{LabelledScene, SceneConfig};
 use grasp_sim::ordered;
@@ -118,7 +118,23 @@ impl Label {
 
     /// Checks that this run continues that of the output folder, if there is one, without missing scenes.
     fn check_continuation(&self, config: &SceneConfig) -> anyhow::Result<()> {
-        let Some((first, last)) = self.format.stored(&self.out)? else { return Ok(()) };
+        if self.out.is_dir()
+            && let Ok(found) = DataFormat::of(&self.out)
+            && found != self.format.of_data()
+        {
+            bail!("{} has scenes in another format; use another --out, or the same --format", self.out.display());
+        }
+        let Some((first, last)) = self.format.stored(&self.out)? else {
+            let is_new = |export: &PathBuf| fs::metadata(export).map_or(true, |file| file.len() == 0);
+            if let Some(export) = self.export.as_ref().filter(|export| !is_new(export)) {
+                bail!(
+                    "--export {} already exists, but {} has no scenes; use another file",
+                    export.display(),
+                    self.out.display()
+                );
+            }
+            return Ok(());
+        };
         // Scenes whose cameras see no object are not stored, and do not count as missing.
         let mut unstored = (self.first..first).chain(last + 1..self.first);
         if let Some(missing) = unstored.find(|&number| config.label(number).is_some()) {
@@ -143,6 +159,14 @@ impl Label {
 }
 
 impl Format {
+    fn of_data(self) -> DataFormat {
+        match self {
+            Self::Raw => DataFormat::Raw,
+            Self::Processed => DataFormat::Processed,
+            Self::Packed => DataFormat::Packed,
+        }
+    }
+
     /// The numbers of the first and the last scene in a folder, if it has any.
     fn stored(self, folder: &Path) -> anyhow::Result<Option<(u64, u64)>> {
         if !folder.exists() {
@@ -159,7 +183,7 @@ impl Format {
     }
 }
 
-/// The numbers of the files NUMBER.npz in a folder, which may not exist.
+/// The numbers of the scenes' files in a folder, which may not exist.
 fn scene_files(folder: &Path) -> anyhow::Result<Vec<u64>> {
     if !folder.exists() {
         return Ok(Vec::new());
@@ -167,7 +191,7 @@ fn scene_files(folder: &Path) -> anyhow::Result<Vec<u64>> {
     let mut numbers = Vec::new();
     for file in fs::read_dir(folder).with_context(|| folder.display().to_string())? {
         let name = file.with_context(|| folder.display().to_string())?.file_name();
-        numbers.extend(name.to_str().and_then(|name| name.strip_suffix(".npz")?.parse::<u64>().ok()));
+        numbers.extend(name.to_str().and_then(|name| scene_number(name.strip_suffix(".npz")?)));
     }
     Ok(numbers)
 }
@@ -198,7 +222,7 @@ impl Writer {
     fn append(&mut self, number: u64, mut scene: LabelledScene) -> anyhow::Result<()> {
         let trials = |unit: f64| -> Vec<Trial> { scene.points.iter().map(|point| point.trial(unit)).collect() };
         let voxel_size = WORKSPACE_SIZE / RESOLUTION as f64;
-        let id = format!("{number:08}");
+        let id = scene_id(number);
         match self {
             Self::Raw(writer) => writer.append(&id, &scene.observations[0].views, &trials(1.0))?,
             Self::Processed(writer) => writer.append(&id, &scene.observations[0].volume, &trials(voxel_size))?,

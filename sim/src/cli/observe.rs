@@ -55,6 +55,7 @@ impl Observe {
         let parse = |views: &str| parse_views(views).with_context(|| format!("--views is `{views}`: use {VIEWS}"));
         let views = parse(&self.views)?;
         let data = Reader::open(&self.data)?;
+        ensure!(!data.is_empty(), "{} has no packed scenes; observe a data set of `label`", self.data.display());
         let mut scenes: Vec<usize> = (0..data.len()).collect();
         scenes.sort_by_key(|&index| data.number(index));
 

@@ -1,3 +1,4 @@
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -6,6 +7,7 @@ use clap::Args;
 use grasp_sim::reliability::{Attempt, Reliability};
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
+use serde::Deserialize;
 
 /// Compare the predicted quality of executed grasps with their success rate: a diagram and the expected calibration
 /// error.
@@ -41,15 +43,31 @@ impl ReliabilityArgs {
     }
 }
 
+/// A line of a file of attempts.
+#[derive(Deserialize)]
+struct Line {
+    planner: Option<String>,
+    #[serde(flatten)]
+    attempt: Attempt,
+}
+
 pub(super) fn read(path: &Path) -> anyhow::Result<Vec<Attempt>> {
     let text = fs::read_to_string(path).with_context(|| path.display().to_string())?;
-    let attempts: Vec<Attempt> = text
+    let lines: Vec<Line> = text
         .lines()
         .enumerate()
         .map(|(index, line)| {
             serde_json::from_str(line).with_context(|| format!("{}, line {}", path.display(), index + 1))
         })
         .collect::<anyhow::Result<_>>()?;
+    let planners: BTreeSet<&str> = lines.iter().filter_map(|line| line.planner.as_deref()).collect();
+    ensure!(
+        planners.len() <= 1,
+        "{} has attempts of several planners ({}); write one file per planner",
+        path.display(),
+        planners.iter().copied().collect::<Vec<_>>().join(", ")
+    );
+    let attempts: Vec<Attempt> = lines.into_iter().map(|line| line.attempt).collect();
     ensure!(!attempts.is_empty(), "{} is empty; it must contain at least one attempt", path.display());
     Ok(attempts)
 }
