@@ -61,6 +61,12 @@ pub struct Checkpoint {
     /// Whether the smallest cost is that of --evaluate.
     #[prost(bool, tag = "13")]
     pub evaluated: bool,
+    /// Whether the network's file contains the best weights, not the last.
+    #[prost(bool, tag = "14")]
+    pub keeps_best: bool,
+    /// Whether --evaluate has no result for the last epoch, because it failed or was interrupted.
+    #[prost(bool, tag = "15")]
+    pub unevaluated: bool,
 }
 
 /// Why a run cannot be resumed from a checkpoint.

@@ -66,8 +66,8 @@ pub(crate) struct Classify {
     #[arg(long, default_value = "auto")]
     device: DeviceChoice,
     /// Threads of libtorch [default: all cores].
-    #[arg(long)]
-    threads: Option<usize>,
+    #[arg(long, value_parser = clap::value_parser!(u16).range(1..))]
+    threads: Option<u16>,
 }
 
 /// The classifiers.
@@ -113,11 +113,15 @@ struct ClassifierEpochRecord {
 impl Classify {
     pub fn run(&self) -> Result<()> {
         if let Some(threads) = self.threads {
-            tch::set_num_threads(i32::try_from(threads).context("--threads is too large")?);
+            tch::set_num_threads(threads.into());
         }
         ensure!((0.0..1.0).contains(&self.val), "--val is {}, must be at least 0 and less than 1", self.val);
         ensure!(self.weight_decay >= 0.0, "--weight-decay is {}, must be at least 0", self.weight_decay);
         ensure!(self.lr > 0.0, "--lr is {}, must be greater than 0", self.lr);
+        ensure!(
+            self.network == Kind::Evaluator || self.proposals_of.is_none(),
+            "--proposals-of is of evaluators, and gpd is not one"
+        );
         if let Some(folder) = self.out.parent() {
             fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
         }

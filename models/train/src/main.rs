@@ -30,9 +30,9 @@ enum Command {
         /// Network: vgn, transformer, transformer-small, or gpd (the classifier of grasp candidates).
         #[arg(long)]
         network: String,
-        /// Representation of the orientation that a grasp network regresses.
-        #[arg(long, value_enum, default_value_t = OrientationArg::Quaternion)]
-        orientation: OrientationArg,
+        /// Representation of the orientation that a grasp network regresses [default: quaternion].
+        #[arg(long, value_enum)]
+        orientation: Option<OrientationArg>,
         /// Seed of the weights.
         #[arg(long, default_value_t = 0)]
         seed: u64,
@@ -137,14 +137,15 @@ struct TrainArgs {
     /// Data augmentation, comma-separated: rotations about z by multiples of 90°, mirror images, shifts along z.
     #[arg(long, value_enum, value_delimiter = ',')]
     augment: Vec<AugmentArg>,
-    /// Largest shift along z, voxels.
-    #[arg(long, default_value_t = 2)]
-    max_shift: u32,
+    /// Largest shift along z, voxels [default: 2].
+    #[arg(long)]
+    max_shift: Option<u32>,
     /// Give failures and successes the same total weight in the loss.
     #[arg(long)]
     balance: bool,
     /// Target of the quality: label (1 for a success, 0 for a failure), or share (the success rate of repetitions with
-    /// small pose errors). Both are the same for data without repetitions. Rotation and width do not depend on it.
+    /// small pose errors; in data of `grasp-sim proposals`, whose grasps are not repeated, 1 also for a grasp that lifted
+    /// an object after a contact on the approach). Rotation and width do not depend on it.
     #[arg(long, value_enum, default_value_t = QualityTargetArg::Label)]
     quality: QualityTargetArg,
     /// Weight of the rotation in the loss, relative to quality and width.
@@ -169,8 +170,8 @@ struct TrainArgs {
     #[arg(long, default_value = "1")]
     model_version: String,
     /// Threads of libtorch [default: all cores].
-    #[arg(long)]
-    threads: Option<usize>,
+    #[arg(long, value_parser = clap::value_parser!(u16).range(1..))]
+    threads: Option<u16>,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -227,9 +228,13 @@ enum AugmentArg {
 
 fn main() -> anyhow::Result<()> {
     match Cli::parse().command {
-        Command::Init { network, seed, out, .. } if network == "gpd" => Ok(gpd::gpd(seed).write(&out)?),
+        Command::Init { network, orientation, seed, out } if network == "gpd" => {
+            anyhow::ensure!(orientation.is_none(), "--orientation is of grasp networks, and gpd is not one");
+            Ok(gpd::gpd(seed).write(&out)?)
+        }
         Command::Init { network, orientation, seed, out } => {
-            let model = network.parse::<Architecture>()?.build_with(RESOLUTION, orientation.into(), seed)?;
+            let orientation = orientation.unwrap_or(OrientationArg::Quaternion).into();
+            let model = network.parse::<Architecture>()?.build_with(RESOLUTION, orientation, seed)?;
             Ok(model.write(&out)?)
         }
         Command::Train(training) => train_command::train(&training),

@@ -93,7 +93,9 @@ struct OutputComparison {
 
 impl Export {
     pub fn run(&self) -> Result<()> {
-        ensure!(self.from != self.out, "--from and --out are the same file; use another --out");
+        let same = std::fs::canonicalize(&self.from).ok();
+        let same = same.is_some_and(|from| std::fs::canonicalize(&self.out).ok() == Some(from));
+        ensure!(!same, "--from and --out are the same file; use another --out");
         let model = ModelProto::read(&self.from)?;
         let data = if self.data.is_empty() { None } else { Some(Dataset::open(&self.data)?) };
         if let Some(data) = &data {

@@ -1,7 +1,7 @@
 use std::path::PathBuf;
 
 use grasp::{Patch, Volume, WORKSPACE_SIZE};
-use grasp_data::{DataError, Dataset, value};
+use grasp_data::{DataError, Dataset, Setup, value};
 use nalgebra::Isometry3;
 use tch::Tensor;
 
@@ -12,7 +12,7 @@ use crate::Examples;
 /// Class 0 is failure; 1 is success after a contact on the approach; 2 is success without a contact.
 pub struct ProposalDataset {
     volumes: Vec<Volume>,
-    /// Folder index and scene name of each volume.
+    /// Name of the scene of each volume.
     scenes: Vec<String>,
     proposals: Vec<Proposal>,
 }
@@ -33,6 +33,9 @@ impl ProposalDataset {
         let mut all = Self { volumes: Vec::new(), scenes: Vec::new(), proposals: Vec::new() };
         for path in folders {
             let dataset = Dataset::open(std::slice::from_ref(path))?;
+            if Setup::read(path)?.provenance.is_some_and(|provenance| provenance.network.is_none()) {
+                return Err(DataError::NoProposals(path.clone()));
+            }
             let n = dataset.resolution();
             let voxel_size = WORKSPACE_SIZE / n as f64;
             for scene in 0..dataset.len() {

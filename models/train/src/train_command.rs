@@ -1,7 +1,7 @@
 //! The command `train`: runs the training, writes its files, shows its progress and handles Ctrl-C.
 
 use std::fs;
-use std::io::ErrorKind;
+use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -26,7 +26,7 @@ use crate::{AugmentArg, KeptWeights, TrainArgs, VoxelOriginArg};
 /// Trains until the last epoch, until the patience is used up, or until Ctrl-C.
 pub(crate) fn train(training: &TrainArgs) -> Result<()> {
     if let Some(threads) = training.threads {
-        tch::set_num_threads(i32::try_from(threads).context("--threads is too large")?);
+        tch::set_num_threads(threads.into());
     }
     ensure!((0.0..1.0).contains(&training.val), "--val is {}, must be at least 0 and less than 1", training.val);
     ensure!(training.save_every >= 0.0, "--save-every is {}, must be at least 0 seconds", training.save_every);
@@ -48,6 +48,14 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
         "--patience and --keep best need results; give --evaluate, or --val greater than 0"
     );
     ensure!(!training.augment.contains(&AugmentArg::Turns), "`--augment turns` is now `--augment rotate`");
+    ensure!(
+        training.max_shift.is_none() || training.augment.contains(&AugmentArg::Shift),
+        "--max-shift needs --augment shift"
+    );
+    ensure!(
+        !training.follow || !training.cosine || training.minutes.is_some(),
+        "--cosine with --follow needs --minutes, because the number of steps is not known"
+    );
     if let Some(command) = &training.evaluate {
         ensure!(
             command.contains(PLACEHOLDER),
@@ -64,16 +72,35 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
         dataset.resolution(),
         metadata.resolution
     );
+    ensure!(!training.follow || dataset.is_packed(), "--follow needs packed data sets");
     let device = training.device.device()?;
     // Channels last is faster on CPUs; on a GPU only channels first was measured.
     let execution = ExecutionOptions { device, bf16: training.bf16, channels_last: !device.is_cuda() };
     let mut trainer = Trainer::new(model, dataset, settings.clone(), execution)?;
+    ensure!(
+        trainer.scenes().1 > 0
+            || training.evaluate.is_some()
+            || training.patience.is_none() && training.keep == KeptWeights::Last,
+        "--val is {}, which leaves no scene for the validation that --patience and --keep best need; use a larger one",
+        training.val
+    );
     if let Some(path) = &training.teacher {
         let (teacher, name) = load_teacher(training, path, &metadata)?;
         trainer = trainer.with_teacher(teacher);
         metadata.provenance.insert("teacher".to_owned(), name);
     }
 
+    let save = |trainer: &Trainer, best: BestResult, unevaluated: bool| {
+        let checkpoint = Checkpoint {
+            best: best.cost,
+            results_since_best: best.results_since,
+            evaluated: training.evaluate.is_some(),
+            keeps_best: training.keep == KeptWeights::Best,
+            unevaluated,
+            ..trainer.checkpoint()
+        };
+        checkpoint.write(&files.state)
+    };
     let mut records = Vec::new();
     let mut best = BestResult::default();
     if training.resume {
@@ -84,8 +111,25 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
             "the best result of the checkpoint is that of {}; give the same options, or start without --resume",
             if checkpoint.evaluated { "--evaluate" } else { "the validation loss, without --evaluate" }
         );
+        ensure!(
+            training.keep == KeptWeights::Last || checkpoint.keeps_best,
+            "--keep best needs a run that was started with it: the file has the last weights, not the best"
+        );
         best = BestResult { cost: checkpoint.best, results_since: checkpoint.results_since_best };
         records = files.read_log(trainer.epochs())?;
+        if checkpoint.unevaluated
+            && let (Some(command), Some(record)) = (&training.evaluate, records.last_mut())
+        {
+            add_provenance(training, &settings, trainer.dataset(), &mut metadata);
+            write_model(&mut trainer, &metadata, Some(record), &files.evaluated)?;
+            record.benchmark = Some(evaluate(command, &files.evaluated)?);
+            println!("{}", serde_json::to_string(record)?);
+            if best.update(training, record) {
+                write_model(&mut trainer, &metadata, Some(record), &training.out)?;
+            }
+            files.write_log(&records)?;
+            save(&trainer, best, false)?;
+        }
     }
     print_counts(&trainer);
     eprintln!("device: {}", device::name(device));
@@ -115,6 +159,7 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
         let mut interrupted = matches!(epoch, EpochOutcome::Interrupted);
         // Returned after the checkpoint is written, so that the epoch is not lost.
         let mut failure = None;
+        let mut unevaluated = false;
         if let EpochOutcome::Completed(mut record) = epoch {
             add_provenance(training, &settings, trainer.dataset(), &mut metadata);
             let last = trainer.epochs() == settings.epochs || trainer.is_over();
@@ -127,25 +172,23 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
                     Err(_) if stop.load(Ordering::Relaxed) => interrupted = true,
                     Err(error) => failure = Some(error),
                 }
+                unevaluated = record.benchmark.is_none();
             }
-            println!("{}", serde_json::to_string(&record)?);
+            // A reader that has closed the pipe does not end the run.
+            let _ = writeln!(std::io::stdout(), "{}", serde_json::to_string(&record)?);
             better = best.update(training, &record);
             records.push(record);
-            files.write_log(&records)?;
-            learning_curves::draw(&files.curves, &records)?;
+            let drawn = files.write_log(&records).and_then(|()| learning_curves::draw(&files.curves, &records));
+            failure = failure.or(drawn.err());
         }
-        let BestResult { cost, results_since } = best;
-        let ends = interrupted || failure.is_some() || !continues(&trainer, results_since);
+        let ends = interrupted || failure.is_some() || !continues(&trainer, best.results_since);
         let due = ends || saved.elapsed().as_secs_f64() >= training.save_every;
         if better || training.keep == KeptWeights::Last && due {
             add_provenance(training, &settings, trainer.dataset(), &mut metadata);
             write_model(&mut trainer, &metadata, records.last(), &training.out)?;
         }
         if due {
-            let evaluated = training.evaluate.is_some();
-            let checkpoint =
-                Checkpoint { best: cost, results_since_best: results_since, evaluated, ..trainer.checkpoint() };
-            checkpoint.write(&files.state)?;
+            save(&trainer, best, unevaluated)?;
             saved = Instant::now();
         }
         if let Some(error) = failure {
@@ -214,6 +257,10 @@ fn initial_network(training: &TrainArgs) -> Result<(ModelProto, Metadata)> {
     let file_name = Metadata::defaults(&training.out, None).name;
     metadata.name = training.name.clone().unwrap_or(file_name);
     metadata.version.clone_from(&training.model_version);
+    if training.augment.contains(&AugmentArg::Rotate) {
+        // The network sees cameras from all sides.
+        metadata.camera_azimuth = None;
+    }
     metadata.voxel_origin = match training.voxel_origin {
         Some(VoxelOriginArg::Corner) => VoxelOrigin::Corner,
         Some(VoxelOriginArg::Center) => VoxelOrigin::Center,
@@ -250,6 +297,8 @@ fn settings(training: &TrainArgs, metadata: &Metadata) -> TrainingSettings {
     let network = training.network.as_ref().or_else(|| metadata.provenance.get("architecture"));
     let is_transformer = network.is_some_and(|network| network.starts_with("transformer"));
     let (epochs, batch, learning_rate) = if is_transformer { (21, 64, 1e-4) } else { (30, 32, 3e-4) };
+    /// Largest shift along z without --max-shift, voxels.
+    const MAX_SHIFT: u32 = 2;
     let allows = |change| training.augment.contains(&change);
     TrainingSettings {
         epochs: training.epochs.unwrap_or(if training.minutes.is_some() { u64::MAX } else { epochs }),
@@ -266,7 +315,7 @@ fn settings(training: &TrainArgs, metadata: &Metadata) -> TrainingSettings {
         augmentation: Augmentation {
             rotate: allows(AugmentArg::Rotate),
             mirror: allows(AugmentArg::Mirror),
-            shift: if allows(AugmentArg::Shift) { training.max_shift } else { 0 },
+            shift: if allows(AugmentArg::Shift) { training.max_shift.unwrap_or(MAX_SHIFT) } else { 0 },
         },
         balance: training.balance,
         quality: training.quality.into(),

@@ -151,7 +151,13 @@ fn an_epoch_whose_evaluation_fails_is_not_lost() {
     let script = r#"test -e {} && echo '{"gsr":0.5,"dr":0.5}'"#;
     let rest = command(folder.path(), &format!("{arguments} --resume")).args(["--evaluate", script]).output().unwrap();
     assert!(rest.status.success(), "{}", stderr(&rest));
-    assert_eq!(String::from_utf8(rest.stdout).unwrap().lines().count(), 1, "the second epoch");
+    let lines = String::from_utf8(rest.stdout).unwrap();
+    let records = lines.lines().map(|line| serde_json::from_str::<EpochRecord>(line).unwrap());
+    let evaluated: Vec<_> = records.map(|record| (record.epoch, record.benchmark.is_some())).collect();
+    assert_eq!(evaluated, [(1, true), (2, true)], "the first epoch is evaluated again");
+    let best = format!("{arguments} --resume --keep best");
+    let refused = command(folder.path(), &best).args(["--evaluate", script]).output().unwrap();
+    assert!(stderr(&refused).contains("the file has the last weights, not the best"), "{}", stderr(&refused));
 }
 
 #[test]
