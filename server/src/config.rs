@@ -59,6 +59,8 @@ pub(crate) struct Config {
     pub tls: Option<Tls>,
     pub tokens: Option<Arc<Tokens>>,
     pub max_connections: usize,
+    /// Time after which a gRPC connection accepts no further calls; None without a limit.
+    pub max_connection_age: Option<Duration>,
     pub limits: Limits,
     /// Messages that are being received, together, bytes.
     pub max_receiving_bytes: usize,
@@ -107,22 +109,20 @@ impl Config {
                 format_args!("is `{receiving}`: must be at least twice --max-message-bytes, {least}"),
             );
         }
+        if flags.max_batch > flags.queue {
+            let needed = format_args!("is `{}`: must be at most --queue, {}", flags.max_batch, flags.queue);
+            errors.add::<Flags>("max_batch", needed);
+        }
         let stamps = stamps(&flags.models);
         let store = Store::open_limited(&flags.models, flags.max_model_bytes);
         let store = store.inspect_err(|error| {
             errors.add::<Flags>("models", format_args!("is `{}`: {error}", flags.models.display()));
         });
-        if let (Some(name), Ok(store)) = (&flags.default_model, &store)
-            && let Err(error) = store.get(name, None)
-        {
-            errors.add::<Flags>("default_model", format_args!("is `{name}`: {error}"));
-        }
         // clap requires the certificate and the key to be given together.
         let tls = flags.tls_cert.as_ref().zip(flags.tls_key.as_ref()).map(|(cert, key)| {
             let ca = flags.tls_client_ca.as_ref().map(|ca| &*ca.0);
             Tls::new(&cert.0, &key.0, ca).map_err(|error| {
-                let files = "--tls-cert, --tls-key and --tls-client-ca";
-                errors.add::<Flags>("tls_cert", format_args!("cannot be used with {files}: {error:#}"));
+                errors.add::<Flags>("tls_cert", format_args!("and the other TLS files cannot be used: {error:#}"));
             })
         });
         match (store, tls.transpose()) {
@@ -157,6 +157,7 @@ impl Config {
             watch: Some(flags.watch).filter(|interval| !interval.is_zero()),
             tls,
             max_connections: flags.max_connections.get(),
+            max_connection_age: Some(flags.max_connection_age).filter(|age| !age.is_zero()),
             limits: Limits { message_bytes: flags.max_message_bytes.get(), stall: flags.stall_timeout },
             max_receiving_bytes: flags.max_receiving_bytes.get(),
             max_tracked: flags.max_tracked.into(),

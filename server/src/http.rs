@@ -74,9 +74,8 @@ pub(crate) async fn serve(
     http_connections::serve(listener, config, app, for_ever).await;
 }
 
-/// Refuses requests to names that are not this server's. Otherwise a page of another site could read the responses in
-/// the browser of someone who can reach this server, if the site's name resolves to this server's address (DNS
-/// rebinding).
+/// Refuses requests to names that are not this server's. Otherwise a page of another site could read the responses in a
+/// browser that can reach this server, if the site's name resolves to this server's address (DNS rebinding).
 async fn check_host(Shared(hosts): Shared<Arc<Vec<String>>>, request: Request, next: Next) -> Response {
     let host = request.headers().get(HOST).map(|host| String::from_utf8_lossy(host.as_bytes()).into_owned());
     match host {

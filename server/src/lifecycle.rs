@@ -1,6 +1,7 @@
 //! Startup, serving and shutdown of the process.
 
 use std::io::Write;
+use std::net::SocketAddr;
 use std::num::NonZero;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -25,11 +26,13 @@ use crate::serving::registry::ModelRegistry;
 use crate::serving::reload::ModelFolder;
 use crate::serving::session_threads::SessionThreads;
 use crate::serving::tracking::TrackedVolumes;
+use crate::serving::turns::Turns;
 use crate::signals::{Signals, hangup};
 use crate::telemetry::metrics::Metrics;
 use crate::telemetry::recent::RecentRequests;
 use crate::telemetry::recorder::Recorder;
 use crate::telemetry::subscriber::{self, Log, Traces};
+use crate::transport::address::Address;
 use crate::transport::http_connections::HttpConfig;
 use crate::transport::listener::{self, GrpcConfig};
 
@@ -77,7 +80,7 @@ fn processors() -> usize {
     available_parallelism().map_or(1, NonZero::get)
 }
 
-/// How long the shutdown waits for tasks and sessions that are still running.
+/// How long the shutdown waits for everything that is still running.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(2);
 
 fn runtime() -> anyhow::Result<Runtime> {
@@ -106,6 +109,12 @@ fn serve_until_stopped(
         tls.warn_of_expiry(SystemTime::now());
         metrics.certificate(tls.expiry);
     }
+    let is_remote = |address: SocketAddr| !address.ip().is_loopback();
+    let is_reachable =
+        matches!(config.listen, Address::Tcp(address) if is_remote(address)) || config.rest.is_some_and(is_remote);
+    if config.tokens.is_some() && config.tls.is_none() && is_reachable {
+        warn!("clients send their tokens in plain text, because --token-file is set without --tls-cert");
+    }
     let onnxruntime = grasp_models::init()?;
     info!(version = onnxruntime.version, library = %onnxruntime.library.display(), "ONNX Runtime loaded");
     let sessions = Arc::new(SessionThreads::default());
@@ -117,13 +126,13 @@ fn serve_until_stopped(
         None => (Recorder::none(), None),
     };
     let served = runtime.block_on(serve(config, signals, connections, &metrics, &sessions, recorder));
+    let until = Instant::now() + SHUTDOWN_TIMEOUT;
     traces.finish();
     // Dropping the runtime's tasks drops the engines, which ends the sessions.
-    runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
+    runtime.shutdown_timeout(until.saturating_duration_since(Instant::now()));
     // ONNX Runtime may crash if the process exits during an inference.
-    sessions.join(SHUTDOWN_TIMEOUT);
+    sessions.join(until);
     if let Some(recording) = recording {
-        let until = Instant::now() + SHUTDOWN_TIMEOUT;
         while !recording.is_finished() && Instant::now() < until {
             thread::sleep(Duration::from_millis(1));
         }
@@ -169,10 +178,13 @@ async fn serve(
     let (folder, control) =
         ModelFolder::new(config, Arc::clone(&models), Arc::clone(sessions), Arc::clone(metrics), state.clone());
     let loads = folder.loads();
-    let inference = InferenceRpc::new(Arc::clone(&models), calls.clone(), Arc::clone(metrics), control);
+    // Requests that are converted and fused, one for each CPU; as many as in the queue of a model may wait.
+    let turns = Turns::new(processors(), *queue);
+    let (requests, counted) = (calls.clone(), Arc::clone(metrics));
+    let inference = InferenceRpc::new(Arc::clone(&models), requests, counted, control, Arc::clone(&turns));
     let tracked_volumes = TrackedVolumes::new(*max_tracked, *track_timeout, metrics.tracked());
     let at_once = config.workers * config.batching.max;
-    let service = GraspRpc::new(Arc::clone(&models), calls, tracked_volumes, recorder, *queue, at_once);
+    let service = GraspRpc::new(Arc::clone(&models), calls, tracked_volumes, recorder, turns, *queue, at_once);
     let rest = rest.map(|listener| {
         let (tokens, limits, metrics) = (tokens.clone(), *limits, Arc::clone(metrics));
         let conversions = Arc::new(Semaphore::new(processors()));
@@ -184,7 +196,14 @@ async fn serve(
     if let Some(tokens) = tokens {
         tokio::spawn(Arc::clone(tokens).watch(self::hangup().context("cannot install a signal handler")?));
     }
-    let grpc_config = GrpcConfig { tls: tls.clone(), tokens: tokens.clone(), connections, budget, limits: *limits };
+    let grpc_config = GrpcConfig {
+        tls: tls.clone(),
+        tokens: tokens.clone(),
+        connections,
+        connection_age: config.max_connection_age,
+        budget,
+        limits: *limits,
+    };
     let mut grpc =
         tokio::spawn(listener::serve(grpc, grpc_config, service, inference, Arc::clone(metrics), state.clone()));
 

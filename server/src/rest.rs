@@ -10,13 +10,14 @@ use axum::body::Body;
 use axum::extract::{Path, Request, State};
 use axum::http::header::{CONTENT_TYPE, ORIGIN, RETRY_AFTER};
 use axum::http::request::Parts;
-use axum::http::{HeaderValue, StatusCode};
+use axum::http::{HeaderValue, Method, StatusCode, Uri};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use axum::{Json, Router};
 use grasp_proto::oip;
 use grasp_proto::oip::grpc_inference_service_server::GrpcInferenceService;
+use grasp_proto::on_a_line;
 use serde_json::{Value, json};
 use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, watch};
@@ -73,8 +74,20 @@ pub(crate) async fn serve(
         // Probes have no token.
         .route("/v2/health/live", get(server_live))
         .route("/v2/health/ready", get(server_ready))
+        .fallback(no_such_path)
+        .method_not_allowed_fallback(no_such_method)
         .with_state(rest);
     http_connections::serve(listener, config, app, state).await;
+}
+
+async fn no_such_path(uri: Uri) -> Response {
+    let error = format!("the path `{}` is not served; see docs/api.md for those that are", on_a_line(uri.path()));
+    (StatusCode::NOT_FOUND, Json(json!({ "error": error }))).into_response()
+}
+
+async fn no_such_method(method: Method, uri: Uri) -> Response {
+    let error = format!("the path `{}` does not accept {method}", on_a_line(uri.path()));
+    (StatusCode::METHOD_NOT_ALLOWED, Json(json!({ "error": error }))).into_response()
 }
 
 /// A refusal as an HTTP response.
@@ -115,8 +128,8 @@ fn http_status(code: Code) -> StatusCode {
     }
 }
 
-/// Refuses requests without a token, and those of web pages: any page could send them through the browser of someone who
-/// can reach this server.
+/// Refuses requests without a token, and those of web pages: any page could send them through a browser that can reach
+/// this server.
 async fn check_access(State(rest): State<Rest>, mut request: Request, next: Next) -> Reply<Response> {
     let headers = request.headers();
     let checked = match &rest.tokens {

@@ -5,12 +5,12 @@ use std::time::Duration;
 
 use grasp::{DepthImage, Fusion, RESOLUTION as PAPERS, Volume, WORKSPACE_SIZE};
 use grasp_client::{
-    Client, CloudView, Depth, DepthView, DetectOptions, Detection, Error, Extrinsics, FindTable, Observation, Options,
-    Proposal, Workspace,
+    Client, CloudView, Depth, DepthView, DetectOptions, Detection, Error, Extrinsics, FindTable, LocalServer,
+    Observation, Options, Proposal, Workspace,
 };
 use grasp_proto::pb;
 use grasp_tests::scene::{BLOCK, CAMERA, TABLE, camera, depth, view};
-use grasp_tests::{RESOLUTION, Server, TestModel};
+use grasp_tests::{RESOLUTION, Server, TestModel, graspd};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use tonic::Code;
 
@@ -395,6 +395,26 @@ async fn an_evaluator_scores_the_grasps_of_its_network() {
     server.reload().unwrap();
     server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 2.0).await;
     assert_eq!(names().await, ["mirror", "graspd", "shaf"]);
+}
+
+#[tokio::test]
+async fn a_model_with_an_evaluator_can_be_the_default() {
+    let zoo = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo"));
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::create_dir(folder.path().join("evaluators")).unwrap();
+    for file in ["vgn-packed.onnx", "evaluators/graspd.onnx"] {
+        std::fs::copy(zoo.join(file), folder.path().join(file)).unwrap();
+    }
+    let models = folder.path().to_str().unwrap();
+    let start = |default| {
+        let flags = ["--models", models, "--provider", "cpu", "--default-model", default];
+        let mut server = LocalServer::start(graspd(), flags)?;
+        server.wait_ready().map(|()| server)
+    };
+    let server = start("graspd").unwrap();
+    let client = Client::connect(server.grpc().to_string()).await.unwrap();
+    assert_eq!(client.list_models().await.unwrap()[0].name, "graspd");
+    assert!(start("shaf").is_err(), "it has no network");
 }
 
 #[tokio::test]

@@ -6,14 +6,15 @@ use std::time::Duration;
 
 use grasp::Volume;
 use grasp_client::{Client, DataType, DetectOptions, Error, LocalServer, Options};
+use grasp_proto::pb::grasp_service_client::GraspServiceClient;
 use grasp_proto::{encode, pb};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs, graspd, metric, resident_bytes};
 use h2::client::SendRequest;
 use nalgebra::Isometry3;
 use prost::Message;
 use tempfile::TempDir;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpStream;
+use tokio::io::{AsyncReadExt, AsyncWriteExt, copy_bidirectional};
+use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio_stream::StreamExt;
@@ -372,6 +373,38 @@ async fn connections_above_the_limit_are_closed_and_others_stay() {
     server.wait_for("graspd_connections", 1.0).await;
     server.client().await.detect(&volume(), Options::default()).await.unwrap();
     second.detect(&volume(), Options::default()).await.unwrap();
+}
+
+#[tokio::test]
+async fn connections_are_replaced_at_their_age_and_no_call_fails() {
+    let server = Server::run(&[TestModel::new("mirror")], &["--max-connection-age", "0.2"]);
+    let target = server.grpc();
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    let (sender, mut accepted) = mpsc::channel(100);
+    tokio::spawn(async move {
+        while let Ok((mut client, _)) = listener.accept().await {
+            sender.send(()).await.unwrap();
+            tokio::spawn(async move {
+                let mut server = TcpStream::connect(target).await.unwrap();
+                let _ = copy_bidirectional(&mut client, &mut server).await;
+            });
+        }
+    });
+    let client = Client::connect(address).await.unwrap();
+    let (requests, sent) = mpsc::channel(1);
+    let mut stream = GraspServiceClient::new(server.channel().await);
+    let request =
+        pb::DetectGraspsRequest { volume: Some(encode(&volume(), pb::DataType::F32, "")), ..Default::default() };
+    let mut replies = stream.detect_grasps_stream(ReceiverStream::new(sent)).await.unwrap().into_inner();
+    for _ in 0..3 {
+        while accepted.try_recv().is_err() {
+            client.detect(&volume(), Options::default()).await.unwrap();
+        }
+        // A call that is open continues.
+        requests.send(request.clone()).await.unwrap();
+        assert!(replies.next().await.unwrap().is_ok());
+    }
 }
 
 #[tokio::test]

@@ -40,6 +40,8 @@ async fn the_server_is_ready_after_the_warm_up_and_not_before() {
     assert_eq!(error.code(), Some(Code::Unavailable), "{error}");
     assert!(error.to_string().contains("warming up"), "{error}");
 
+    assert_eq!(client.list_models().await.unwrap_err().code(), Some(Code::Unavailable), "the list is not known yet");
+
     let address = server.grpc().to_string();
     let error = Client::wait_ready(address.clone(), Duration::ZERO).await.unwrap_err();
     assert!(matches!(error, Error::NotReady { .. }), "{error}");

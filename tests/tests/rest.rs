@@ -64,6 +64,18 @@ async fn web_pages_and_compressed_bodies_are_refused() {
 }
 
 #[tokio::test]
+async fn unknown_paths_and_methods_have_an_error_as_a_body() {
+    let server = Server::run(&[TestModel::new("mirror")], &["--rest", "127.0.0.1:0"]);
+    for (path, status, reason) in [
+        ("/v2/systemsharedmemory/status", 404, "the path `/v2/systemsharedmemory/status` is not served"),
+        ("/v2/models/mirror/ready", 405, "the path `/v2/models/mirror/ready` does not accept POST"),
+    ] {
+        let (code, body) = response(open(&server, path, 0, b"").await).await;
+        assert!(code == status && body.starts_with("{\"error\":\"") && body.contains(reason), "{code} {body}");
+    }
+}
+
+#[tokio::test]
 async fn incomplete_bodies_share_the_memory_of_incomplete_messages() {
     let flags = ["--rest", "127.0.0.1:0", "--max-message-bytes", "1000000", "--max-receiving-bytes", "2000000"];
     let server = Server::run(&[TestModel::new("mirror")], &flags);

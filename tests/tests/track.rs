@@ -190,6 +190,13 @@ async fn each_cube_of_a_tracked_workspace_counts() {
     large.add(&views, low()).await.unwrap();
     assert_eq!(server.metric(TRACKED), 4.0);
 
+    let mut too_large = client.track(of([1.2, 1.2])).await.unwrap();
+    let refused = too_large.add(&views, low()).await.unwrap_err();
+    assert_eq!(refused.code(), Some(Code::InvalidArgument), "a retry does not help");
+    assert!(refused.to_string().contains("must have at most 9 (--max-tracked)"), "{refused}");
+    drop(too_large);
+    server.wait_for(TRACKED, 4.0).await;
+
     let mut second = client.track(of([0.6, 0.4])).await.unwrap();
     let refused = second.add(&views, low()).await.unwrap_err();
     assert!(refused.code() == Some(Code::ResourceExhausted) && !refused.views_added(), "{refused:?}");

@@ -176,6 +176,17 @@ pub(super) struct Flags {
     #[arg(long, env = "GRASPD_MAX_CONNECTIONS", value_name = "N", default_value = "16384")]
     pub max_connections: NonZeroUsize,
 
+    /// Time after which a gRPC connection accepts no further calls and is closed when the open ones end, seconds. Clients
+    /// connect again, so that they find the replicas that were added since. 0 disables the limit.
+    #[arg(
+        long,
+        env = "GRASPD_MAX_CONNECTION_AGE",
+        value_name = "SECONDS",
+        default_value = "0",
+        value_parser = seconds,
+    )]
+    pub max_connection_age: Duration,
+
     /// Maximum number of volumes that open TrackGrasps streams keep: each has one, or one for each cube of its workspace.
     /// Further ones are refused.
     #[arg(long, env = "GRASPD_MAX_TRACKED", value_name = "N", default_value = "256", value_parser = count())]

@@ -10,7 +10,7 @@ use opentelemetry::Context;
 use tokio::sync::watch;
 use tonic::{Code, Request, Status};
 use tracing::field::Empty;
-use tracing::{Span, debug, info, info_span};
+use tracing::{Span, debug, error, error_span, info};
 
 use crate::readiness::State;
 use crate::serving::engine::Engine;
@@ -27,7 +27,7 @@ use crate::transport::request_body::unreadable_message;
 use crate::transport::tokens::Tokens;
 
 /// Retry hint while the models are loaded and warmed up.
-pub(super) const WARM_UP: Duration = Duration::from_secs(1);
+const WARM_UP: Duration = Duration::from_secs(1);
 
 /// Creates the [`Call`] of each request.
 #[derive(Clone)]
@@ -91,6 +91,11 @@ impl Calls {
         self.state.clone()
     }
 
+    /// Refuses a request that needs the list of models while the server is still starting.
+    pub fn check_started(&self) -> Result<(), Refusal> {
+        if *self.state.borrow() == State::Starting { Err(Refusal::Starting(WARM_UP)) } else { Ok(()) }
+    }
+
     /// The status that ends a stream after a message that cannot be read.
     pub fn unreadable(&self, status: Status) -> Status {
         unreadable_message(status, &self.metrics)
@@ -98,22 +103,26 @@ impl Calls {
 
     /// Opens a call. The second value is an error if the id is invalid, the server is still starting, or the token of the
     /// call's stream is no longer accepted.
-    pub fn open(&self, mut id: String, context: CallContext) -> (Call, Result<(), Refusal>) {
+    pub fn open(&self, id: String, context: CallContext) -> (Call, Result<(), Refusal>) {
+        self.open_with("request_id", id, context)
+    }
+
+    /// As [`open`](Self::open), of a request whose id is in another field.
+    pub fn open_with(&self, field: &'static str, mut id: String, context: CallContext) -> (Call, Result<(), Refusal>) {
         let started = Instant::now();
-        let mut checked = check_id("request_id", &id).map_err(Refusal::from);
+        let mut checked = check_id(field, &id).map_err(Refusal::from);
         if id.is_empty() || checked.is_err() {
             id = self.ids.next();
         }
         // During the drain, requests on open connections are still answered; streams stop reading on their own.
-        if checked.is_ok() && *self.state.borrow() == State::Starting {
-            checked = Err(Refusal::Starting(WARM_UP));
-        }
+        checked = checked.and_then(|()| self.check_started());
         let CallContext { caller, deadline, parent } = context;
         // The token of a stream was checked when the stream was opened.
         if checked.is_ok() && self.tokens.as_ref().is_some_and(|tokens| !tokens.accept(&caller)) {
             checked = Err(Refusal::TokenRemoved);
         }
-        let span = info_span!(
+        // Its fields mark the lines of the log at every level.
+        let span = error_span!(
             REQUEST,
             otel.kind = "server",
             otel.status_code = Empty,
@@ -194,7 +203,10 @@ impl Call {
         }
         let outcome = Outcome::Refused { code: refusal.code(), message: refusal.to_string() };
         self.recent.add(self.id.clone(), self.label.clone(), outcome);
-        self.span.in_scope(|| info!(code = ?refusal.code(), %refusal, "refused"));
+        self.span.in_scope(|| match refusal.code() {
+            Code::Internal => error!(code = ?Code::Internal, %refusal, "refused"),
+            code => info!(?code, %refusal, "refused"),
+        });
         self.ended = true;
         refusal
     }

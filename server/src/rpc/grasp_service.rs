@@ -1,6 +1,5 @@
-use std::num::NonZero;
 use std::sync::Arc;
-use std::thread;
+use std::time::Duration;
 
 use grasp::{Volume, WORKSPACE_SIZE};
 use grasp_proto::pb::find_table_request::Observation as Seen;
@@ -9,22 +8,19 @@ use grasp_proto::pb::recording::{Answer, Request as Recorded};
 use grasp_proto::{
     Candidate, DetectParams, FieldError, Priority, TABLE_HEIGHT, Workspace, candidates, check_count, pb, resolution,
 };
-use tokio::time::timeout_at;
 use tonic::codegen::BoxStream;
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::rpc::call::{Call, CallContext, Calls};
 use crate::rpc::pending::{PendingReply, Prepared};
 use crate::serving::cubes::{CubeScene, Cubes, check_margin, edge};
-use crate::serving::engine::Engine;
 use crate::serving::frame_stamp::FrameStamp;
 use crate::serving::job::EngineError;
 use crate::serving::observation::{Observation, Observed, Placed};
-use crate::serving::queue::Ticket;
 use crate::serving::refusal::Refusal;
 use crate::serving::registry::{ModelRegistry, check_voxel_size};
 use crate::serving::tracking::TrackedVolumes;
-use crate::serving::turns::{NoTurn, Turn, Turns};
+use crate::serving::turns::Turns;
 use crate::telemetry::recorder::{Pending, Recorder};
 use crate::transport::deadline::Deadline;
 use grasp_planner::Scene;
@@ -42,8 +38,8 @@ pub(crate) struct GraspRpc {
     pub(super) recorder: Recorder,
     /// Requests of one stream that are queued behind the current one.
     pub(super) read_ahead: usize,
-    /// The requests that are converted and fused, one for each CPU.
-    conversions: Arc<Turns>,
+    /// The requests that are converted and fused.
+    pub(super) conversions: Arc<Turns>,
 }
 
 /// A call that is queued, or refused with its refusal not yet sent.
@@ -72,19 +68,19 @@ impl PendingCall {
 }
 
 impl GraspRpc {
-    /// `queue` is the number of requests that may wait for conversion and fusion, `at_once` the number of volumes that a
-    /// model can compute at the same time. A stream keeps that many in work, but never fills a queue.
+    /// `queue` is the length of a queue, `at_once` the number of volumes that a model can compute at the same time. A
+    /// stream keeps that many in work, but never fills a queue.
     pub fn new(
         models: Arc<ModelRegistry>,
         calls: Calls,
         tracked_volumes: TrackedVolumes,
         recorder: Recorder,
+        conversions: Arc<Turns>,
         queue: usize,
         at_once: usize,
     ) -> Self {
         let read_ahead = at_once.min(queue / 2).max(1);
-        let processors = thread::available_parallelism().map_or(1, NonZero::get);
-        let (tracked_volumes, conversions) = (Arc::new(tracked_volumes), Turns::new(processors, queue));
+        let tracked_volumes = Arc::new(tracked_volumes);
         Self { models, calls, tracked_volumes, recorder, read_ahead, conversions }
     }
 
@@ -129,14 +125,13 @@ impl GraspRpc {
         let engine = self.models.select(&params.model, &params.version, Some(resolution(&volume)?))?;
         call.set_model(&engine);
         let ticket = call.ticket(params.priority);
-        let checked = if volume.data.len() <= INLINE_BYTES {
-            engine.check_capacity(ticket)?;
-            Volume::try_from(&volume)?
+        engine.check_capacity(1, ticket)?;
+        let (checked, waited) = if volume.data.len() <= INLINE_BYTES {
+            (Volume::try_from(&volume)?, Duration::ZERO)
         } else {
-            engine.check_capacity(ticket)?;
-            let turn = self.conversion(&engine, ticket).await?;
-            engine.check_capacity(ticket)?;
-            blocking(turn, call.deadline, move |_| Ok(Volume::try_from(&volume)?)).await?
+            let (turn, waited) = self.conversions.of_request(&engine, ticket).await?;
+            engine.check_capacity(1, ticket)?;
+            (blocking(turn, call.deadline, move |_| Ok(Volume::try_from(&volume)?)).await?, waited)
         };
         check_voxel_size(&checked, &engine)?;
         check_margin(params.margin, checked.resolution() as f64 * checked.voxel_size())?;
@@ -145,7 +140,7 @@ impl GraspRpc {
             params.constraints.workspace = Some(checked.within(params.margin));
         }
         let scenes = vec![CubeScene { scene: Scene { volume: checked, points: None }, params }];
-        Ok(Prepared { engine, scenes, observed: Observed::default(), origin })
+        Ok(Prepared { engine, scenes, observed: Observed { waited, ..Observed::default() }, origin })
     }
 
     async fn submit_depth(
@@ -197,9 +192,9 @@ impl GraspRpc {
         let engine = self.models.select(&params.model, &params.version, None)?;
         call.set_model(&engine);
         let ticket = call.ticket(params.priority);
-        engine.check_capacity(ticket)?;
-        let turn = self.conversion(&engine, ticket).await?;
-        engine.check_capacity(ticket)?;
+        engine.check_capacity(1, ticket)?;
+        let (turn, waited) = self.conversions.of_request(&engine, ticket).await?;
+        engine.check_capacity(1, ticket)?;
         let (selected, params) = (Arc::clone(&engine), params.clone());
         let fused = blocking(turn, call.deadline, move |is_wanted| {
             let edge = edge(&selected.source, workspace.size);
@@ -208,7 +203,7 @@ impl GraspRpc {
             cubes.fuse(observation, table, &params, is_wanted)
         });
         let (scenes, observed) = fused.await?;
-        Ok(Prepared { engine, scenes, observed, origin })
+        Ok(Prepared { engine, scenes, observed: Observed { waited, ..observed }, origin })
     }
 
     /// Scores the candidates of a request.
@@ -221,6 +216,12 @@ impl GraspRpc {
         let pb::ScoreGraspsRequest { candidates: messages, scene, options, .. } = request;
         let params = DetectParams::try_from(&options.unwrap_or_default())?;
         let candidates: Vec<Candidate> = candidates(&messages, &params)?;
+        // Checked before the views are fused. The resolution is not known yet.
+        let engine = self.models.select(&params.model, &params.version, None)?;
+        if engine.source.network().is_none() {
+            let value = format_args!("`{}`", engine.source.name());
+            return Err(FieldError::new("options.model", value, "which has no network and cannot score").into());
+        }
         let one_cube = |workspace: &Option<pb::Workspace>, field: &'static str| match workspace {
             Some(pb::Workspace { extent: Some(_), .. }) => Err(FieldError::new(field, "given", "must be absent")),
             _ => Ok(()),
@@ -242,11 +243,6 @@ impl GraspRpc {
                 prepared.map_err(|refusal| inside("clouds", refusal))?
             }
         };
-        let source = &prepared.engine.source;
-        if source.network().is_none() {
-            let value = format_args!("`{}`", source.name());
-            return Err(FieldError::new("options.model", value, "which has no network and cannot score").into());
-        }
         PendingReply::score(call, prepared, params, &candidates)?.response(call).await
     }
 
@@ -265,7 +261,7 @@ impl GraspRpc {
         let origin = FrameStamp::checked("workspace.frame_id", frame_id, workspace.stamp)?;
         // The retry hint of a refusal is that of the default model.
         let engine = self.models.select("", "", None)?;
-        let turn = self.conversion(&engine, call.ticket(Priority::Normal)).await?;
+        let (turn, _) = self.conversions.of_request(&engine, call.ticket(Priority::Normal)).await?;
         let edge = workspace.size.unwrap_or(WORKSPACE_SIZE);
         let find = move |_: &dyn Fn() -> bool| {
             let found = match observation {
@@ -288,20 +284,6 @@ impl GraspRpc {
         let (call, _) = self.calls.open(String::new(), context);
         let id = call.id.clone();
         call.end(refusal).status(&id)
-    }
-
-    /// Waits for a turn to convert and fuse, at most until the deadline. Refuses immediately if too many requests wait,
-    /// with the retry hint of a model.
-    pub(super) async fn conversion(&self, engine: &Engine, ticket: Ticket) -> Result<Turn, Refusal> {
-        let turn = self.conversions.take(ticket);
-        let turn = match ticket.deadline {
-            None => turn.await,
-            Some(deadline) => timeout_at(deadline.into(), turn).await.map_err(|_| EngineError::Expired)?,
-        };
-        turn.map_err(|reason| match reason {
-            NoTurn::Full => engine.full("too many requests wait for fusion".to_owned()).into(),
-            NoTurn::Displaced => engine.displaced("too many requests wait for fusion".to_owned()).into(),
-        })
     }
 }
 
@@ -430,6 +412,7 @@ impl GraspService for GraspRpc {
     }
 
     async fn list_models(&self, _: Request<pb::ListModelsRequest>) -> Result<Response<pb::ListModelsResponse>, Status> {
+        self.calls.check_started().map_err(|refusal| refusal.status(""))?;
         Ok(Response::new((&*self.models).into()))
     }
 }

@@ -8,8 +8,8 @@ use grasp_proto::{FieldError, on_a_line};
 /// The only datatype of tensors.
 pub(super) const FP32: &str = "FP32";
 
-/// The parameter with which Triton's clients ask for an empty message after the last response of a stream. There is no
-/// such stream here, so that it has no effect on any server.
+/// With this parameter Triton's clients request an empty message after the last response of a stream. `ModelInfer` is not
+/// a stream, so that it has no effect.
 const EMPTY_FINAL_RESPONSE: &str = "triton_enable_empty_final_response";
 
 /// Refuses parameters: ignoring, for example, a time limit would surprise the client.
@@ -27,8 +27,39 @@ pub(super) fn check_parameters(request: &oip::ModelInferRequest) -> Result<(), F
     Ok(())
 }
 
-/// The validated values of the input `[batch, 1, n, n, n]`.
-pub(super) fn batches(request: &oip::ModelInferRequest, n: usize, max_batch: usize) -> Result<Vec<f32>, FieldError> {
+/// The values of an input.
+pub(super) enum Values<'a> {
+    /// f32, little-endian.
+    Raw(&'a [[u8; 4]]),
+    Numbers(&'a [f32]),
+}
+
+impl Values<'_> {
+    fn len(&self) -> usize {
+        match self {
+            Self::Raw(values) => values.len(),
+            Self::Numbers(values) => values.len(),
+        }
+    }
+
+    /// The values of each volume of `voxels` voxels.
+    pub fn volumes(&self, voxels: usize) -> impl Iterator<Item = Vec<f32>> {
+        (0..self.len() / voxels.max(1)).map(move |index| {
+            let range = index * voxels..(index + 1) * voxels;
+            match self {
+                Self::Raw(values) => values[range].iter().map(|&bytes| f32::from_le_bytes(bytes)).collect(),
+                Self::Numbers(values) => values[range].to_vec(),
+            }
+        })
+    }
+}
+
+/// The number of volumes of a request, and their values: the validated input `[batch, 1, n, n, n]`.
+pub(super) fn batch(
+    request: &oip::ModelInferRequest,
+    n: usize,
+    max_batch: usize,
+) -> Result<(usize, Values<'_>), FieldError> {
     let [InferInputTensor { name, datatype, shape, contents, .. }] = &request.inputs[..] else {
         let needed = format_args!("must contain exactly one tensor, `{INPUT}`");
         return Err(FieldError::new("inputs", format_args!("a list of {}", request.inputs.len()), needed));
@@ -40,29 +71,24 @@ pub(super) fn batches(request: &oip::ModelInferRequest, n: usize, max_batch: usi
         return Err(FieldError::new("inputs[0].datatype", format_args!("`{datatype}`"), "must be FP32"));
     }
     let edge = n as i64;
-    let batch = match shape[..] {
-        [batch, 1, x, y, z] if [x, y, z] == [edge; 3] => usize::try_from(batch).unwrap_or(0),
+    let count = match shape[..] {
+        [count, 1, x, y, z] if [x, y, z] == [edge; 3] => usize::try_from(count).unwrap_or(0),
         _ => 0,
     };
-    if !(1..=max_batch).contains(&batch) {
+    if !(1..=max_batch).contains(&count) {
         let needed = format_args!("must be [batch, 1, {n}, {n}, {n}] with a batch from 1 to {max_batch}");
         return Err(FieldError::new("inputs[0].shape", format_args!("{shape:?}"), needed));
     }
-    let expected = batch * n.pow(3);
-    let values: Vec<f32> = match (&request.raw_input_contents[..], contents) {
-        ([raw], None) if raw.len() % 4 == 0 => {
-            raw.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect()
-        }
-        ([raw], None) => {
-            let needed = format_args!("must be {} bytes for this shape", 4 * expected);
-            return Err(FieldError::new("raw_input_contents[0]", format_args!("{} bytes", raw.len()), needed));
-        }
-        ([], Some(contents)) if contents.fp32_contents.len() != expected => {
-            let value = format_args!("{} values", contents.fp32_contents.len());
-            let needed = format_args!("must be {expected} values for this shape");
-            return Err(FieldError::new("inputs[0]", value, needed));
-        }
-        ([], Some(contents)) => contents.fp32_contents.clone(),
+    let expected = count * n.pow(3);
+    let values = match (&request.raw_input_contents[..], contents) {
+        ([raw], None) => match raw.as_chunks() {
+            (values, []) if values.len() == expected => Values::Raw(values),
+            _ => {
+                let needed = format_args!("must be {} bytes for this shape", 4 * expected);
+                return Err(FieldError::new("raw_input_contents[0]", format_args!("{} bytes", raw.len()), needed));
+            }
+        },
+        ([], Some(contents)) => Values::Numbers(&contents.fp32_contents),
         (raw, contents) => {
             let given = usize::from(contents.is_some());
             let value = format_args!("a list of {} with {given} of contents", raw.len());
@@ -74,12 +100,8 @@ pub(super) fn batches(request: &oip::ModelInferRequest, n: usize, max_batch: usi
         }
     };
     if values.len() == expected {
-        Ok(values)
-    } else {
-        Err(FieldError::new(
-            "inputs[0]",
-            format_args!("{} values", values.len()),
-            format_args!("must be {expected} values for this shape"),
-        ))
+        return Ok((count, values));
     }
+    let needed = format_args!("must be {expected} values for this shape");
+    Err(FieldError::new("inputs[0]", format_args!("{} values", values.len()), needed))
 }

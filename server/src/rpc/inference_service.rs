@@ -17,14 +17,17 @@ use tokio::task::spawn_blocking;
 use tonic::{Request, Response, Status};
 
 use crate::readiness::State;
-use crate::rpc::call::{Call, CallContext, Calls, WARM_UP};
-use crate::rpc::infer_request::{FP32, batches, check_parameters};
+use crate::rpc::call::{Call, CallContext, Calls};
+use crate::rpc::grasp_service::blocking;
+use crate::rpc::infer_request::{FP32, batch, check_parameters};
 use crate::rpc::pending;
 use crate::serving::control::{Change, ModelControl};
 use crate::serving::engine::Engine;
 use crate::serving::job::{EngineError, Reply, Tensors};
+use crate::serving::queue::Ticket;
 use crate::serving::refusal::Refusal;
 use crate::serving::registry::{ModelRegistry, Unavailable};
+use crate::serving::turns::Turns;
 use crate::telemetry::metrics::Metrics;
 use crate::telemetry::timings::StageTimings;
 use crate::transport::response_buffer::{ResponseBuffer, ResponsePermit};
@@ -42,28 +45,37 @@ pub(crate) struct InferenceRpc {
     calls: Calls,
     metrics: Arc<Metrics>,
     control: ModelControl,
+    /// The requests that are converted.
+    conversions: Arc<Turns>,
     /// Limits the memory of maps, which are a hundred times as large as the grasps in them.
     response_buffer: ResponseBuffer,
 }
 
 impl InferenceRpc {
-    pub fn new(models: Arc<ModelRegistry>, calls: Calls, metrics: Arc<Metrics>, control: ModelControl) -> Self {
-        Self { models, calls, metrics, control, response_buffer: ResponseBuffer::new() }
+    pub fn new(
+        models: Arc<ModelRegistry>,
+        calls: Calls,
+        metrics: Arc<Metrics>,
+        control: ModelControl,
+        conversions: Arc<Turns>,
+    ) -> Self {
+        Self { models, calls, metrics, control, conversions, response_buffer: ResponseBuffer::new() }
     }
 
     fn is_ready(&self) -> bool {
         *self.calls.state().borrow() == State::Ready
     }
 
-    /// The network with this name and version. Planners without a network are not found.
-    fn network(&self, name: &str, version: &str) -> Result<Arc<Engine>, Refusal> {
+    /// The network with this name, which is in the field `field`, and version. Planners without a network are not found.
+    fn network(&self, field: &'static str, name: &str, version: &str) -> Result<Arc<Engine>, Refusal> {
+        self.calls.check_started()?;
         let requested = || on_a_line(format!("{name} {version}").trim_end());
         let networks = || {
             let served = self.models.now();
             let names = served.iter().filter(|engine| engine.source.network().is_some());
             names.map(|engine| engine.label.clone()).collect::<Vec<_>>().join(", ")
         };
-        let unknown = || Refusal::UnknownModel { field: "model_name", requested: requested(), available: networks() };
+        let unknown = || Refusal::UnknownModel { field, requested: requested(), available: networks() };
         if name.is_empty() {
             return Err(unknown());
         }
@@ -79,9 +91,7 @@ impl InferenceRpc {
         name: String,
         change: Change,
     ) -> Result<(), Refusal> {
-        if *self.calls.state().borrow() == State::Starting {
-            return Err(Refusal::Starting(WARM_UP));
-        }
+        self.calls.check_started()?;
         one_repository(repository)?;
         if let Some(parameter) = parameters.keys().min() {
             let value = format_args!("`{}`", on_a_line(parameter));
@@ -124,41 +134,68 @@ impl InferenceRpc {
     }
 
     /// Validates a request and queues each of its volumes.
-    fn submit(&self, request: &oip::ModelInferRequest, call: &mut Call) -> Result<Queued, Refusal> {
-        check_parameters(request)?;
-        let engine = self.network(&request.model_name, &request.model_version)?;
+    async fn submit(&self, request: oip::ModelInferRequest, call: &mut Call) -> Result<Queued, Refusal> {
+        check_parameters(&request)?;
+        let engine = self.network("model_name", &request.model_name, &request.model_version)?;
         call.set_model(&engine);
-        engine.check_capacity(call.ticket(Priority::Normal))?;
-        let network = engine.source.network().map(|entry| &entry.metadata);
-        let (n, voxel_size) = network.map_or((0, 0.0), |metadata| (metadata.resolution, metadata.voxel_size));
         for output in &request.outputs {
             if !OUTPUTS.iter().any(|(name, _)| *name == output.name) {
                 let needed = "must be quality, rotation or width";
                 return Err(FieldError::new("outputs", format_args!("`{}`", output.name), needed).into());
             }
         }
-        let batch = batches(request, n, max_batch(&engine))?;
-        let permit = self.response_buffer.acquire(batch.len() * MAPS_PER_VOXEL).ok_or_else(|| {
-            let capacity = ResponseBuffer::CAPACITY >> 20;
-            engine.overloaded(format!("the buffer of unread ModelInfer responses is full ({capacity} MiB)"))
-        })?;
-        let volume = |values: &[f32]| {
-            let volume = Volume::new(n, voxel_size, Isometry3::identity(), values.to_vec());
-            volume.map_err(|error| {
-                Refusal::from(FieldError { field: "inputs[0]".into(), message: format!("inputs[0]: {error}") })
-            })
-        };
-        let volumes = batch.chunks_exact(n.pow(3)).map(volume).collect::<Result<Vec<_>, _>>()?;
-        let replies = engine.maps(volumes, call.ticket(Priority::Normal), call.span())?;
-        Ok(Queued { engine, replies, permit })
+        let ticket = call.ticket(Priority::Normal);
+        engine.check_capacity(1, ticket)?;
+        let (turn, waited) = self.conversions.of_request(&engine, ticket).await?;
+        let (selected, buffer) = (Arc::clone(&engine), self.response_buffer.clone());
+        let converted = blocking(turn, call.deadline, move |_| convert(request, &selected, ticket, &buffer));
+        let Converted { request, volumes, permit } = converted.await?;
+        let replies = engine.maps(volumes, ticket, call.span())?;
+        Ok(Queued { engine, request, replies, waited, permit })
     }
 }
 
 /// The queued volumes of a request.
 struct Queued {
     engine: Arc<Engine>,
+    /// Without the values of its input.
+    request: oip::ModelInferRequest,
     replies: Vec<Reply<Tensors>>,
+    /// The time that the request waited for its conversion.
+    waited: Duration,
     permit: ResponsePermit,
+}
+
+struct Converted {
+    request: oip::ModelInferRequest,
+    volumes: Vec<Volume>,
+    permit: ResponsePermit,
+}
+
+/// Validates the volumes of a request, and reserves the memory of its response.
+fn convert(
+    mut request: oip::ModelInferRequest,
+    engine: &Engine,
+    ticket: Ticket,
+    buffer: &ResponseBuffer,
+) -> Result<Converted, Refusal> {
+    let network = engine.source.network().map(|entry| &entry.metadata);
+    let (n, voxel_size) = network.map_or((0, 0.0), |metadata| (metadata.resolution, metadata.voxel_size));
+    let (count, values) = batch(&request, n, max_batch(engine))?;
+    engine.check_capacity(count, ticket)?;
+    let permit = buffer.acquire(count * n.pow(3) * MAPS_PER_VOXEL).ok_or_else(|| {
+        let capacity = ResponseBuffer::CAPACITY >> 20;
+        engine.overloaded(format!("the buffer of unread ModelInfer responses is full ({capacity} MiB)"))
+    })?;
+    let volume = |values: Vec<f32>| {
+        let volume = Volume::new(n, voxel_size, Isometry3::identity(), values);
+        volume.map_err(|error| {
+            Refusal::from(FieldError { field: "inputs[0]".into(), message: format!("inputs[0]: {error}") })
+        })
+    };
+    let volumes = values.volumes(n.pow(3)).map(volume).collect::<Result<_, _>>()?;
+    (request.inputs, request.raw_input_contents) = (Vec::new(), Vec::new());
+    Ok(Converted { request, volumes, permit })
 }
 
 fn one_repository(name: &str) -> Result<(), FieldError> {
@@ -166,12 +203,6 @@ fn one_repository(name: &str) -> Result<(), FieldError> {
         return Ok(());
     }
     Err(FieldError::new("repository_name", format_args!("`{}`", on_a_line(name)), "must be empty"))
-}
-
-/// Runs `work` on a thread for blocking tasks, because it copies megabytes.
-async fn copying<T: Send + 'static>(id: &str, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Status> {
-    let copied = spawn_blocking(work).await;
-    copied.map_err(|panic| Refusal::from(EngineError::Panic(panic.to_string())).status(id))
 }
 
 /// The response: the maps of all volumes, concatenated to one tensor per requested output.
@@ -234,7 +265,7 @@ impl GrpcInferenceService for InferenceRpc {
         request: Request<oip::ModelReadyRequest>,
     ) -> Result<Response<oip::ModelReadyResponse>, Status> {
         let oip::ModelReadyRequest { name, version } = request.into_inner();
-        let ready = self.is_ready() && self.network(&name, &version).is_ok();
+        let ready = self.is_ready() && self.network("name", &name, &version).is_ok();
         Ok(Response::new(oip::ModelReadyResponse { ready }))
     }
 
@@ -254,7 +285,7 @@ impl GrpcInferenceService for InferenceRpc {
         request: Request<oip::ModelMetadataRequest>,
     ) -> Result<Response<oip::ModelMetadataResponse>, Status> {
         let oip::ModelMetadataRequest { name, version } = request.into_inner();
-        let engine = self.network(&name, &version).map_err(|refusal| refusal.status(""))?;
+        let engine = self.network("name", &name, &version).map_err(|refusal| refusal.status(""))?;
         let tensor = |name: &str, channels: usize| {
             let edge = edge(&engine);
             let shape = vec![-1, channels as i64, edge, edge, edge];
@@ -277,22 +308,24 @@ impl GrpcInferenceService for InferenceRpc {
     ) -> Result<Response<oip::ModelInferResponse>, Status> {
         let context = CallContext::of(&request);
         let request = request.into_inner();
-        let (mut call, checked) = self.calls.open(request.id.clone(), context);
+        let (mut call, checked) = self.calls.open_with("id", request.id.clone(), context);
         let id = call.id.clone();
-        let inference = self.clone();
-        let (mut call, request, queued) = copying(&id, move || {
-            let queued = checked.and_then(|()| inference.submit(&request, &mut call));
-            (call, request, queued)
-        })
-        .await?;
+        let queued = match checked {
+            Ok(()) => self.submit(request, &mut call).await,
+            Err(refusal) => Err(refusal),
+        };
         let outcome = match queued {
-            Ok(Queued { engine, replies, permit }) => {
-                pending::maps(&mut call, replies).await.map(|maps| (engine, permit, maps))
+            Ok(Queued { engine, request, replies, waited, permit }) => {
+                let maps = pending::maps(&mut call, replies, waited).await;
+                maps.map(|(maps, timings)| (engine, request, maps, timings, permit))
             }
             Err(refusal) => Err(refusal),
         };
-        let (engine, permit, (maps, timings)) = outcome.map_err(|refusal| call.end(refusal).status(&id))?;
-        let mut response = Response::new(copying(&id, move || response(request, &engine, &maps, &timings)).await?);
+        let (engine, request, maps, timings, permit) = outcome.map_err(|refusal| call.end(refusal).status(&id))?;
+        // Copies megabytes.
+        let copied = spawn_blocking(move || response(request, &engine, &maps, &timings)).await;
+        let copied = copied.map_err(|panic| Refusal::from(EngineError::Panic(panic.to_string())).status(&id))?;
+        let mut response = Response::new(copied);
         response.extensions_mut().insert(permit);
         Ok(response)
     }
@@ -302,7 +335,7 @@ impl GrpcInferenceService for InferenceRpc {
         request: Request<oip::ModelConfigRequest>,
     ) -> Result<Response<oip::ModelConfigResponse>, Status> {
         let oip::ModelConfigRequest { name, version } = request.into_inner();
-        let engine = self.network(&name, &version).map_err(|refusal| refusal.status(""))?;
+        let engine = self.network("name", &name, &version).map_err(|refusal| refusal.status(""))?;
         let edge = edge(&engine);
         let (data_type, dims) =
             (oip::DataType::TypeFp32.into(), |channels: usize| vec![channels as i64, edge, edge, edge]);
@@ -328,16 +361,17 @@ impl GrpcInferenceService for InferenceRpc {
         request: Request<oip::ModelStatisticsRequest>,
     ) -> Result<Response<oip::ModelStatisticsResponse>, Status> {
         let oip::ModelStatisticsRequest { name, version } = request.into_inner();
+        self.calls.check_started().map_err(|refusal| refusal.status(""))?;
         let served = self.models.now();
-        let is_asked = |engine: &&Arc<Engine>| {
+        let is_requested = |engine: &&Arc<Engine>| {
             engine.source.network().is_some()
                 && (name.is_empty() || engine.source.name() == name)
                 && (version.is_empty() || engine.source.version() == version)
         };
         if !name.is_empty() {
-            self.network(&name, &version).map_err(|refusal| refusal.status(""))?;
+            self.network("name", &name, &version).map_err(|refusal| refusal.status(""))?;
         }
-        let model_stats = served.iter().filter(is_asked).map(|engine| self.statistics(engine)).collect();
+        let model_stats = served.iter().filter(is_requested).map(|engine| self.statistics(engine)).collect();
         Ok(Response::new(oip::ModelStatisticsResponse { model_stats }))
     }
 
@@ -347,6 +381,7 @@ impl GrpcInferenceService for InferenceRpc {
     ) -> Result<Response<oip::RepositoryIndexResponse>, Status> {
         let oip::RepositoryIndexRequest { repository_name, ready } = request.into_inner();
         one_repository(&repository_name).map_err(|error| Refusal::from(error).status(""))?;
+        self.calls.check_started().map_err(|refusal| refusal.status(""))?;
         let served = self.models.now();
         let networks = served.iter().filter(|engine| engine.source.network().is_some());
         let mut models: Vec<_> = networks

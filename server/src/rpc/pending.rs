@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use futures_util::future::try_join_all;
 use grasp::Warning;
 use grasp_proto::{Candidate, DetectParams, pb};
 
@@ -31,7 +32,7 @@ pub(crate) struct PendingReply<T = Detection> {
     params: DetectParams,
     /// The smallest quality of a grasp.
     threshold: f32,
-    /// Time until the scenes were queued, without the fusion.
+    /// Time until the scenes were queued, without the fusion and the waiting for it.
     preprocessing: Duration,
     observed: Observed,
     origin: FrameStamp,
@@ -47,7 +48,8 @@ impl<T> PendingReply<T> {
     ) -> Result<Self, Refusal> {
         let Prepared { engine, scenes, mut observed, origin } = prepared;
         observed.warnings.extend(params.table.and_then(|expected| table_warning(&scenes, expected)));
-        let preprocessing = call.elapsed().saturating_sub(observed.fusion.unwrap_or_default());
+        let others = observed.fusion.unwrap_or_default() + observed.waited;
+        let preprocessing = call.elapsed().saturating_sub(others);
         let threshold = params.decode_params(engine.source.decode_params()).threshold;
         Ok(Self { replies: push(&engine, scenes)?, params, threshold, preprocessing, observed, origin })
     }
@@ -64,7 +66,7 @@ impl PendingReply {
     /// Waits for the grasps, and records the success.
     pub async fn response(self, call: &mut Call) -> Result<pb::DetectGraspsResponse, Refusal> {
         let Self { replies, params, threshold, preprocessing, observed, origin } = self;
-        let Observed { fusion, warnings, table, depth_factors } = observed;
+        let Observed { waited, fusion, warnings, table, depth_factors } = observed;
         let (cubes, stages) = all(replies, call).await?;
         let Detection { grasps: found, dropped, over_limit, volumes } = Detection::merged(cubes, &params, threshold);
 
@@ -91,7 +93,8 @@ impl PendingReply {
         let finger_depth = params.hand.map_or(grasp::FINGER_DEPTH, |hand| hand.depth);
         let warnings = call.warned(&warnings);
         let messages = warnings.iter().map(|warning| warning.message.clone()).collect();
-        let timings = StageTimings { preprocessing, fusion, total: call.elapsed(), ..stages };
+        let queue = waited + stages.queue;
+        let timings = StageTimings { queue, preprocessing, fusion, total: call.elapsed(), ..stages };
         let shown = Shown::new(timings, volumes, found, finger_depth, messages);
         call.succeeded(&timings, grasps.len(), Outcome::Detected(Box::new(shown)));
         Ok(pb::DetectGraspsResponse {
@@ -125,10 +128,11 @@ impl PendingReply<Vec<Score>> {
     /// Waits for the scores, and records the success.
     pub async fn response(self, call: &mut Call) -> Result<pb::ScoreGraspsResponse, Refusal> {
         let Self { replies, preprocessing, observed, origin, .. } = self;
-        let Observed { fusion, warnings, table, depth_factors } = observed;
+        let Observed { waited, fusion, warnings, table, depth_factors } = observed;
         let (values, stages) = all(replies, call).await?;
         let warnings = call.warned(&warnings);
-        let timings = StageTimings { preprocessing, fusion, total: call.elapsed(), ..stages };
+        let queue = waited + stages.queue;
+        let timings = StageTimings { queue, preprocessing, fusion, total: call.elapsed(), ..stages };
         call.succeeded(&timings, 0, Outcome::Scored(timings));
         Ok(pb::ScoreGraspsResponse {
             request_id: call.id.clone(),
@@ -145,21 +149,24 @@ impl PendingReply<Vec<Score>> {
     }
 }
 
-/// Waits for the maps of each volume, and records the success. The timings are those of the slowest volume.
+/// Waits for the maps of each volume, and records the success. The timings are those of the slowest volume. `waited` is the
+/// time that the request waited for its conversion.
 pub(super) async fn maps(
     call: &mut Call,
     replies: Vec<Reply<Tensors>>,
+    waited: Duration,
 ) -> Result<(Vec<Tensors>, StageTimings), Refusal> {
-    let preprocessing = call.elapsed();
+    let preprocessing = call.elapsed().saturating_sub(waited);
     let mut maps = Vec::with_capacity(replies.len());
     let mut timings = StageTimings { preprocessing, ..StageTimings::default() };
-    for reply in replies {
-        let SessionOutput { value, queue, inference, postprocessing, .. } = reply.wait(call.deadline).await?;
+    for output in outputs(replies, call).await? {
+        let SessionOutput { value, queue, inference, postprocessing, .. } = output;
         maps.push(value);
         if queue + inference >= timings.queue + timings.inference {
             timings = StageTimings { queue, inference, postprocessing, ..timings };
         }
     }
+    timings.queue += waited;
     timings.total = call.elapsed();
     call.succeeded(&timings, 0, Outcome::Inferred(timings));
     Ok((maps, timings))
@@ -172,8 +179,8 @@ async fn all<T>(replies: Vec<Reply<T>>, call: &Call) -> Result<(Vec<T>, StageTim
     // When the first cube was taken from the queue, and the last one had passed each stage.
     let mut taken = Duration::MAX;
     let (mut inferred, mut evaluated, mut decoded) = (Duration::ZERO, None, Duration::ZERO);
-    for reply in replies {
-        let SessionOutput { value, queue, inference, evaluation, postprocessing } = reply.wait(call.deadline).await?;
+    for output in outputs(replies, call).await? {
+        let SessionOutput { value, queue, inference, evaluation, postprocessing } = output;
         values.push(value);
         taken = taken.min(queue);
         inferred = inferred.max(queue + inference);
@@ -188,6 +195,11 @@ async fn all<T>(replies: Vec<Reply<T>>, call: &Call) -> Result<(Vec<T>, StageTim
         ..StageTimings::default()
     };
     Ok((values, stages))
+}
+
+/// Waits for all results of a request. The first error ends the waiting, and the other scenes leave the queue.
+async fn outputs<T>(replies: Vec<Reply<T>>, call: &Call) -> Result<Vec<SessionOutput<T>>, EngineError> {
+    try_join_all(replies.into_iter().map(|reply| reply.wait(call.deadline))).await
 }
 
 /// The warning about the table, unless it is as expected in one of the cubes.

@@ -16,6 +16,7 @@ use crate::readiness::draining;
 use crate::rpc::call::{Call, CallContext};
 use crate::rpc::grasp_service::{GraspRpc, PendingCall, blocking};
 use crate::rpc::pending::{PendingReply, Prepared};
+use crate::serving::observation::Observed;
 use crate::serving::refusal::Refusal;
 use crate::serving::tracking::{Start, Track, TrackPermit};
 use crate::telemetry::recorder::Pending;
@@ -36,14 +37,22 @@ impl GraspRpc {
             while let Ok(slot) = pending.reserve().await {
                 let message = tokio::select! {
                     message = requests.message() => message,
-                    () = draining(service.calls.state()) => return slot.send(Err(service.refuse(Refusal::Draining, context))),
+                    () = draining(service.calls.state()) => {
+                        return slot.send(Err(service.refuse(Refusal::Draining, context)));
+                    }
                 };
                 match message {
                     Ok(Some(mut request)) => {
                         let recording = service.recorder.request(|| Recorded::Volume(request.clone()));
                         let id = std::mem::take(&mut request.request_id);
                         let submit = async |call: &mut Call| service.submit(request, call).await;
-                        slot.send(Ok(service.begin(id, context.clone(), recording, submit).await));
+                        tokio::select! {
+                            // Polls the request first, so that it is opened and counted.
+                            biased;
+                            call = service.begin(id, context.clone(), recording, submit) => slot.send(Ok(call)),
+                            // The client has closed the stream; the call counts as cancelled.
+                            () = pending.closed() => return,
+                        }
                     }
                     Ok(None) => return,
                     // Too large or malformed: the framing of messages is lost, so the stream ends with this status.
@@ -139,7 +148,7 @@ impl GraspRpc {
             return Err(FieldError::new("half_life", half_life, "must be absent without a workspace").into());
         }
         let start = workspace.map(|workspace| Start::checked(workspace, half_life)).transpose()?;
-        let turn = self.conversion(&engine, call.ticket(params.priority)).await?;
+        let (turn, waited) = self.conversions.of_request(&engine, call.ticket(params.priority)).await?;
         if let Some(start) = &start {
             // Not fewer: if the request fails, the stream keeps its volumes.
             let needed = start.volumes(&engine, &params)?.max(volumes.count());
@@ -154,6 +163,7 @@ impl GraspRpc {
         (*track, *views_added) = (new, fused.is_ok());
         self.tracked_volumes.resize(volumes, track.as_ref().map_or(1, Track::volumes))?;
         let ((scenes, observed), origin) = fused?;
+        let observed = Observed { waited, ..observed };
         PendingReply::detect(call, Prepared { engine, scenes, observed, origin }, params)
     }
 }

@@ -1,5 +1,7 @@
 //! Requests of clients to load and unload models.
 
+use std::time::Duration;
+
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 
@@ -30,6 +32,9 @@ pub(super) struct Command {
 /// Requests that wait for the one before them.
 const WAITING: usize = 8;
 
+/// Retry hint if too many requests wait: loading and warming up a model takes seconds.
+const LOADING: Duration = Duration::from_secs(5);
+
 impl ModelControl {
     pub(super) fn new(is_allowed: bool) -> (Self, mpsc::Receiver<Command>) {
         let (commands, receiver) = mpsc::channel(WAITING);
@@ -43,9 +48,7 @@ impl ModelControl {
         }
         let (done, outcome) = oneshot::channel();
         self.commands.try_send(Command { name, change, done }).map_err(|error| match error {
-            TrySendError::Full(_) => {
-                Refusal::NotChanged(format!("{WAITING} requests to load or unload models already wait; retry later"))
-            }
+            TrySendError::Full(_) => Refusal::ManyChanges(WAITING, LOADING),
             TrySendError::Closed(_) => Refusal::Draining,
         })?;
         // The folder's task ends only with the server.

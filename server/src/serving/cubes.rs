@@ -150,7 +150,10 @@ impl Cubes {
         let objects = observation.objects(&self.frame_from_task, &params.objects)?;
         let points = self.integrate(&observation, &mut warnings, is_wanted)?;
         let scenes = self.scenes(points, objects.as_ref(), params)?;
-        Ok((scenes, Observed { fusion: Some(started.elapsed()), warnings, table: found, depth_factors }))
+        Ok((
+            scenes,
+            Observed { fusion: Some(started.elapsed()), warnings, table: found, depth_factors, ..Observed::default() },
+        ))
     }
 
     /// Corrects the scale of the depths if `correct_depth_scale` is set, so that the table is at the height `table`, metres.

@@ -175,12 +175,14 @@ impl Engine {
         Err(FieldError::new("workspace.extent", value, needed))
     }
 
-    /// Refuses a request that the queue would refuse now, before the caller converts and fuses data.
-    pub fn check_capacity(&self, ticket: Ticket) -> Result<(), EngineError> {
+    /// Refuses a request with this number of scenes that the queue would refuse now, before the caller converts and fuses
+    /// data.
+    pub fn check_capacity(&self, scenes: usize, ticket: Ticket) -> Result<(), EngineError> {
         if self.is_hanging() {
             return Err(EngineError::NoSession);
         }
-        self.queue.check(ticket, self.service_time.get()).map_err(|refused| self.refused(&refused).into())
+        let checked = self.queue.check(scenes, ticket, self.service_time.get());
+        checked.map_err(|refused| self.refused(&refused, scenes).into())
     }
 
     /// Queues the scenes of a request. `task` says what to compute from one of them, for the receiver of its result.
@@ -203,21 +205,26 @@ impl Engine {
         let (jobs, receivers): (Vec<_>, Vec<_>) = scenes.map(job).unzip();
         // The queue is open: only dropping the engine closes it.
         let pushed = self.queue.push(jobs, ticket, self.service_time.get());
-        let (slots, displaced) = pushed.map_err(|refused| self.refused(&refused))?;
+        let (slots, displaced) = pushed.map_err(|refused| self.refused(&refused, receivers.len()))?;
         self.queued[ticket.priority as usize].inc_by(slots.len() as u64);
-        displaced.into_iter().for_each(|job| job.task.fail(self.displaced(self.queue_is_full()).into()));
+        displaced.into_iter().for_each(|job| job.task.fail(self.displaced(self.queue_is_full(1)).into()));
         Ok(receivers.into_iter().zip(slots).map(|(receiver, slot)| Reply::new(receiver, slot)).collect())
     }
 
-    fn refused(&self, refused: &Refused) -> Overloaded {
+    /// The refusal of a request with this number of scenes.
+    fn refused(&self, refused: &Refused, scenes: usize) -> Overloaded {
         match refused {
-            Refused::Full => self.full(self.queue_is_full()),
+            Refused::Full => self.full(self.queue_is_full(scenes)),
             Refused::TooLate(estimate) => self.too_late(*estimate),
         }
     }
 
-    fn queue_is_full(&self) -> String {
-        format!("the queue of the model `{}` is full ({} requests)", self.source.name(), self.capacity())
+    fn queue_is_full(&self, scenes: usize) -> String {
+        let (name, capacity) = (self.source.name(), self.capacity());
+        match scenes {
+            1 => format!("the queue of the model `{name}` is full ({capacity} requests)"),
+            _ => format!("the queue of the model `{name}` has too few free places for {scenes} scenes (of {capacity})"),
+        }
     }
 
     /// The refusal of a request for which there is no place, for this reason.

@@ -44,6 +44,8 @@ pub(crate) enum EngineError {
     SessionEnded,
     #[error("the deadline passed before the request was finished")]
     Expired,
+    #[error("the inference takes about {0:.0?}, longer than the time that is left until the deadline")]
+    NoTimeLeft(Duration),
     #[error("the inference takes longer than {0:?} (--inference-timeout)")]
     Hanging(Duration),
     #[error("all sessions of the model hang in an inference; retry on another replica")]

@@ -21,6 +21,8 @@ pub(crate) type Placed = (Observation, Option<pb::FoundTable>);
 /// What the fusion of a request's views showed. The default is a request with a volume.
 #[derive(Default)]
 pub(crate) struct Observed {
+    /// The time that the request waited for its conversion and fusion.
+    pub waited: Duration,
     /// The time that the fusion took.
     pub fusion: Option<Duration>,
     /// Signs that the geometry of the request is wrong.
@@ -43,6 +45,7 @@ impl Observation {
         table: f64,
         edge: f64,
     ) -> Result<Placed, FieldError> {
+        // Before a view is decoded to find the table.
         check_png(views)?;
         let table = workspace.find_table(views, table, edge)?;
         Ok((Self::depth(views, &workspace.frame_from_task)?, table))

@@ -61,7 +61,7 @@ pub(crate) struct Service {
 /// Why a job is refused.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Refused {
-    /// The queue is full.
+    /// There are not enough places for all jobs of the request.
     Full,
     /// The job would be done only after its deadline: the estimated time until then.
     TooLate(Duration),
@@ -104,9 +104,9 @@ impl<T> Queue<T> {
         Ok((slots, displaced))
     }
 
-    /// Whether [`push`](Self::push) would accept one job now.
-    pub fn check(&self, ticket: Ticket, service: Service) -> Result<(), Refused> {
-        self.admit(&self.lock(), 1, ticket, service)
+    /// Whether [`push`](Self::push) would accept this number of jobs now.
+    pub fn check(&self, jobs: usize, ticket: Ticket, service: Service) -> Result<(), Refused> {
+        self.admit(&self.lock(), jobs, ticket, service)
     }
 
     /// Whether there are places for all jobs of a request, and time.
@@ -375,12 +375,12 @@ mod tests {
         let mut slots: Vec<_> = (0..4).map(|job| push(1, job).ok().unwrap()).collect();
         assert_eq!(push(1, 4).err(), Some(Refused::Full));
         for (job, displaced) in [(20, 3), (21, 2)] {
-            assert!(queue.check(ticket(caller(2), Priority::Normal), Service::default()).is_ok());
+            assert!(queue.check(1, ticket(caller(2), Priority::Normal), Service::default()).is_ok());
             let (slot, job) = push(2, job).ok().unwrap();
             assert_eq!(job, [displaced]);
             slots.push((slot, Vec::new()));
         }
-        assert_eq!(queue.check(ticket(caller(2), Priority::Normal), Service::default()), Err(Refused::Full));
+        assert_eq!(queue.check(1, ticket(caller(2), Priority::Normal), Service::default()), Err(Refused::Full));
         assert_eq!(push(2, 22).err(), Some(Refused::Full), "both have two");
         assert_eq!((gauge.get(), queue.waiting()), (4, 4));
         queue.free();

@@ -32,6 +32,8 @@ pub(crate) enum Refusal {
     NoModelControl,
     #[error("{0}")]
     NotChanged(String),
+    #[error("{0} requests to load or unload models already wait; retry after {1:?}")]
+    ManyChanges(usize, Duration),
     #[error(transparent)]
     Failed(EngineError),
 }
@@ -53,13 +55,13 @@ impl Refusal {
         match self {
             Self::Field(_) => Code::InvalidArgument,
             Self::UnknownModel { .. } => Code::NotFound,
-            Self::Overloaded(_) | Self::TooManyTracked { .. } => Code::ResourceExhausted,
+            Self::Overloaded(_) | Self::TooManyTracked { .. } | Self::ManyChanges(..) => Code::ResourceExhausted,
             Self::Starting(_) | Self::Draining => Code::Unavailable,
             Self::TrackExpired(_) => Code::Aborted,
             Self::TokenRemoved => Code::Unauthenticated,
             Self::NoModelControl => Code::PermissionDenied,
             Self::NotChanged(_) => Code::FailedPrecondition,
-            Self::Failed(EngineError::Expired) => Code::DeadlineExceeded,
+            Self::Failed(EngineError::Expired | EngineError::NoTimeLeft(_)) => Code::DeadlineExceeded,
             Self::Failed(EngineError::NoSession) => Code::Unavailable,
             Self::Failed(_) => Code::Internal,
         }
@@ -78,7 +80,7 @@ impl Refusal {
     pub fn retry_after(&self) -> Option<Duration> {
         match self {
             Self::Overloaded(overloaded) => Some(overloaded.retry_after),
-            Self::Starting(retry_after) => Some(*retry_after),
+            Self::Starting(retry_after) | Self::ManyChanges(_, retry_after) => Some(*retry_after),
             Self::TooManyTracked { .. } => Some(STREAMS_IN_USE),
             Self::Field(_)
             | Self::UnknownModel { .. }

@@ -22,7 +22,7 @@ pub(crate) struct Unavailable {
     pub reason: String,
 }
 
-/// The default network first, then the other networks by name, then those with an evaluator, then the planners without a
+/// The default model first, then the other networks by name, then those with an evaluator, then the planners without a
 /// network; per name the newest version first.
 pub(crate) type Engines = Arc<[Arc<Engine>]>;
 
@@ -33,7 +33,7 @@ impl ModelRegistry {
     }
 
     pub fn replace(&self, mut engines: Vec<Arc<Engine>>, default: Option<&str>) {
-        // The sort by name is stable, so versions remain sorted. Only networks can be the default.
+        // The sort by name is stable, so versions remain sorted. Only models with a network can be the default.
         engines.sort_by(|a, b| b.source.by_version(&a.source));
         engines.sort_by_key(|engine| {
             let name = engine.source.name().to_owned();

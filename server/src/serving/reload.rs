@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use anyhow::ensure;
 use grasp_models::{Entry, Options, read_regular_file};
 use grasp_proto::on_a_line;
 use tokio::signal::unix::Signal;
@@ -122,13 +123,23 @@ impl ModelFolder {
         if let Some(error) = files.rejected.into_iter().next() {
             return Err(error.into());
         }
+        if let Some(default) = &self.default_model {
+            let networks = files.sources.iter().filter(|source| source.network().is_some());
+            let names: BTreeSet<&str> = networks.map(Source::name).collect();
+            let available = || names.iter().copied().collect::<Vec<_>>().join(", ");
+            ensure!(
+                names.contains(&**default),
+                "--default-model is `{default}`, which is not in the model folder; available: {}",
+                available()
+            );
+        }
         for source in files.sources {
             if self.is_draining() {
                 return Ok(());
             }
             engines.push(self.start(source)?);
         }
-        self.replace(engines, self.default().as_deref());
+        self.replace(engines, &self.defaults());
         Ok(())
     }
 
@@ -297,7 +308,7 @@ impl ModelFolder {
                 return self.metrics.reloaded(Err(()));
             }
         };
-        let default = self.default();
+        let defaults = self.defaults();
         let served = self.models.now();
         let unloaded = self.unloaded().clone();
         let reason = "a client has unloaded it";
@@ -354,7 +365,7 @@ impl ModelFolder {
         if engines.iter().all(|engine| engine.source.network().is_none()) {
             warn!("the model folder contains no network that can be served; the served models are unchanged");
         } else {
-            self.replace(engines, default.as_deref());
+            self.replace(engines, &defaults);
         }
         self.models.set_unavailable(unavailable);
         self.completed.store(number, Ordering::Relaxed);
@@ -367,19 +378,24 @@ impl ModelFolder {
         Engine::start(source, &self.serving, &self.metrics, &self.sessions).map(Arc::new)
     }
 
-    /// The name of the default model, if it is set.
-    fn default(&self) -> Option<String> {
-        self.default_model.clone().or_else(|| default_of(&self.directory))
+    /// The names of the default model that are set: the first that is served is the default.
+    fn defaults(&self) -> Vec<DefaultName> {
+        let flag = self.default_model.clone().map(|name| DefaultName { name, setting: "--default-model" });
+        let file = default_of(&self.directory).map(|name| DefaultName { name, setting: "the file `default`" });
+        flag.into_iter().chain(file).collect()
     }
 
-    fn replace(&self, engines: Vec<Arc<Engine>>, default: Option<&str>) {
+    fn replace(&self, engines: Vec<Arc<Engine>>, defaults: &[DefaultName]) {
         let before = self.models.now();
-        if default.is_some_and(|name| engines.iter().all(|engine| engine.source.name() != name)) {
-            // The name is not logged: if the file `default` is a link to another file, it is that file's content.
-            let setting = if self.default_model.is_some() { "--default-model" } else { "the file `default`" };
-            warn!("the model named by {setting} is not served; the first network by name is the default instead");
+        let is_served =
+            |name: &str| engines.iter().any(|engine| engine.source.network().is_some() && engine.source.name() == name);
+        let default = defaults.iter().find(|default| is_served(&default.name));
+        // The name is not logged: if the file `default` is a link to another file, it is that file's content.
+        for DefaultName { setting, .. } in defaults.iter().take_while(|default| !is_served(&default.name)) {
+            warn!("the model named by {setting} is not served; another model is the default instead");
         }
-        self.models.replace(engines, default);
+        let default = default.map(|default| default.name.clone());
+        self.models.replace(engines, default.as_deref());
         let now = self.models.now();
         let labels = |engines: &[Arc<Engine>]| engines.iter().map(|engine| engine.labels()).collect::<Vec<_>>();
         self.metrics.replaced(&labels(&before), &labels(&now));
@@ -387,6 +403,12 @@ impl ModelFolder {
             info!(model = removed.label, sha256 = removed.source.sha256(), "model no longer served");
         }
     }
+}
+
+/// The name of a default model, and the setting that it is from.
+struct DefaultName {
+    name: String,
+    setting: &'static str,
 }
 
 /// The name in the file [`DEFAULT`], if there is one.

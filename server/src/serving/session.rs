@@ -81,8 +81,8 @@ struct Batch<'a> {
 }
 
 impl Batch<'_> {
-    /// Counts the time of the batch although its result is not sent, if it is longer than expected: otherwise nothing
-    /// would be learnt from batches whose jobs all expire. The time of an inference that hung says nothing about the next.
+    /// Counts the time of the batch although its result is not sent, if it is longer than expected: otherwise the
+    /// expectation would not change if all jobs of the batches expire. The time of an inference that hung is not typical.
     fn note_delay(&self) {
         let time = self.taken.elapsed();
         if time > self.service_time.get().long && !self.running.is_hanging() {
@@ -90,7 +90,7 @@ impl Batch<'_> {
         }
     }
 
-    /// Counts the outcome of a scene. A request that has expired or that cannot be decoded says nothing about the session.
+    /// Counts the outcome of a scene. That of a request that has expired or cannot be decoded is not the session's.
     fn note_outcome(&mut self, error: Option<&EngineError>) {
         match error {
             None => self.succeeded = Some(true),
@@ -149,10 +149,12 @@ impl Session {
         while let Some(mut jobs) = self.queue.take(batching) {
             let now = Instant::now();
             // While others wait, a job that would end after its deadline is dropped before its inference.
-            let until = if self.queue.waiting() > 0 { now + self.service_time.get().long } else { now };
+            let long = self.service_time.get().long;
+            let until = if self.queue.waiting() > 0 { now + long } else { now };
             let expired = |job: &mut Job| job.deadline.is_some_and(|Deadline(deadline)| deadline <= until);
             for job in jobs.extract_if(.., expired) {
-                job.task.fail(EngineError::Expired);
+                let has_passed = job.deadline.is_some_and(Deadline::has_passed);
+                job.task.fail(if has_passed { EngineError::Expired } else { EngineError::NoTimeLeft(long) });
             }
             // Cancelled jobs leave the queue on their own, except those that are cancelled while they are taken.
             jobs.retain(|job| !job.task.is_closed());
@@ -260,8 +262,8 @@ fn plan(planner: &mut dyn Planner, defaults: DecodeParams, job: Job, mut batch: 
     }
 }
 
-/// Ends the post-processing, which began at `started` and contains the evaluation, and sends its result. The job's part of the span ends before:
-/// otherwise a server that stops after the reply could lose the span.
+/// Ends the post-processing, which began at `started` and contains the evaluation, and sends its result. The job's part
+/// of the span ends before: otherwise a server that stops after the reply could lose the span.
 fn send_result<T: Send + 'static>(
     reply: Sender<T>,
     span: Span,

@@ -179,10 +179,9 @@ impl SessionThreads {
         }
     }
 
-    /// Waits until the session threads end, at most `timeout`. A session ends when its engine is dropped and its queue
+    /// Waits for the session threads to end, not after `until`. A session ends when its engine is dropped and its queue
     /// is empty.
-    pub fn join(&self, timeout: Duration) {
-        let until = Instant::now() + timeout;
+    pub fn join(&self, until: Instant) {
         let threads = std::mem::take(&mut *self.threads());
         for SessionThread { thread, .. } in threads {
             while !thread.is_finished() && Instant::now() < until {

@@ -40,6 +40,11 @@ impl TrackedVolumes {
 
     /// Changes the number of a stream's volumes, or refuses immediately.
     pub fn resize(&self, permit: &mut TrackPermit, volumes: usize) -> Result<(), Refusal> {
+        if volumes > self.limit {
+            let value = format_args!("a workspace of {volumes} cubes");
+            let needed = format_args!("must have at most {} (--max-tracked)", self.limit);
+            return Err(FieldError::new("workspace.extent", value, needed).into());
+        }
         let held = permit.count();
         if let Some(surplus) = held.checked_sub(volumes) {
             self.gauge.sub(surplus as i64);

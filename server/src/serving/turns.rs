@@ -1,10 +1,15 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
+use tokio::time::timeout_at;
 
+use super::engine::Engine;
+use super::job::EngineError;
 use super::lines::{Lines, Ticket};
+use super::refusal::Refusal;
 
-/// The right to convert and fuse the views of a request, which needs a CPU and much memory. A bounded number of requests
+/// The right to convert a request and to fuse its views, which needs a CPU and much memory. A bounded number of requests
 /// wait for it, in the same order as in the [`Queue`](super::queue::Queue) of a model.
 pub(crate) struct Turns {
     state: Mutex<State>,
@@ -25,7 +30,7 @@ pub(crate) struct Turn(Option<Arc<Turns>>);
 
 /// Why a request gets no turn.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum NoTurn {
+enum NoTurn {
     /// Too many requests wait.
     Full,
     /// The request of another caller has taken the place.
@@ -45,8 +50,25 @@ impl Turns {
         Arc::new(Self { state: Mutex::new(state), capacity })
     }
 
+    /// Waits for the turn of a request to a model, at most until its deadline, and returns how long it waited. Refuses
+    /// immediately if too many requests wait, with the model's retry hint.
+    pub async fn of_request(self: &Arc<Self>, engine: &Engine, ticket: Ticket) -> Result<(Turn, Duration), Refusal> {
+        let begun = Instant::now();
+        let turn = self.take(ticket);
+        let turn = match ticket.deadline {
+            None => turn.await,
+            Some(deadline) => timeout_at(deadline.into(), turn).await.map_err(|_| EngineError::Expired)?,
+        };
+        let reason = "too many requests wait for conversion and fusion".to_owned();
+        let turn = turn.map_err(|refused| match refused {
+            NoTurn::Full => engine.full(reason),
+            NoTurn::Displaced => engine.displaced(reason),
+        });
+        Ok((turn?, begun.elapsed()))
+    }
+
     /// Waits for a turn, or refuses immediately.
-    pub async fn take(self: &Arc<Self>, ticket: Ticket) -> Result<Turn, NoTurn> {
+    async fn take(self: &Arc<Self>, ticket: Ticket) -> Result<Turn, NoTurn> {
         let (waiting, turn) = match self.enter(ticket)? {
             Ok(turn) => return Ok(turn),
             Err(waiting) => waiting,

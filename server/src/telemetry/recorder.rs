@@ -15,13 +15,16 @@ use grasp_proto::pb;
 use grasp_proto::pb::recording::{Answer, Request};
 use prometheus::IntCounterVec;
 use prost::Message;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tonic::Code;
 use tracing::warn;
 
 use crate::serving::refusal::Refusal;
 
-/// Recordings that wait to be written. Further ones are dropped and counted, so that a slow disk delays no reply.
+/// Recordings that wait to be written, and their bytes. Further ones are dropped and counted, so that a slow disk delays
+/// no reply and fills no memory.
 const WAITING: usize = 64;
+const WAITING_BYTES: usize = 64 << 20;
 
 /// Extension of the files.
 const EXTENSION: &str = "recording";
@@ -34,9 +37,14 @@ const PARTIAL: &str = "part";
 pub(crate) struct Recorder(Option<Arc<Writer>>);
 
 struct Writer {
-    recordings: SyncSender<pb::Recording>,
+    recordings: SyncSender<Waiting>,
+    /// One permit per byte of the recordings that wait.
+    bytes: Arc<Semaphore>,
     outcomes: IntCounterVec,
 }
+
+/// A recording that waits to be written, with the permits of its bytes.
+type Waiting = (pb::Recording, OwnedSemaphorePermit);
 
 /// A request that will be recorded with its answer.
 pub(crate) struct Pending(Option<(Arc<Writer>, pb::Recording)>);
@@ -61,7 +69,8 @@ impl Recorder {
         let counted = outcomes.clone();
         let thread = thread::Builder::new().name("record".to_owned());
         let thread = thread.spawn(move || write(files, &receiver, &counted))?;
-        Ok((Self(Some(Arc::new(Writer { recordings, outcomes }))), thread))
+        let bytes = Arc::new(Semaphore::new(WAITING_BYTES));
+        Ok((Self(Some(Arc::new(Writer { recordings, bytes, outcomes }))), thread))
     }
 
     /// A request, which is copied only if it will be recorded. The copy shares the data of images and volumes.
@@ -82,7 +91,7 @@ impl Pending {
     /// Records the request with its answer.
     pub fn answered<T>(self, outcome: &Result<T, Refusal>, answer: impl FnOnce(&T) -> Answer) {
         let Self(Some((writer, mut recording))) = self else { return };
-        // They say nothing about the request, and would displace those that do.
+        // They depend on the load, not on the request, and would displace those that depend on it.
         let is_overload = |refusal: &Refusal| {
             matches!(refusal.code(), Code::ResourceExhausted | Code::Unavailable | Code::DeadlineExceeded)
         };
@@ -93,15 +102,19 @@ impl Pending {
             Ok(response) => answer(response),
             Err(refusal) => Answer::Error(refusal.into()),
         });
-        if writer.recordings.try_send(recording).is_err() {
+        let bytes = recording.encoded_len().min(WAITING_BYTES);
+        let permit = u32::try_from(bytes).ok();
+        let permit = permit.and_then(|bytes| Arc::clone(&writer.bytes).try_acquire_many_owned(bytes).ok());
+        let sent = permit.and_then(|permit| writer.recordings.try_send((recording, permit)).ok());
+        if sent.is_none() {
             writer.outcomes.with_label_values(&["dropped"]).inc();
         }
     }
 }
 
 /// Writes recordings until the sender is dropped.
-fn write(mut files: Files, recordings: &Receiver<pb::Recording>, outcomes: &IntCounterVec) {
-    while let Ok(recording) = recordings.recv() {
+fn write(mut files: Files, recordings: &Receiver<Waiting>, outcomes: &IntCounterVec) {
+    while let Ok((recording, _permit)) = recordings.recv() {
         let written = files.write(&recording);
         if let Err(error) = &written {
             warn!(%error, folder = %files.folder.display(), "cannot write a recording");
@@ -167,7 +180,7 @@ impl Files {
             // Also if it cannot be removed: the next one is then removed instead.
             self.bytes -= bytes;
             match fs::remove_file(oldest) {
-                // Someone else has removed it.
+                // It was removed before.
                 Err(error) if error.kind() == io::ErrorKind::NotFound => {}
                 removed => removed?,
             }

@@ -1,4 +1,4 @@
-//! Who sent a request.
+//! The caller of a request.
 
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 

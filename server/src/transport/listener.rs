@@ -46,6 +46,8 @@ pub(crate) struct GrpcConfig {
     pub tokens: Option<Arc<Tokens>>,
     /// Maximum number of open connections.
     pub connections: usize,
+    /// Time after which a connection accepts no further calls; None without a limit.
+    pub connection_age: Option<Duration>,
     /// The messages that are being received.
     pub budget: Arc<ReceiveBudget>,
     pub limits: Limits,
@@ -60,7 +62,7 @@ pub(crate) async fn serve(
     metrics: Arc<Metrics>,
     state: watch::Receiver<State>,
 ) -> anyhow::Result<()> {
-    let GrpcConfig { tls, tokens, connections, budget, limits } = config;
+    let GrpcConfig { tls, tokens, connections, connection_age, budget, limits } = config;
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
@@ -88,7 +90,10 @@ pub(crate) async fn serve(
             RequestBody::new(parts.uri.path(), body, deadline, limits, share, Arc::clone(&metrics), drain.clone());
         http::Request::from_parts(parts, Body::new(body))
     });
-    Server::builder()
+    let server = Server::builder();
+    // Open calls are not ended at this age, because there is no grace period.
+    let server = connection_age.into_iter().fold(server, Server::max_connection_age);
+    server
         .layer(intake)
         .layer(outgoing)
         .initial_stream_window_size(STREAM_WINDOW)
