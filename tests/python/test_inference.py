@@ -131,8 +131,8 @@ class InferenceTest(unittest.TestCase):
             (lambda: self.infer(VOLUMES, model="missing"), "NOT_FOUND", "model_name: `missing` not found"),
             (lambda: self.infer(VOLUMES, model="shaf"), "NOT_FOUND", "available: vgn-packed"),
             (lambda: self.infer(VOLUMES, model_version="7"), "NOT_FOUND", "vgn-packed 7"),
-            (lambda: self.client.get_model_metadata("missing"), "NOT_FOUND", "model_name"),
-            (lambda: self.client.get_model_config("missing"), "NOT_FOUND", "model_name"),
+            (lambda: self.client.get_model_metadata("missing"), "NOT_FOUND", "name: `missing` not found"),
+            (lambda: self.client.get_model_config("missing"), "NOT_FOUND", "name: `missing` not found"),
             (lambda: self.infer(VOLUMES[:, :, 1:]), "INVALID_ARGUMENT", "inputs[0].shape is [2, 1, 39, 40, 40]"),
             (lambda: self.infer(VOLUMES[:0]), "INVALID_ARGUMENT", "inputs[0].shape is [0, 1, 40, 40, 40]"),
             (lambda: self.client.infer(MODEL, [other]), "INVALID_ARGUMENT", "inputs[0].name is `input`"),
@@ -218,7 +218,7 @@ class InferenceTest(unittest.TestCase):
         infer = f"/models/{MODEL}/infer"
         for path, body, status, message in [
             ("/models/missing/infer", {"inputs": [tensor]}, 404, "model_name: `missing` not found"),
-            ("/models/missing", None, 404, "model_name: `missing` not found"),
+            ("/models/missing", None, 404, "name: `missing` not found"),
             (infer, {"inputs": [tensor]}, 400, "inputs[0] is 1 values, must be 64000 values"),
             (infer, {"inputs": []}, 400, "inputs is a list of 0"),
             (infer, timeout, 400, "parameters is `timeout`"),
