@@ -290,8 +290,13 @@ fn incomplete_or_invalid_settings_are_errors() {
         let output = command.output().unwrap();
         let text = String::from_utf8(output.stderr).unwrap();
         assert_eq!(output.status.code(), Some(2), "{text}");
-        assert!(text.contains("--tls-cert (GRASPD_TLS_CERT) cannot be used") && text.contains(error), "{text}");
+        let files = "--tls-cert (GRASPD_TLS_CERT) and the other TLS files cannot be used";
+        assert!(text.contains(files) && text.contains(error), "{text}");
     }
+    let mut command = Command::new(graspd());
+    command.args(["--models".as_ref(), folder.path().as_os_str()]).args(["--max-batch", "64"]);
+    let text = String::from_utf8(command.output().unwrap().stderr).unwrap();
+    assert!(text.contains("--max-batch (GRASPD_MAX_BATCH) is `64`: must be at most --queue, 32"), "{text}");
 }
 
 /// The log of a server with these flags and variables, which cannot load ONNX Runtime and so ends at once.

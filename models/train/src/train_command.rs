@@ -77,13 +77,6 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
     // Channels last is faster on CPUs; on a GPU only channels first was measured.
     let execution = ExecutionOptions { device, bf16: training.bf16, channels_last: !device.is_cuda() };
     let mut trainer = Trainer::new(model, dataset, settings.clone(), execution)?;
-    ensure!(
-        trainer.scenes().1 > 0
-            || training.evaluate.is_some()
-            || training.patience.is_none() && training.keep == KeptWeights::Last,
-        "--val is {}, which leaves no scene for the validation that --patience and --keep best need; use a larger one",
-        training.val
-    );
     if let Some(path) = &training.teacher {
         let (teacher, name) = load_teacher(training, path, &metadata)?;
         trainer = trainer.with_teacher(teacher);
@@ -131,6 +124,13 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
             save(&trainer, best, false)?;
         }
     }
+    ensure!(
+        trainer.scenes().1 > 0
+            || training.evaluate.is_some()
+            || training.patience.is_none() && training.keep == KeptWeights::Last,
+        "--val is {}, which leaves no scene for the validation that --patience and --keep best need; use a larger one",
+        training.val
+    );
     print_counts(&trainer);
     eprintln!("device: {}", device::name(device));
 

@@ -6,7 +6,7 @@ use std::process::{Command, Output};
 
 use grasp::gpd::{Candidate, Cloud, Image};
 use grasp::{DecodeParams, Grasp, Patch, SurfacePoint, Volume};
-use grasp_data::{Candidates, Setup, Trial, packed};
+use grasp_data::{Candidates, Provenance, Setup, Trial, packed};
 use grasp_models::gpd::gpd;
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Classifier, Metadata, Options};
@@ -127,8 +127,8 @@ fn a_trained_classifier_plans_in_the_benchmark() {
 /// A data set of volumes that are full or empty between the fingers. Grasps in full volumes succeed.
 fn proposals(folder: &Path) -> PathBuf {
     let path = folder.join("proposals");
-    let setup = Setup::benchmark(support::provenance());
-    let mut writer = packed::Writer::open(&path, &setup).unwrap();
+    let provenance = Provenance { network: Some("vgn-packed".to_owned()), ..support::provenance() };
+    let mut writer = packed::Writer::open(&path, &Setup::benchmark(provenance)).unwrap();
     for number in 0..24_u8 {
         let success = number.is_multiple_of(2);
         let volume = filled(if success { 0.7 } else { 0.2 } + 0.005 * f32::from(number));
