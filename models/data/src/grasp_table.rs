@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::fs::{File, OpenOptions};
-use std::io::{self, BufRead, BufReader, Seek, SeekFrom, Write};
+use std::io::{self, BufRead, BufReader, ErrorKind, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use nalgebra::{Point3, Quaternion, UnitQuaternion};
@@ -54,7 +54,7 @@ impl LengthUnit {
     pub(crate) fn of(folder: &Path) -> Result<Option<Self>, DataError> {
         let path = folder.join(FILE);
         let file = match File::open(&path) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => return Ok(None),
             file => file.at(&path)?,
         };
         let mut reader = csv::Reader::from_reader(file);
