@@ -11,7 +11,6 @@ import os
 import pickle
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -476,25 +475,6 @@ class TrackTest(ServerTest):
                 self.assertEqual(caught.exception.field, "views[0]")
                 kept = tracking.add([good], LOW)
             self.assertEqual(tracking.add().grasps, kept.grasps)
-        self.wait_until_none_is_tracked()
-
-    def test_a_keyboard_interrupt_ends_the_tracking(self):
-        def interrupt(_, frame):
-            # Only while `add` waits for the reply, in gRPC's `_next`.
-            while frame is not None and frame.f_code.co_name != "_next":
-                frame = frame.f_back
-            if frame is not None:
-                signal.setitimer(signal.ITIMER_REAL, 0)
-                raise KeyboardInterrupt
-
-        self.addCleanup(signal.signal, signal.SIGALRM, signal.signal(signal.SIGALRM, interrupt))
-        with self.client.track() as tracking:
-            self.assertTrue(tracking.add(views(), LOW).grasps)
-            with self.assertRaises(KeyboardInterrupt):
-                signal.setitimer(signal.ITIMER_REAL, 0.001, 0.001)
-                tracking.add(views()[:1] * 12)
-            with self.assertRaisesRegex(graspd.Error, "CANCELLED"):
-                tracking.add()
         self.wait_until_none_is_tracked()
 
     def test_tracked_volumes_are_limited_and_expire(self):

@@ -215,16 +215,11 @@ class Tracking:
 
         An invalid view does not end the tracking. If the error has `views_added`, repeat the call without the views.
         `Aborted` ends the tracking, and so does `ResourceExhausted` if the server's limit of tracked volumes is reached
-        when it starts. Calls are not retried. An exception of a signal handler, such as `KeyboardInterrupt`, ends the
-        tracking.
+        when it starts. Calls are not retried.
         """
         self._requests.put(self._adding.request(views, options, request_id, stamp))
         try:
             reply = next(self._replies, None)
         except grpc.RpcError as status:
             raise from_status(status) from None
-        except BaseException:
-            # Otherwise the next call would get the reply of this one.
-            self.close()
-            raise
         return self._adding.answer(reply)
