@@ -3,7 +3,7 @@
 use std::f64::consts::PI;
 
 use grasp::{FINGER_DEPTH, Grasp, MAX_OPENING, RESOLUTION, SurfacePoint};
-use grasp_data::{DISTINCT_YAWS, MAX_CLEARANCE, Trial};
+use grasp_data::{DISTINCT_YAWS, MAX_CLEARANCE, Occupancy, Trial};
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -67,6 +67,17 @@ pub struct LabelledScene {
     pub observations: Vec<LabelObservation>,
     /// Grasp points.
     pub points: Vec<Point>,
+    /// The voxels inside the objects.
+    pub occupancy: Occupancy,
+}
+
+/// The observations of a scene without labels.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ObservedScene {
+    /// Observations; none if the cameras see nothing.
+    pub observations: Vec<LabelObservation>,
+    /// The voxels inside the objects.
+    pub occupancy: Occupancy,
 }
 
 /// An object in a scene.
@@ -158,15 +169,20 @@ impl SceneConfig {
             scale: body.scale,
             pose: world.pose(body.id),
         });
-        (!observations.is_empty()).then(|| LabelledScene { objects: objects.collect(), observations, points })
+        (!observations.is_empty()).then(|| LabelledScene {
+            objects: objects.collect(),
+            observations,
+            points,
+            occupancy: world.occupancy(RESOLUTION),
+        })
     }
 
     /// Observes scene number `index` without trials. The scene is the one that [`label`](Self::label) generates. The
     /// observations are the same, too, if `seed` is [`seed`](Self::seed).
     #[must_use]
-    pub fn observe_again(&self, index: u64, seed: u64) -> Vec<LabelObservation> {
+    pub fn observe_again(&self, index: u64, seed: u64) -> ObservedScene {
         let world = self.scene(&mut self.rng(index));
-        self.observe_world(&world, index, seed)
+        ObservedScene { observations: self.observe_world(&world, index, seed), occupancy: world.occupancy(RESOLUTION) }
     }
 
     /// Uses its own random generator, so that the number of observations does not change the labels.

@@ -4,8 +4,8 @@ use std::ops::RangeInclusive;
 use std::sync::{Mutex, PoisonError};
 
 use anyhow::Context;
-use grasp::{DecodeParams, FINGER_DEPTH};
-use grasp_data::Trial;
+use grasp::{DecodeParams, FINGER_DEPTH, RESOLUTION};
+use grasp_data::{Occupancy, Trial};
 use grasp_planner::{PlanParams, Planner, Scene};
 use nalgebra::{Isometry3, Translation3, Vector3};
 use rand::seq::IndexedRandom;
@@ -25,6 +25,8 @@ pub struct TriedScene {
     /// The trials. A success is a grasp that the hand reached without a contact, and that lifted an object. The share is
     /// 1 if it lifted an object, also after a contact, else 0. The clearance is unknown.
     pub trials: Vec<Trial>,
+    /// The voxels inside the objects.
+    pub occupancy: Occupancy,
 }
 
 impl SceneConfig {
@@ -61,7 +63,7 @@ impl SceneConfig {
             let trial = Trial::new(&grasp, lifted && short_by == 0.0, volume.voxel_size());
             trials.push(Trial { share: if lifted { 1.0 } else { 0.0 }, ..trial });
         }
-        Ok(Some(TriedScene { volume: volume.values().to_vec(), trials }))
+        Ok(Some(TriedScene { volume: volume.values().to_vec(), trials, occupancy: world.occupancy(RESOLUTION) }))
     }
 }
 

@@ -59,6 +59,13 @@ impl Desk {
         scenes.sort();
         scenes
     }
+
+    /// The voxels inside the objects of a packed data set, by the scene's name.
+    fn occupied(&self, name: &str) -> BTreeMap<String, Vec<usize>> {
+        let data = Dataset::open(&[self.path(name)]).unwrap();
+        let occupied = |index| data.occupancy(index).unwrap().occupied().collect();
+        (0..data.len()).map(|index| (data.id(index), occupied(index))).collect()
+    }
 }
 
 fn stderr(output: &Output) -> String {
@@ -151,6 +158,7 @@ fn conversions_keep_all_observations() {
     desk.run(&format!("{LABEL} --scenes 3 --out data"));
     desk.run("convert --from data --out copy");
     assert!(desk.scenes("copy") == desk.scenes("data"));
+    assert!(desk.occupied("copy") == desk.occupied("data"));
     let error = desk.refused("convert --from data --format processed --out one");
     assert!(error.contains("of data has 2 observations"), "{error}");
     assert!(!desk.path("one").exists());
@@ -366,6 +374,9 @@ fn scenes_are_observed_again() {
     desk.run("observe data --views random:1,circle --observations 3 --noise 0 --seed 9 --out other");
     let other = desk.scenes("other");
     assert_eq!(other.len(), before.len());
+    let occupied = desk.occupied("data");
+    assert!(occupied.values().all(|voxels| (20..6_400).contains(&voxels.len())), "at most a tenth of the volume");
+    assert!(desk.occupied("other") == occupied, "the objects stay where they are");
     for ((id, volumes, trials), (id_before, volumes_before, trials_before)) in other.iter().zip(&before) {
         assert_eq!((id, trials), (id_before, trials_before));
         assert!(volumes.len() == 3 && volumes.iter().all(|volume| !volumes_before.contains(volume)));
@@ -488,6 +499,7 @@ fn errors_name_the_cause() {
         .map(|i| format!("v {} {} {}\n", 0.3 * f64::from(i & 1), 0.3 * f64::from(i >> 1 & 1), 0.3 * f64::from(i >> 2)));
     let faces = ["1 2 4 3", "5 6 8 7", "1 2 6 5", "3 4 8 7", "1 3 7 5", "2 4 8 6"].map(|face| format!("f {face}\n"));
     fs::write(desk.path("wide/a.obj"), corners.chain(faces).collect::<String>()).unwrap();
+    fs::write(desk.path("data.jsonl"), "{}\n").unwrap();
     let label = "label --scene packed --scenes 1 --out never --objects";
     for (arguments, expected) in [
         (format!("{label} nowhere"), "nowhere"),
@@ -513,6 +525,14 @@ fn errors_name_the_cause() {
         ("label --scenes 1 --looks 2 --out never".to_owned(), "`--looks` is now `--observations`"),
         ("label --scenes 1 --objects endless --out never".to_owned(), "`endless` is now `generated`"),
         ("label --scenes 1 --views side,anywhere:1 --out never".to_owned(), "`anywhere` is now `random`"),
+        ("label --scenes 1 --observations 0 --out never".to_owned(), "--observations is 0, must be greater than 0"),
+        ("label --scenes 1 --stretch 1.2 --export x.jsonl --out never".to_owned(), "leave out --stretch"),
+        ("label --scenes 1 --export data.jsonl --out never".to_owned(), "--export data.jsonl already exists"),
+        ("label --scene pile --scenes 3 --points 5 --out half".to_owned(), "half has scenes in another format"),
+        ("observe half --views side --out never".to_owned(), "half has no packed scenes"),
+        ("observe half --views side --observations 0 --out never".to_owned(), "--observations is 0"),
+        ("observe half --views top --out never".to_owned(), "--views is `top`"),
+        ("merge half empty --out never".to_owned(), "half"),
         ("stats empty".to_owned(), "empty"),
     ] {
         let error = desk.refused(&arguments);

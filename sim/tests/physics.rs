@@ -39,6 +39,31 @@ fn from_above() -> Isometry3<f64> {
 }
 
 #[test]
+fn voxels_inside_objects_are_occupied() {
+    let mut world = cube_on_table(0.2, 1.0);
+    let turned = Isometry3::new(Vector3::new(0.05, 0.2, 0.2), Vector3::new(0.3, 0.2, 0.8));
+    world.add(&cube(0.2, 1.0), 1.5, &turned);
+    const N: usize = 40;
+    let occupancy = world.occupancy(N);
+    let voxel = grasp::WORKSPACE_SIZE / N as f64;
+    let poses: Vec<_> = world.objects().iter().map(|body| (world.pose(body.id), body.scale)).collect();
+    let (mut occupied, mut near) = (0, 0);
+    for index in 0..N.pow(3) {
+        let centre = [index / (N * N), index / N % N, index % N].map(|cell| (cell as f64 + 0.5) * voxel);
+        // Positive outside.
+        let outside = |(pose, scale): &(Isometry3<f64>, f64)| {
+            let local = pose.inverse_transform_point(&Point3::from(centre));
+            local.iter().map(|c| c.abs() - CUBE * scale / 2.0).fold(f64::NEG_INFINITY, f64::max)
+        };
+        let distance = poses.iter().map(outside).fold(f64::INFINITY, f64::min);
+        occupied += usize::from(occupancy.contains(index));
+        near += usize::from(distance.abs() < 1e-5);
+        assert!(distance.abs() < 1e-5 || occupancy.contains(index) == (distance < 0.0), "{centre:?}: {distance}");
+    }
+    assert!(occupied > 400 && near < occupied / 4, "{occupied} voxels, {near} of them at a surface");
+}
+
+#[test]
 fn a_cube_is_lifted() {
     let world = cube_on_table(0.2, 1.0);
     match trial::label(&world, &from_above(), 0.0) {

@@ -6,7 +6,7 @@ use sha2::{Digest, Sha256};
 
 use crate::error::{At, DataError};
 use crate::grasp_table::LengthUnit;
-use crate::{Scene, Trial, edge_of, packed, processed};
+use crate::{Occupancy, Scene, Trial, edge_of, packed, processed};
 
 /// The format of a folder.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -200,6 +200,16 @@ impl Dataset {
         }
     }
 
+    /// The voxels inside the objects of scene `index`, if they are known.
+    #[must_use]
+    pub fn occupancy(&self, index: usize) -> Option<Occupancy> {
+        let (source, scene) = self.scenes[index];
+        match &self.sources[source] {
+            Source::Packed(reader) => reader.occupancy(scene),
+            Source::Memory(scenes) => scenes[scene].occupancy.clone(),
+        }
+    }
+
     /// Number of trials in `scenes`, and number of successes among them.
     #[must_use]
     pub fn grasps(&self, scenes: &[usize]) -> (usize, usize) {
@@ -227,7 +237,7 @@ impl Dataset {
         hash.finalize().iter().take(8).map(|byte| format!("{byte:02x}")).collect()
     }
 
-    /// A checksum of the volumes of scene `index`.
+    /// A checksum of the volumes of scene `index`, and of its occupancy.
     fn checksum(&self, index: usize) -> u32 {
         let (source, scene) = self.scenes[index];
         match &self.sources[source] {
@@ -235,6 +245,7 @@ impl Dataset {
             Source::Memory(scenes) => {
                 let mut hasher = crc32fast::Hasher::new();
                 scenes[scene].volumes.iter().for_each(|volume| hasher.update(volume));
+                scenes[scene].occupancy.iter().for_each(|occupancy| hasher.update(occupancy.as_bytes()));
                 hasher.finalize()
             }
         }

@@ -17,6 +17,7 @@ mod candidates;
 mod dataset;
 mod error;
 mod grasp_table;
+mod occupancy;
 pub mod packed;
 pub mod processed;
 pub mod raw;
@@ -26,6 +27,7 @@ mod trial;
 pub use candidates::Candidates;
 pub use dataset::{DataFormat, Dataset};
 pub use error::DataError;
+pub use occupancy::Occupancy;
 pub use setup::{Provenance, Setup};
 pub use trial::{DISTINCT_YAWS, MAX_CLEARANCE, Trial};
 
@@ -39,6 +41,8 @@ pub struct Scene {
     pub volumes: Vec<Vec<u8>>,
     /// The grasp trials.
     pub trials: Vec<Trial>,
+    /// The voxels inside the objects, if they are known. The formats of VGN and GIGA do not store them.
+    pub occupancy: Option<Occupancy>,
 }
 
 /// The name of scene `number` in the formats of VGN and GIGA. It begins with a letter, because their code reads names of

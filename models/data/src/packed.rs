@@ -1,6 +1,6 @@
 //! The packed format: a few large append-only files.
 //!
-//! A folder holds `setup.json` and `scenes-NNNNN.pack`. A file is a header of 16 bytes (`graspack`, the version 3 and N
+//! A folder holds `setup.json` and `scenes-NNNNN.pack`. A file is a header of 16 bytes (`graspack`, the version 4 and N
 //! as little-endian u32), followed by records, one per scene:
 //!
 //! | bytes | content |
@@ -8,12 +8,14 @@
 //! | 4 | length of the content after the checksum |
 //! | 4 | CRC-32 of that content |
 //! | 8 | number of the scene |
-//! | 4, 4 | number of trials, number of volumes |
+//! | 4, 4, 4 | number of trials, number of volumes, number of occupancies: 0 or 1 |
 //! | 41 per trial | position (voxels), quaternion x y z w, width (voxels): eight f32; one byte, bit 0: success, bit k: the grasp rotated by k · 36° about the approach is a success too; share of successful executions and clearance (metres): two f32 |
 //! | N³ per volume | [`quantise`]d values, `[x][y][z]` |
+//! | ⌈N³ / 8⌉ per occupancy | a bit per voxel, least significant first: whether its centre is inside an object |
 //!
-//! In versions 1 and 2 a trial has 33 bytes, without share and clearance: the share is 1 for a success and 0 for
-//! a failure, and the clearance is unknown. Version 1 has no yaws either. A folder may hold files of several versions.
+//! Up to version 3 a record has no occupancy, nor the number of them. In versions 1 and 2 a trial has 33 bytes, without
+//! share and clearance: the share is 1 for a success and 0 for a failure, and the clearance is unknown. Version 1 has no
+//! yaws either. A folder may hold files of several versions.
 //!
 //! All numbers are little-endian. Readers ignore an incomplete record at the end of a file. A run that continues after
 //! an interruption starts a new file, so that a file that is mapped by a reader never shrinks.
@@ -27,13 +29,15 @@ use memmap2::Mmap;
 use nalgebra::{Point3, Quaternion, UnitQuaternion};
 
 use crate::error::{At, DataError};
-use crate::{Setup, Trial, edge_of, quantise};
+use crate::{Occupancy, Setup, Trial, edge_of, quantise};
 
 const MAGIC: &[u8; 8] = b"graspack";
-const VERSION: u32 = 3;
+const VERSION: u32 = 4;
 const HEADER: usize = 16;
 /// Bytes of the length and the checksum before a record's content.
 const PREFIX: usize = 8;
+/// Bytes of the number of the scene and the counts after it.
+const COUNTS: usize = 20;
 /// Bytes of a trial in the current version, and in versions 1 and 2.
 const TRIAL_SIZE: usize = 41;
 const SHORT_TRIAL_SIZE: usize = 33;
@@ -69,20 +73,17 @@ impl Writer {
         self.next
     }
 
-    /// Appends a scene in one write: its volumes, each `[N, N, N]` in [0, 1], and its trials in voxels.
+    /// Appends a scene in one write: its volumes, each `[N, N, N]` in [0, 1], its trials in voxels, and the voxels inside
+    /// its objects, if they are known.
     ///
     /// # Errors
     /// [`DataError`] names the file. Earlier scenes are not lost.
-    pub fn append(&mut self, number: u64, volumes: &[Vec<f32>], trials: &[Trial]) -> Result<(), DataError> {
-        let quantised: Vec<Vec<u8>> = volumes.iter().map(|volume| quantise(volume)).collect();
-        self.append_quantised(number, &quantised, trials)
-    }
-
-    pub(crate) fn append_quantised(
+    pub fn append(
         &mut self,
         number: u64,
-        volumes: &[Vec<u8>],
+        volumes: &[Vec<f32>],
         trials: &[Trial],
+        occupancy: Option<&Occupancy>,
     ) -> Result<(), DataError> {
         let edge = volumes.first().and_then(|volume| edge_of(volume.len())).unwrap_or(0);
         self.record.clear();
@@ -90,6 +91,7 @@ impl Writer {
         self.record.extend(number.to_le_bytes());
         self.record.extend((trials.len() as u32).to_le_bytes());
         self.record.extend((volumes.len() as u32).to_le_bytes());
+        self.record.extend(u32::from(occupancy.is_some()).to_le_bytes());
         for Trial { position: p, rotation, width, success, yaws, share, clearance } in trials {
             let q = rotation.coords;
             for number in [p.x, p.y, p.z, q.x, q.y, q.z, q.w, *width] {
@@ -99,7 +101,8 @@ impl Writer {
             self.record.extend(share.to_le_bytes());
             self.record.extend(clearance.to_le_bytes());
         }
-        volumes.iter().for_each(|volume| self.record.extend(volume));
+        volumes.iter().for_each(|volume| self.record.extend(quantise(volume)));
+        self.record.extend(occupancy.map_or(&[][..], Occupancy::as_bytes));
         let content = &self.record[PREFIX..];
         let (length, checksum) = (content.len() as u32, crc32fast::hash(content));
         self.record[..4].copy_from_slice(&length.to_le_bytes());
@@ -163,10 +166,18 @@ struct PackFile {
     path: PathBuf,
     map: Mmap,
     edge: usize,
-    /// Bytes per trial.
-    trial_size: usize,
+    layout: Layout,
     /// End of the last complete record.
     end: usize,
+}
+
+/// Sizes of the parts of a record, which depend on the version.
+#[derive(Clone, Copy)]
+struct Layout {
+    /// Bytes of the number of the scene and the counts.
+    counts: usize,
+    /// Bytes per trial.
+    trial_size: usize,
 }
 
 /// Location of a scene in its file. Checksum and lengths are valid.
@@ -175,6 +186,7 @@ struct SceneLocation {
     number: u64,
     trials: usize,
     volumes: usize,
+    has_occupancy: bool,
     /// Offset of the trials.
     start: usize,
     /// Checksum of the record.
@@ -211,9 +223,9 @@ impl Reader {
                 continue;
             }
             let map = map(&path)?;
-            let (edge, trial_size) = check_header(&path, &map)?;
+            let (edge, layout) = check_header(&path, &map)?;
             let end = known.map_or(HEADER, |file| file.end);
-            let mut file = PackFile { path, map, edge, trial_size, end };
+            let mut file = PackFile { path, map, edge, layout, end };
             // Offsets of earlier records stay valid.
             self.scenes.extend(file.read_appended(index)?);
             match self.files.get_mut(index) {
@@ -265,7 +277,18 @@ impl Reader {
         let scene = &self.scenes[index];
         let file = &self.files[scene.file];
         let size = file.edge.pow(3);
-        &file.map[scene.start + scene.trials * file.trial_size + observation * size..][..size]
+        &file.map[scene.start + scene.trials * file.layout.trial_size + observation * size..][..size]
+    }
+
+    /// The voxels inside the objects of scene `index`, if they are known.
+    #[must_use]
+    pub fn occupancy(&self, index: usize) -> Option<Occupancy> {
+        let scene = &self.scenes[index];
+        let file = &self.files[scene.file];
+        let voxels = file.edge.pow(3);
+        let start = scene.start + scene.trials * file.layout.trial_size + scene.volumes * voxels;
+        let bytes = scene.has_occupancy.then(|| &file.map[start..][..Occupancy::size(voxels)])?;
+        Occupancy::from_bytes(bytes, voxels)
     }
 
     /// The trials of scene `index`.
@@ -273,10 +296,8 @@ impl Reader {
     pub fn trials(&self, index: usize) -> Vec<Trial> {
         let scene = &self.scenes[index];
         let file = &self.files[scene.file];
-        file.map[scene.start..][..scene.trials * file.trial_size]
-            .chunks_exact(file.trial_size)
-            .map(parse_trial)
-            .collect()
+        let size = file.layout.trial_size;
+        file.map[scene.start..][..scene.trials * size].chunks_exact(size).map(parse_trial).collect()
     }
 }
 
@@ -314,35 +335,51 @@ impl PackFile {
             if crc32fast::hash(content) != checksum {
                 return Err(damaged("the checksum of a scene does not match".to_owned()));
             }
-            let [trials, volumes] = match content.get(8..16) {
-                Some(counts) => [u32_at(counts, 0), u32_at(counts, 4)].map(|count| count as usize),
-                None => return Err(damaged(format!("a scene of {length} bytes is too short"))),
-            };
-            if length != 16 + trials * self.trial_size + volumes * self.edge.pow(3) {
+            let Layout { counts, trial_size } = self.layout;
+            if length < counts {
+                return Err(damaged(format!("a scene of {length} bytes is too short")));
+            }
+            let count = |offset: usize| if offset < counts { u32_at(content, offset) as usize } else { 0 };
+            let [trials, volumes, occupancies] = [8, 12, 16].map(count);
+            let voxels = self.edge.pow(3);
+            let size = counts + trials * trial_size + volumes * voxels + occupancies * Occupancy::size(voxels);
+            if occupancies > 1 || length != size {
                 return Err(damaged(format!(
-                    "a scene of {trials} trials and {volumes} volumes cannot have {length} bytes"
+                    "a scene of {trials} trials, {volumes} volumes and {occupancies} occupancies cannot have {length} \
+                     bytes"
                 )));
             }
             let number = u64::from(u32_at(content, 0)) | u64::from(u32_at(content, 4)) << 32;
-            scenes.push(SceneLocation { file, number, trials, volumes, start: start + 16, checksum });
+            let (start_of_trials, has_occupancy) = (start + counts, occupancies > 0);
+            scenes.push(SceneLocation {
+                file,
+                number,
+                trials,
+                volumes,
+                has_occupancy,
+                start: start_of_trials,
+                checksum,
+            });
             self.end = start + length;
         }
         Ok(scenes)
     }
 }
 
-/// Edge of the volumes of a file, and bytes per trial.
-fn check_header(path: &Path, bytes: &[u8]) -> Result<(usize, usize), DataError> {
+/// Edge of the volumes of a file, and the layout of its records.
+fn check_header(path: &Path, bytes: &[u8]) -> Result<(usize, Layout), DataError> {
     let damaged = |reason: String| DataError::Damaged { path: path.to_owned(), offset: 0, reason };
     if &bytes[..8] != MAGIC {
         return Err(damaged("the file does not begin with `graspack`".to_owned()));
     }
-    let trial_size = match u32_at(bytes, 8) {
-        1 | 2 => SHORT_TRIAL_SIZE,
-        VERSION => TRIAL_SIZE,
+    const SHORT_COUNTS: usize = 16;
+    let layout = match u32_at(bytes, 8) {
+        1 | 2 => Layout { counts: SHORT_COUNTS, trial_size: SHORT_TRIAL_SIZE },
+        3 => Layout { counts: SHORT_COUNTS, trial_size: TRIAL_SIZE },
+        VERSION => Layout { counts: COUNTS, trial_size: TRIAL_SIZE },
         version => return Err(damaged(format!("the version is {version}, must be from 1 to {VERSION}"))),
     };
-    Ok((u32_at(bytes, 12) as usize, trial_size))
+    Ok((u32_at(bytes, 12) as usize, layout))
 }
 
 #[expect(

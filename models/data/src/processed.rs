@@ -70,7 +70,7 @@ pub fn read(folder: &Path) -> Result<Vec<Scene>, DataError> {
         .into_par_iter()
         .map(|(id, trials)| {
             let values = read_volume(&folder.join("scenes").join(format!("{id}.npz")))?;
-            Ok(Scene { id, volumes: vec![quantise(&values)], trials })
+            Ok(Scene { id, volumes: vec![quantise(&values)], trials, occupancy: None })
         })
         .collect()
 }

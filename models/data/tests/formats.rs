@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use grasp_data::{
-    DataError, DataFormat, Dataset, MAX_CLEARANCE, Provenance, Scene, Setup, Trial, packed, processed, raw,
+    DataError, DataFormat, Dataset, MAX_CLEARANCE, Occupancy, Provenance, Scene, Setup, Trial, packed, processed, raw,
 };
 use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 
@@ -50,6 +50,12 @@ fn volumes(number: u64) -> Vec<Vec<f32>> {
         .collect()
 }
 
+fn occupancy(number: u64) -> Occupancy {
+    let mut occupancy = Occupancy::empty(N.pow(3));
+    [number as usize, 100, N.pow(3) - 1].into_iter().for_each(|voxel| occupancy.insert(voxel));
+    occupancy
+}
+
 /// Compares trials after a round trip through f32.
 fn assert_same(read: &[Trial], written: &[Trial]) {
     assert_eq!(read.len(), written.len());
@@ -66,7 +72,7 @@ fn pack(folder: &Path, numbers: impl IntoIterator<Item = u64>) {
     let mut writer = packed::Writer::open(folder, &setup()).unwrap();
     let next = writer.next().unwrap_or(0);
     for number in numbers.into_iter().filter(|&number| number >= next) {
-        writer.append(number, &volumes(number), &trials(number)).unwrap();
+        writer.append(number, &volumes(number), &trials(number), Some(&occupancy(number))).unwrap();
     }
 }
 
@@ -87,15 +93,18 @@ fn packed_scenes_round_trip() {
                 dataset.volume(index, observation).iter().map(|&byte| grasp_data::value(byte)).collect();
             assert_eq!(read, *volume);
         }
+        assert_eq!(dataset.occupancy(index), Some(occupancy(number)));
     }
 }
 
 /// A file with one scene in an earlier version, whose trials end after the flags.
 fn of_version(version: u8, bytes: &[u8], trials: usize) -> Vec<u8> {
     let (header, record) = bytes.split_at(16);
-    let (counts, rest) = record[8..].split_at(16);
+    // Without the number of occupancies.
+    let (counts, rest) = (&record[8..24], &record[28..]);
     let (tried, volumes) = rest.split_at(41 * trials);
-    let tried: Vec<u8> = tried.chunks_exact(41).flat_map(|trial| &trial[..33]).copied().collect();
+    let size = if version < 3 { 33 } else { 41 };
+    let tried: Vec<u8> = tried.chunks_exact(41).flat_map(|trial| &trial[..size]).copied().collect();
     let content = [counts, &tried, volumes].concat();
     let prefix = [(content.len() as u32).to_le_bytes(), crc32fast::hash(&content).to_le_bytes()].concat();
     let mut header = header.to_vec();
@@ -105,10 +114,10 @@ fn of_version(version: u8, bytes: &[u8], trials: usize) -> Vec<u8> {
 
 #[test]
 fn earlier_versions_of_the_packed_format_are_read() {
-    for (version, yaws) in [(1, 0), (2, 0b1_0010)] {
+    for (version, yaws) in [(1, 0), (2, 0b1_0010), (3, 0b1_0010)] {
         let folder = tempfile::tempdir().unwrap();
         let written: Vec<Trial> = trials(0).into_iter().map(|trial| Trial { yaws, ..trial }).collect();
-        packed::Writer::open(folder.path(), &setup()).unwrap().append(0, &volumes(0), &written).unwrap();
+        packed::Writer::open(folder.path(), &setup()).unwrap().append(0, &volumes(0), &written, None).unwrap();
         let path = folder.path().join("scenes-00000.pack");
         let bytes = fs::read(&path).unwrap();
         fs::write(&path, of_version(version, &bytes, 2)).unwrap();
@@ -116,8 +125,12 @@ fn earlier_versions_of_the_packed_format_are_read() {
         pack(folder.path(), [0, 1]);
         let dataset = Dataset::open(&[folder.path().to_owned()]).unwrap();
         let share = |success| if success { 1.0 } else { 0.0 };
-        let known = written.iter().map(|trial| Trial { share: share(trial.success), clearance: 0.0, ..*trial });
-        assert_same(&dataset.trials(0), &known.collect::<Vec<_>>());
+        let known = |trial: &Trial| match version {
+            1 | 2 => Trial { share: share(trial.success), clearance: 0.0, ..*trial },
+            _ => *trial,
+        };
+        assert_same(&dataset.trials(0), &written.iter().map(known).collect::<Vec<_>>());
+        assert_eq!((dataset.occupancy(0), dataset.occupancy(1)), (None, Some(occupancy(1))));
         assert_eq!(dataset.trials(0)[0].yaws, yaws, "version {version}");
         assert_eq!(dataset.volume(0, 1), grasp_data::quantise(&volumes(0)[1]));
         assert_same(&dataset.trials(1), &trials(1));
@@ -129,7 +142,7 @@ fn earlier_versions_of_the_packed_format_are_read() {
 fn a_scene_that_was_observed_again_counts_once() {
     let scene = |id: &str, trials: Vec<Trial>, seen: u64| {
         let volumes = volumes(seen).iter().map(|volume| grasp_data::quantise(volume)).collect();
-        Scene { id: id.into(), volumes, trials }
+        Scene { id: id.into(), volumes, trials, occupancy: None }
     };
     let scenes = [("0", trials(0), 0), ("1", trials(1), 0), ("0", trials(0), 1), ("0", trials(1), 0)];
     let scenes = scenes.map(|(id, trials, seen)| scene(id, trials, seen));
@@ -137,16 +150,19 @@ fn a_scene_that_was_observed_again_counts_once() {
 }
 
 #[test]
-fn the_fingerprint_depends_on_shares_and_clearances() {
-    let fingerprint = |change: fn(&mut Trial)| {
+fn the_fingerprint_depends_on_everything_that_is_trained() {
+    let fingerprint_of = |change: fn(&mut Trial), occupancy| {
         let mut trials = trials(0);
         change(&mut trials[0]);
         let volumes = volumes(0).iter().map(|volume| grasp_data::quantise(volume)).collect();
-        Dataset::of(vec![Scene { id: "a".into(), volumes, trials }]).unwrap().fingerprint()
+        Dataset::of(vec![Scene { id: "a".into(), volumes, trials, occupancy }]).unwrap().fingerprint()
     };
+    let fingerprint = |change| fingerprint_of(change, None);
     let same = fingerprint(|_| {});
     assert_ne!(fingerprint(|trial| trial.share = 0.5), same);
     assert_ne!(fingerprint(|trial| trial.clearance = 0.01), same);
+    let [one, other] = [1, 2].map(|number| fingerprint_of(|_| {}, Some(occupancy(number))));
+    assert!(one != same && one != other);
 }
 
 #[test]
@@ -176,11 +192,11 @@ fn an_interrupted_packed_run_continues_without_lost_or_duplicate_scenes() {
 fn scenes_are_read_while_they_are_written() {
     let folder = tempfile::tempdir().unwrap();
     let mut writer = packed::Writer::open(folder.path(), &setup()).unwrap();
-    writer.append(0, &volumes(0), &trials(0)).unwrap();
+    writer.append(0, &volumes(0), &trials(0), None).unwrap();
     let mut dataset = Dataset::open(&[folder.path().to_owned()]).unwrap();
     assert_eq!(dataset.refresh().unwrap(), 0);
     for number in 1..4 {
-        writer.append(number, &volumes(number), &trials(number)).unwrap();
+        writer.append(number, &volumes(number), &trials(number), Some(&occupancy(number))).unwrap();
         assert_eq!(dataset.refresh().unwrap(), 1);
     }
     drop(writer);
@@ -231,7 +247,7 @@ fn ranges_of_scenes_are_merged() {
     let mut other = setup();
     other.provenance.as_mut().unwrap().seed = 2;
     let c = folder.path().join("c");
-    packed::Writer::open(&c, &other).unwrap().append(9, &volumes(9), &trials(9)).unwrap();
+    packed::Writer::open(&c, &other).unwrap().append(9, &volumes(9), &trials(9), None).unwrap();
     assert!(matches!(packed::merge(&[a, c], &again), Err(DataError::OtherSetup { .. })));
 }
 

@@ -69,6 +69,19 @@ impl Transform {
         }
     }
 
+    /// The voxel that a voxel of the original volume is moved to; `None` outside the volume. `n` is N.
+    #[must_use]
+    pub fn voxel(self, [mut x, mut y, z]: [usize; 3], n: usize) -> Option<[usize; 3]> {
+        if self.mirror {
+            x = n - 1 - x;
+        }
+        for _ in 0..self.quarter_turns {
+            (x, y) = (n - 1 - y, x);
+        }
+        let z = usize::try_from(z as i64 + i64::from(self.shift)).ok().filter(|&z| z < n)?;
+        Some([x, y, z])
+    }
+
     /// The trial in the transformed scene. `n` is N, the voxels along an edge of the volume.
     #[must_use]
     pub fn trial(self, trial: &Trial, n: usize) -> Trial {

@@ -1,7 +1,6 @@
 use std::sync::mpsc;
 use std::thread;
 
-use grasp::VoxelOrigin;
 use grasp_data::Dataset;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -9,9 +8,10 @@ use tch::{Device, Tensor};
 
 use crate::augment::Transform;
 use crate::loss::Targets;
+use crate::occupancy::OccupancyTargets;
 use crate::teacher::Teacher;
 use crate::trainer::TrainError;
-use crate::training_settings::QualityTarget;
+use crate::training_settings::TrainingSettings;
 
 /// Number of batches that a background thread reads in advance.
 const READ_AHEAD: usize = 2;
@@ -26,7 +26,7 @@ pub(crate) struct Example {
     /// Index of the scene's volume.
     pub volume: usize,
     pub transform: Transform,
-    /// Seed of the voxels for which the teacher's output is used.
+    /// Seed of the voxels for which the teacher's output or the occupancy is used.
     pub voxel_seed: u64,
 }
 
@@ -39,35 +39,42 @@ pub(crate) struct Batch {
     pub targets: Targets,
     /// The teacher's outputs as targets; empty without a teacher.
     pub teacher_targets: Targets,
+    /// Voxels with their occupancy; empty without the completion of shapes.
+    pub occupancy: OccupancyTargets,
 }
 
 impl Batch {
     fn read(
         dataset: &Dataset,
         examples: &[Example],
-        origin: VoxelOrigin,
-        quality: QualityTarget,
+        settings: &TrainingSettings,
         device: Device,
         mut teacher: Option<&mut Teacher>,
     ) -> Result<Self, TrainError> {
         let n = dataset.resolution();
         let mut volumes = vec![0.0; examples.len() * n.pow(3)];
         let (mut targets, mut teacher_targets) = (Targets::default(), Targets::default());
+        let mut occupancy = OccupancyTargets::default();
         for (index, (example, out)) in examples.iter().zip(volumes.chunks_exact_mut(n.pow(3))).enumerate() {
             let &Example { scene, volume, transform, voxel_seed } = example;
             transform.volume(dataset.volume(scene, volume), n, out);
             for trial in dataset.trials(scene) {
-                targets.push(index, &transform.trial(&trial, n), n, origin, quality);
+                targets.push(index, &transform.trial(&trial, n), n, settings.voxel_origin, settings.quality);
             }
             if let Some(teacher) = teacher.as_deref_mut() {
                 teacher.add_targets(index, out, &mut ChaCha8Rng::seed_from_u64(voxel_seed), &mut teacher_targets)?;
+            }
+            if settings.occupancy > 0.0
+                && let Some(inside) = dataset.occupancy(scene)
+            {
+                occupancy.add(index, &inside, transform, n, &mut ChaCha8Rng::seed_from_u64(voxel_seed));
             }
         }
         let (len, edge) = (examples.len(), n as i64);
         // Copied to the device here and not in the training step, so that a GPU does not wait for it.
         let volumes =
             Tensor::f_from_slice(&volumes)?.f_reshape([len as i64, 1, edge, edge, edge])?.f_to_device(device)?;
-        Ok(Self { len, volumes, targets, teacher_targets })
+        Ok(Self { len, volumes, targets, teacher_targets, occupancy })
     }
 }
 
@@ -76,8 +83,7 @@ impl Batch {
 pub(crate) fn read_ahead<R>(
     dataset: &Dataset,
     plan: &[&[Example]],
-    origin: VoxelOrigin,
-    quality: QualityTarget,
+    settings: &TrainingSettings,
     device: Device,
     mut teacher: Option<&mut Teacher>,
     consume: impl FnOnce(&mut dyn Iterator<Item = Result<Batch, TrainError>>) -> R,
@@ -90,7 +96,7 @@ pub(crate) fn read_ahead<R>(
                 let mut teacher = teacher.take();
                 scope.spawn(move || {
                     for examples in plan.iter().skip(first).step_by(readers) {
-                        let batch = Batch::read(dataset, examples, origin, quality, device, teacher.as_deref_mut());
+                        let batch = Batch::read(dataset, examples, settings, device, teacher.as_deref_mut());
                         // Sending fails when `consume` has returned early.
                         if sender.send(batch).is_err() {
                             break;

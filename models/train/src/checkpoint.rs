@@ -100,7 +100,7 @@ pub enum CheckpointError {
         ours: String,
     },
     /// The sums of the losses are incomplete.
-    #[error("the checkpoint has {0} sums of losses, must have 8: it is of another version; start without --resume")]
+    #[error("the checkpoint has {0} sums of losses, must have 10: it is of another version; start without --resume")]
     Sums(usize),
     /// The weights are not those of this network.
     #[error("the checkpoint is of another network: {0}; start without --resume")]
@@ -188,15 +188,51 @@ fn copy(stored: &TensorProto, tensor: &Tensor) -> Result<(), CheckpointError> {
 impl LossSums {
     /// The sums as a list, for a checkpoint.
     pub(crate) fn to_list(self) -> Vec<f64> {
-        let Self { voxels, quality, rotation, width, angle, true_positives, false_positives, false_negatives } = self;
-        vec![voxels, quality, rotation, width, angle, true_positives, false_positives, false_negatives]
+        let Self { voxels, quality, rotation, width, angle, true_positives, false_positives, false_negatives, .. } =
+            self;
+        let Self { occupancy_voxels, occupancy, .. } = self;
+        vec![
+            voxels,
+            quality,
+            rotation,
+            width,
+            angle,
+            true_positives,
+            false_positives,
+            false_negatives,
+            occupancy_voxels,
+            occupancy,
+        ]
     }
 
     /// The inverse of [`to_list`](Self::to_list); `None` if the length is wrong.
     pub(crate) fn from_list(list: &[f64]) -> Option<Self> {
-        let &[voxels, quality, rotation, width, angle, true_positives, false_positives, false_negatives] = list else {
+        let &[
+            voxels,
+            quality,
+            rotation,
+            width,
+            angle,
+            true_positives,
+            false_positives,
+            false_negatives,
+            occupancy_voxels,
+            occupancy,
+        ] = list
+        else {
             return None;
         };
-        Some(Self { voxels, quality, rotation, width, angle, true_positives, false_positives, false_negatives })
+        Some(Self {
+            voxels,
+            quality,
+            rotation,
+            width,
+            angle,
+            true_positives,
+            false_positives,
+            false_negatives,
+            occupancy_voxels,
+            occupancy,
+        })
     }
 }

@@ -19,6 +19,9 @@ pub struct EpochRecord {
     pub loss_rotation: f64,
     /// Part of the loss: width.
     pub loss_width: f64,
+    /// Loss of the completion of shapes, if it is trained. It is not part of `loss`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub loss_occupancy: Option<f64>,
     /// Results on the validation scenes, if there are any.
     pub validation: Option<Validation>,
     /// Results of --evaluate, if it was run.
@@ -41,6 +44,9 @@ pub struct Validation {
     pub loss_rotation: f64,
     /// Part of the loss: width.
     pub loss_width: f64,
+    /// Loss of the completion of shapes, if it is trained. It is not part of `loss`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub loss_occupancy: Option<f64>,
     /// Mean angle of the successes to the nearest valid rotation, degrees.
     #[serde(default)]
     pub angle: Option<f64>,
@@ -69,6 +75,7 @@ impl Validation {
             loss_quality: sums.quality / sums.voxels,
             loss_rotation: sums.rotation / sums.voxels,
             loss_width: sums.width / sums.voxels,
+            loss_occupancy: sums.occupancy(),
             angle: Some(sums.angle()).filter(|angle| angle.is_finite()),
             accuracy: sums.accuracy(),
             precision: Some(sums.precision()).filter(|share| share.is_finite()),

@@ -5,7 +5,8 @@
 //! the bounds of a `Clip`. Only the operators of grasp networks are implemented. A graph with other operators or
 //! attributes is an error when it is loaded, because ignoring them would train a different network.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashSet;
+use std::collections::hash_map::{Entry, HashMap};
 
 use grasp_models::onnx::{ModelProto, NodeProto};
 use grasp_models::{upsampled_convolutions, with_full_weights};
@@ -13,8 +14,9 @@ use tch::{Device, Kind, Tensor};
 
 use crate::execution_options::ExecutionOptions;
 use crate::gelu::Gelus;
+use crate::occupancy::OccupancyHead;
 use crate::operators::NodeCall;
-use crate::pointwise::{cubes, head_convolutions};
+use crate::pointwise::{PaddedFeatures, head_convolutions, largest_kernel};
 use crate::supported::{ExecuteError, supported_graph};
 use crate::tensors::{constant, tensor_of, values_of};
 
@@ -22,7 +24,7 @@ use crate::tensors::{constant, tensor_of, values_of};
 pub struct Executor {
     model: ModelProto,
     execution: ExecutionOptions,
-    /// The weights, in the order of the initializers.
+    /// The weights, in the order of the initializers, and those of the head that completes shapes.
     parameters: Vec<(String, Tensor)>,
     constants: HashMap<String, Tensor>,
     /// Convolutions after which the graph is pointwise.
@@ -30,6 +32,7 @@ pub struct Executor {
     /// Convolutions that are computed on their input before upsampling, with the upsampling node.
     upsampled: HashMap<usize, usize>,
     gelus: Gelus,
+    occupancy: Option<OccupancyHead>,
 }
 
 /// The outputs of a grasp network, f32: for a batch of volumes, or at single voxels, which are volumes of 1³.
@@ -42,7 +45,20 @@ pub struct NetworkOutputs {
     pub width: Tensor,
 }
 
+/// The values of a graph by name.
+struct Values {
+    all: HashMap<String, Tensor>,
+    /// The features of heads that were computed at single voxels.
+    padded: HashMap<String, PaddedFeatures>,
+}
+
 impl NetworkOutputs {
+    /// Removes the outputs from the values of a graph.
+    fn take(values: &mut HashMap<String, Tensor>) -> Result<Self, ExecuteError> {
+        let [quality, rotation, width] = ["quality", "rotation", "width"].map(|name| take_output(values, name));
+        Ok(Self { quality: quality?, rotation: rotation?, width: width? })
+    }
+
     /// The outputs of `count` volumes or voxels, from index `first`.
     pub(crate) fn narrow(&self, first: usize, count: usize) -> Self {
         let part = |map: &Tensor| map.narrow(0, first as i64, count as i64);
@@ -78,7 +94,21 @@ impl Executor {
             }
         }
         let (heads, upsampled, gelus) = (head_convolutions(graph), upsampled_convolutions(graph), Gelus::of(graph));
-        Ok(Self { model, execution, parameters, constants, heads, upsampled, gelus })
+        Ok(Self { model, execution, parameters, constants, heads, upsampled, gelus, occupancy: None })
+    }
+
+    /// Adds a head that completes shapes, with random weights.
+    ///
+    /// # Errors
+    /// [`ExecuteError::NoFeatures`] if the output heads do not read the same features.
+    pub fn with_occupancy_head(mut self, seed: u64) -> Result<Self, ExecuteError> {
+        let graph = self.model.graph.as_ref().ok_or(ExecuteError::NoGraph)?;
+        let head = OccupancyHead::new(graph, seed).ok_or(ExecuteError::NoFeatures)?;
+        let head = head.map(|weight| weight.to_device(self.execution.device).set_requires_grad(true));
+        let parameters = head.parameters().map(|(name, weight)| (name.to_owned(), weight.shallow_clone()));
+        self.parameters.extend(parameters);
+        self.occupancy = Some(head);
+        Ok(self)
     }
 
     /// Disables the convolutions before upsampling and the GELUs in one operation, so that every value of the graph is
@@ -99,7 +129,7 @@ impl Executor {
         self.execution.device
     }
 
-    /// The model with the current weights.
+    /// The model with the current weights, without the head that completes shapes.
     #[must_use]
     pub fn to_model(&self) -> ModelProto {
         let mut model = self.model.clone();
@@ -126,7 +156,7 @@ impl Executor {
     /// # Errors
     /// [`ExecuteError`] names the node that failed, or the missing output.
     pub fn output(&self, input: &Tensor, name: &str) -> Result<Tensor, ExecuteError> {
-        take_output(&mut self.execute(input, None)?, name)
+        take_output(&mut self.execute(input, None)?.all, name)
     }
 
     /// Runs any graph with one input, and returns intermediate values by name, in f32.
@@ -134,7 +164,7 @@ impl Executor {
     /// # Errors
     /// [`ExecuteError`] names the node that failed, or the missing value.
     pub fn intermediate_values(&self, input: &Tensor, names: &[String]) -> Result<Vec<Tensor>, ExecuteError> {
-        let values = self.execute(input, None)?;
+        let values = self.execute(input, None)?.all;
         let value = |name: &String| values.get(name).map(|value| value.to_kind(Kind::Float));
         names.iter().map(|name| value(name).ok_or_else(|| ExecuteError::Output(name.clone()))).collect()
     }
@@ -149,23 +179,41 @@ impl Executor {
         }
         let NetworkOutputs { quality, rotation, width } = self.forward(volumes)?;
         let at = |map: &Tensor, channels: i64| {
-            cubes(map, voxels, 1)
+            PaddedFeatures::new(map, 1)
+                .and_then(|map| map.cubes(voxels, 1))
                 .and_then(|values| values.f_reshape([-1, channels, 1, 1, 1]))
                 .map_err(ExecuteError::Voxels)
         };
         Ok(NetworkOutputs { quality: at(&quality, 1)?, rotation: at(&rotation, 4)?, width: at(&width, 1)? })
     }
 
+    /// Runs the network with the output heads only at `voxels`, and the head that completes shapes at `occupancy_voxels`.
+    /// Returns the outputs and the logits. Both lists are flat indices into `[batch, N, N, N]`.
+    ///
+    /// # Errors
+    /// [`ExecuteError`] names the node at which it failed, or tells that there is no such head.
+    pub(crate) fn forward_with_occupancy(
+        &self,
+        volumes: &Tensor,
+        voxels: &[i64],
+        occupancy_voxels: &[i64],
+    ) -> Result<(NetworkOutputs, Tensor), ExecuteError> {
+        let head = self.occupancy.as_ref().ok_or(ExecuteError::NoFeatures)?;
+        let mut values = self.execute(volumes, Some(voxels))?;
+        let features = values.padded.get(head.features()).ok_or(ExecuteError::NoFeatures)?;
+        let logits = head.logits(features, occupancy_voxels).map_err(ExecuteError::Voxels)?;
+        Ok((NetworkOutputs::take(&mut values.all)?, logits))
+    }
+
     fn maps(&self, volumes: &Tensor, voxels: Option<&[i64]>) -> Result<NetworkOutputs, ExecuteError> {
-        let mut values = self.execute(volumes, voxels)?;
-        let [quality, rotation, width] = ["quality", "rotation", "width"].map(|name| take_output(&mut values, name));
-        Ok(NetworkOutputs { quality: quality?, rotation: rotation?, width: width? })
+        NetworkOutputs::take(&mut self.execute(volumes, voxels)?.all)
     }
 
     /// Computes the values of all nodes in order; the heads only at `voxels`, if given.
-    fn execute(&self, input: &Tensor, voxels: Option<&[i64]>) -> Result<HashMap<String, Tensor>, ExecuteError> {
+    fn execute(&self, input: &Tensor, voxels: Option<&[i64]>) -> Result<Values, ExecuteError> {
         let graph = self.model.graph.as_ref().ok_or(ExecuteError::NoGraph)?;
         let mut values: HashMap<String, Tensor> = HashMap::with_capacity(graph.node.len());
+        let mut padded: HashMap<String, PaddedFeatures> = HashMap::new();
         if let Some(declared) = graph.input.first() {
             values.insert(declared.name().to_owned(), input.shallow_clone());
         }
@@ -207,13 +255,19 @@ impl Executor {
                 .collect::<Result<Vec<_>, _>>()?;
             let call = NodeCall { node, inputs, execution: self.execution };
             let outputs = match voxels.filter(|_| self.heads.contains(&index)) {
-                Some(voxels) => vec![call.convolution_at(voxels)?],
+                Some(voxels) => {
+                    let features = match padded.entry(node.input.first().cloned().unwrap_or_default()) {
+                        Entry::Occupied(entry) => entry.into_mut(),
+                        Entry::Vacant(entry) => entry.insert(call.padded_features(largest_kernel(graph, &self.heads))?),
+                    };
+                    vec![call.convolution_at(features, voxels)?]
+                }
                 None if small.is_some() => vec![call.convolution_before_upsampling()?],
                 None => call.run()?,
             };
             values.extend(node.output.iter().cloned().zip(outputs));
         }
-        Ok(values)
+        Ok(Values { all: values, padded })
     }
 }
 

@@ -17,6 +17,7 @@ mod executor;
 mod gelu;
 pub mod learning_curves;
 mod loss;
+mod occupancy;
 mod operators;
 mod pointwise;
 mod proposal_dataset;

@@ -71,6 +71,10 @@ pub struct LossSums {
     pub false_positives: f64,
     /// Successes with a quality of 0.5 or less.
     pub false_negatives: f64,
+    /// Voxels at which shapes are completed.
+    pub occupancy_voxels: f64,
+    /// Binary cross-entropy of their occupancy.
+    pub occupancy: f64,
 }
 
 /// Why the loss cannot be computed.
@@ -175,6 +179,7 @@ impl Targets {
             true_positives,
             false_positives: sum(5) - true_positives,
             false_negatives: f64::from(self.labels.iter().sum::<f32>()) - true_positives,
+            ..LossSums::default()
         };
         Ok(Loss { mean: (quality_loss + rotation_loss + width_loss) / self.len() as f64, sums })
     }
@@ -207,12 +212,20 @@ impl LossSums {
         self.true_positives += other.true_positives;
         self.false_positives += other.false_positives;
         self.false_negatives += other.false_negatives;
+        self.occupancy_voxels += other.occupancy_voxels;
+        self.occupancy += other.occupancy;
     }
 
-    /// The mean loss of a voxel.
+    /// The mean loss of a labelled voxel.
     #[must_use]
     pub fn loss(&self) -> f64 {
         (self.quality + self.rotation + self.width) / self.voxels
+    }
+
+    /// The mean loss of the completion of shapes; `None` without it.
+    #[must_use]
+    pub fn occupancy(&self) -> Option<f64> {
+        (self.occupancy_voxels > 0.0).then(|| self.occupancy / self.occupancy_voxels)
     }
 
     /// Mean angle of the successes to the nearest valid rotation, degrees.

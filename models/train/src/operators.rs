@@ -5,7 +5,7 @@ use grasp_models::upsampled_taps;
 use tch::{Device, Kind, TchError, Tensor};
 
 use crate::execution_options::ExecutionOptions;
-use crate::pointwise::cubes;
+use crate::pointwise::PaddedFeatures;
 use crate::supported::ExecuteError;
 use crate::tensors::values_of;
 
@@ -204,18 +204,15 @@ impl NodeCall<'_> {
         Ok(vec![y.map_err(|source| self.torch_error(source))?])
     }
 
+    /// The input of a head, padded for kernels of at most `edge`³ voxels.
+    pub fn padded_features(&self, edge: i64) -> Result<PaddedFeatures, ExecuteError> {
+        PaddedFeatures::new(self.input(0)?, edge).map_err(|source| self.torch_error(source))
+    }
+
     /// A convolution that preserves the size, only at `voxels`, which are flat indices into `[batch, N, N, N]`. Returns
     /// `[voxels.len(), channels, 1, 1, 1]`, computed in f32.
-    pub fn convolution_at(&self, voxels: &[i64]) -> Result<Tensor, ExecuteError> {
-        let (x, weight) = (self.input(0)?, self.input(1)?);
-        let edge = weight.size().last().copied().unwrap_or(1);
-        // Channels are the fastest axis, as in `cubes`.
-        let compute = || {
-            let weight = weight.f_permute([0, 2, 3, 4, 1])?.f_reshape([weight.size()[0], -1])?;
-            let y = cubes(x, voxels, edge)?.f_linear(&weight, self.optional_input(2))?;
-            y.f_reshape([voxels.len() as i64, -1, 1, 1, 1])
-        };
-        compute().map_err(|source| self.torch_error(source))
+    pub fn convolution_at(&self, features: &PaddedFeatures, voxels: &[i64]) -> Result<Tensor, ExecuteError> {
+        features.convolution(self.input(1)?, self.optional_input(2), voxels).map_err(|source| self.torch_error(source))
     }
 
     /// Nearest-neighbour upsampling: the modes of `Resize` that libtorch's `nearest` supports.

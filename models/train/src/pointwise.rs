@@ -41,6 +41,11 @@ fn ints<'a>(node: &'a NodeProto, name: &str) -> &'a [i64] {
     node.attribute(name).map_or(&[], |attribute| &attribute.ints)
 }
 
+/// The largest edge of the kernels of `heads`.
+pub(crate) fn largest_kernel(graph: &GraphProto, heads: &HashSet<usize>) -> i64 {
+    heads.iter().filter_map(|&index| ints(&graph.node[index], "kernel_shape").first()).copied().max().unwrap_or(1)
+}
+
 /// Whether the node is a convolution with stride 1 that preserves the size.
 fn is_head(node: &NodeProto) -> bool {
     let kernel = ints(node, "kernel_shape");
@@ -65,27 +70,57 @@ fn is_pointwise(graph: &GraphProto, node: &NodeProto) -> bool {
     }
 }
 
-/// The cubes of `edge`³ voxels around `voxels` of `x` `[batch, channels, N, N, N]`, padded with zeros: `[voxels.len(),
-/// edge³ · channels]`, channels fastest. `voxels` are flat indices into `[batch, N, N, N]`.
-pub(crate) fn cubes(x: &Tensor, voxels: &[i64], edge: i64) -> Result<Tensor, TchError> {
-    let (_, channels, depth, height, width) = x.size5()?;
-    let reach = edge / 2;
-    let padded = x.f_permute([0, 2, 3, 4, 1])?.f_constant_pad_nd([&[0; 2][..], &[reach; 6]].concat())?;
-    let [rows, columns] = [height, width].map(|size| size + 2 * reach);
-    let row_of = |volume: i64, [x, y, z]: [i64; 3]| ((volume * (depth + 2 * reach) + x) * rows + y) * columns + z;
-    // The first voxel of a cube has the coordinates in the padded array that its centre has in `x`.
-    let corner = |&voxel: &i64| {
-        row_of(
-            voxel / (depth * height * width),
-            [voxel / (height * width) % depth, voxel / width % height, voxel % width],
-        )
-    };
-    let corners: Vec<i64> = voxels.iter().map(corner).collect();
-    let offsets = |index: i64| row_of(0, [index / (edge * edge), index / edge % edge, index % edge]);
-    let offsets: Vec<i64> = (0..edge.pow(3)).map(offsets).collect();
-    let corners = Tensor::f_from_slice(&corners)?.f_to_device(x.device())?.f_unsqueeze(1)?;
-    let offsets = Tensor::f_from_slice(&offsets)?.f_to_device(x.device())?;
-    let features = padded.f_reshape([-1, channels])?;
-    let cubes = features.f_index_select(0, &corners.f_add(&offsets)?.f_reshape([-1])?)?;
-    cubes.f_to_kind(Kind::Float)?.f_reshape([voxels.len() as i64, -1])
+/// Features `[batch, channels, N, N, N]`, padded with zeros, to be read at single voxels. Several heads that read the same
+/// features share one, because padding and its gradient take as long as a head.
+pub(crate) struct PaddedFeatures {
+    /// `[voxels of the padded arrays, channels]`.
+    rows: Tensor,
+    /// Depth, height and width without padding.
+    size: [i64; 3],
+    /// Padding on each side.
+    reach: i64,
+}
+
+impl PaddedFeatures {
+    /// Features for kernels of at most `edge`³ voxels.
+    pub fn new(x: &Tensor, edge: i64) -> Result<Self, TchError> {
+        let (_, channels, depth, height, width) = x.size5()?;
+        let reach = edge / 2;
+        let padded = x.f_permute([0, 2, 3, 4, 1])?.f_constant_pad_nd([&[0; 2][..], &[reach; 6]].concat())?;
+        Ok(Self { rows: padded.f_reshape([-1, channels])?, size: [depth, height, width], reach })
+    }
+
+    /// The cubes of `edge`³ voxels around `voxels`: `[voxels.len(), edge³ · channels]`, channels fastest. `voxels` are flat
+    /// indices into `[batch, N, N, N]`.
+    pub fn cubes(&self, voxels: &[i64], edge: i64) -> Result<Tensor, TchError> {
+        let [depth, height, width] = self.size;
+        let [planes, rows, columns] = self.size.map(|size| size + 2 * self.reach);
+        let row_of = |volume: i64, [x, y, z]: [i64; 3]| ((volume * planes + x) * rows + y) * columns + z;
+        // The first voxel of a cube that is as large as the padding allows has the coordinates in the padded array that
+        // its centre has in the features. Smaller cubes begin later.
+        let inset = self.reach - edge / 2;
+        let corner = |&voxel: &i64| {
+            row_of(
+                voxel / (depth * height * width),
+                [voxel / (height * width) % depth, voxel / width % height, voxel % width].map(|index| index + inset),
+            )
+        };
+        let corners: Vec<i64> = voxels.iter().map(corner).collect();
+        let offsets = |index: i64| row_of(0, [index / (edge * edge), index / edge % edge, index % edge]);
+        let offsets: Vec<i64> = (0..edge.pow(3)).map(offsets).collect();
+        let device = self.rows.device();
+        let corners = Tensor::f_from_slice(&corners)?.f_to_device(device)?.f_unsqueeze(1)?;
+        let offsets = Tensor::f_from_slice(&offsets)?.f_to_device(device)?;
+        let cubes = self.rows.f_index_select(0, &corners.f_add(&offsets)?.f_reshape([-1])?)?;
+        cubes.f_to_kind(Kind::Float)?.f_reshape([voxels.len() as i64, -1])
+    }
+
+    /// A convolution that preserves the size, at `voxels`: `[voxels.len(), outputs, 1, 1, 1]`.
+    pub fn convolution(&self, weight: &Tensor, bias: Option<&Tensor>, voxels: &[i64]) -> Result<Tensor, TchError> {
+        let (outputs, _, _, _, edge) = weight.size5()?;
+        // Channels are the fastest axis, as in `cubes`.
+        let weight = weight.f_permute([0, 2, 3, 4, 1])?.f_reshape([outputs, -1])?;
+        let y = self.cubes(voxels, edge)?.f_linear(&weight, bias)?;
+        y.f_reshape([voxels.len() as i64, -1, 1, 1, 1])
+    }
 }

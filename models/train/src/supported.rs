@@ -95,6 +95,9 @@ pub enum ExecuteError {
     /// The graph has no such value.
     #[error("the graph does not compute `{0}`")]
     Output(String),
+    /// The graph has no features for the head that completes shapes.
+    #[error("--occupancy needs a network whose output heads are convolutions of the same features")]
+    NoFeatures,
     /// The requested voxels are not in the batch.
     #[error("the voxels cannot be selected from the maps: {0}")]
     Voxels(TchError),

@@ -32,6 +32,7 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
     ensure!(training.save_every >= 0.0, "--save-every is {}, must be at least 0 seconds", training.save_every);
     ensure!(training.weight_decay >= 0.0, "--weight-decay is {}, must be at least 0", training.weight_decay);
     ensure!(training.rotation_weight >= 0.0, "--rotation-weight is {}, must be at least 0", training.rotation_weight);
+    ensure!(training.occupancy >= 0.0, "--occupancy is {}, must be at least 0", training.occupancy);
     if let Some(lr) = training.lr {
         ensure!(lr > 0.0, "--lr is {lr}, must be greater than 0");
     }
@@ -116,7 +117,8 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
             add_provenance(training, &settings, trainer.dataset(), &mut metadata);
             write_model(&mut trainer, &metadata, Some(record), &files.evaluated)?;
             record.benchmark = Some(evaluate(command, &files.evaluated)?);
-            println!("{}", serde_json::to_string(record)?);
+            // As below.
+            let _ = writeln!(std::io::stdout(), "{}", serde_json::to_string(record)?);
             if best.update(training, record) {
                 write_model(&mut trainer, &metadata, Some(record), &training.out)?;
             }
@@ -320,6 +322,7 @@ fn settings(training: &TrainArgs, metadata: &Metadata) -> TrainingSettings {
         balance: training.balance,
         quality: training.quality.into(),
         rotation_weight: training.rotation_weight,
+        occupancy: training.occupancy,
         voxel_origin: metadata.voxel_origin,
         bf16: training.bf16,
     }

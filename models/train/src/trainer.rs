@@ -97,7 +97,10 @@ impl Trainer {
         settings: TrainingSettings,
         execution: ExecutionOptions,
     ) -> Result<Self, TrainError> {
-        let executor = Executor::new(model, execution)?;
+        let mut executor = Executor::new(model, execution)?;
+        if settings.occupancy > 0.0 {
+            executor = executor.with_occupancy_head(settings.seed)?;
+        }
         let adam = Adam::new(executor.parameters(), settings.weight_decay);
         let average = settings.average.map(|decay| WeightAverage::new(decay, executor.parameters()));
         let mut trainer = Self {
@@ -155,6 +158,11 @@ impl Trainer {
                  all but validation must be greater than 0"
             );
             return Err(TrainError::Settings(reason));
+        }
+        if self.settings.occupancy > 0.0 && !training.iter().any(|&scene| self.dataset.occupancy(scene).is_some()) {
+            let reason = "--occupancy needs scenes with their occupancy, which `grasp-sim` writes in its packed format since \
+                          version 4; label or observe the scenes again";
+            return Err(TrainError::Settings(reason.to_owned()));
         }
         let classes = if self.settings.balance { class_weights(&self.dataset, &training)? } else { [1.0; 2] };
         self.weights = LossWeights { classes, rotation: self.settings.rotation_weight };
@@ -273,7 +281,8 @@ impl Trainer {
     pub fn epoch(&mut self, stop: &AtomicBool, mut report: impl FnMut(u64, f64)) -> Result<EpochOutcome, TrainError> {
         let start = Instant::now();
         let plan = self.plan();
-        let TrainingSettings { batch, accumulate, voxel_origin: origin, quality, .. } = self.settings;
+        let settings = self.settings.clone();
+        let TrainingSettings { batch, accumulate, .. } = settings;
         let plan: Vec<&[Example]> = plan.chunks(batch).skip(self.batch as usize).collect();
         let mut volumes = 0;
         let mut learning_rate = 0.0;
@@ -282,23 +291,22 @@ impl Trainer {
         let mut teacher = self.teacher.take();
         let device = self.executor.device();
         let batch_teacher = teacher.as_mut();
-        let done: Result<bool, TrainError> =
-            read_ahead(&dataset, &plan, origin, quality, device, batch_teacher, |batches| {
-                let mut remaining = plan.len();
-                while remaining > 0 && !(self.batch > 0 && self.is_over()) {
-                    if stop.load(Ordering::Relaxed) {
-                        return Ok(false);
-                    }
-                    let passes = accumulate.min(remaining);
-                    let minutes = self.seconds() / 60.0;
-                    learning_rate = self.settings.learning_rate_at(self.steps(), self.steps_per_epoch(), minutes);
-                    volumes += self.step((&mut *batches).take(passes), passes, learning_rate)?;
-                    remaining -= passes;
-                    self.batch += passes as u64;
-                    report(self.batch.div_ceil(accumulate as u64), self.sums.loss());
+        let done: Result<bool, TrainError> = read_ahead(&dataset, &plan, &settings, device, batch_teacher, |batches| {
+            let mut remaining = plan.len();
+            while remaining > 0 && !(self.batch > 0 && self.is_over()) {
+                if stop.load(Ordering::Relaxed) {
+                    return Ok(false);
                 }
-                Ok(true)
-            });
+                let passes = accumulate.min(remaining);
+                let minutes = self.seconds() / 60.0;
+                learning_rate = self.settings.learning_rate_at(self.steps(), self.steps_per_epoch(), minutes);
+                volumes += self.step((&mut *batches).take(passes), passes, learning_rate)?;
+                remaining -= passes;
+                self.batch += passes as u64;
+                report(self.batch.div_ceil(accumulate as u64), self.sums.loss());
+            }
+            Ok(true)
+        });
         (self.dataset, self.teacher) = (dataset, teacher);
         if !done? {
             return Ok(EpochOutcome::Interrupted);
@@ -315,6 +323,7 @@ impl Trainer {
             loss_quality: sums.quality / sums.voxels,
             loss_rotation: sums.rotation / sums.voxels,
             loss_width: sums.width / sums.voxels,
+            loss_occupancy: sums.occupancy(),
             validation: self.with_average(Self::validate)?,
             benchmark: None,
             seconds,
@@ -353,10 +362,9 @@ impl Trainer {
     /// The results on the validation scenes, without augmentation; `None` if there are none.
     fn validate(&self) -> Result<Option<Validation>, TrainError> {
         let scenes: Vec<_> = self.validation.iter().map(|&scene| Example { scene, ..Example::default() }).collect();
-        let TrainingSettings { batch, voxel_origin, quality, .. } = self.settings;
-        let plan: Vec<&[Example]> = scenes.chunks(batch).collect();
+        let plan: Vec<&[Example]> = scenes.chunks(self.settings.batch).collect();
         let device = self.executor.device();
-        read_ahead(&self.dataset, &plan, voxel_origin, quality, device, None, |batches| {
+        read_ahead(&self.dataset, &plan, &self.settings, device, None, |batches| {
             let mut sums = LossSums::default();
             for batch in batches {
                 if let Some(loss) = no_grad(|| self.loss(&batch?))? {
@@ -388,21 +396,34 @@ impl Trainer {
     }
 
     /// The loss of one forward pass; `None` if no trial of the scenes is inside its volume. The mean includes the
-    /// teacher's outputs; the sums contain only trials.
+    /// teacher's outputs and the occupancy; the sums of grasps contain only trials.
     fn loss(&self, batch: &Batch) -> Result<Option<Loss>, TrainError> {
         if batch.targets.is_empty() {
             return Ok(None);
         }
         let (trials, teacher_outputs) = (batch.targets.len(), batch.teacher_targets.len());
         let voxels = [batch.targets.voxels(), batch.teacher_targets.voxels()].concat();
-        let outputs = self.executor.forward_at(&batch.volumes, &voxels)?;
-        let Loss { mut mean, sums } = self.checked(batch.targets.loss(&outputs.narrow(0, trials), &self.weights))?;
+        let inside = batch.occupancy.voxels();
+        let (outputs, logits) = if inside.is_empty() {
+            (self.executor.forward_at(&batch.volumes, &voxels)?, None)
+        } else {
+            let (outputs, logits) = self.executor.forward_with_occupancy(&batch.volumes, &voxels, inside)?;
+            (outputs, Some(logits))
+        };
+        let Loss { mut mean, mut sums } =
+            self.checked(batch.targets.loss(&outputs.narrow(0, trials), &self.weights))?;
         if teacher_outputs > 0 {
             // Without class weights: the teacher was trained with its own.
             let weights = LossWeights { rotation: self.settings.rotation_weight, ..LossWeights::default() };
             let teacher_loss =
                 self.checked(batch.teacher_targets.loss(&outputs.narrow(trials, teacher_outputs), &weights))?;
             mean += teacher_loss.mean * self.teacher_weight;
+        }
+        if let Some(logits) = logits {
+            let loss = batch.occupancy.loss(&logits)?;
+            sums.occupancy_voxels = inside.len() as f64;
+            sums.occupancy = loss.double_value(&[]);
+            mean += loss * (self.settings.occupancy / inside.len() as f64);
         }
         Ok(Some(Loss { mean, sums }))
     }

@@ -61,6 +61,8 @@ pub struct TrainingSettings {
     pub quality: QualityTarget,
     /// Weight of the rotation in the loss.
     pub rotation_weight: f64,
+    /// Weight of the completion of shapes in the loss; 0: not trained.
+    pub occupancy: f64,
     /// Point of a voxel that a grasp refers to, `corner` or `center`.
     #[serde(serialize_with = "origin_name")]
     pub voxel_origin: VoxelOrigin,

@@ -89,6 +89,7 @@ fn a_volume_is_transformed_like_its_trials() {
         let [x, y, z] = [moved.x, moved.y, moved.z].map(|c| c.floor() as usize);
         assert_eq!(changed.iter().sum::<f32>(), 1.0);
         assert_eq!(changed[(x * N + y) * N + z], 1.0, "{transform:?}");
+        assert_eq!(transform.voxel(cell, N), Some([x, y, z]), "{transform:?}");
     }
 }
 

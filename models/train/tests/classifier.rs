@@ -133,7 +133,7 @@ fn proposals(folder: &Path) -> PathBuf {
         let success = number.is_multiple_of(2);
         let volume = filled(if success { 0.7 } else { 0.2 } + 0.005 * f32::from(number));
         let trial = |i: u8| Trial::new(&grasp(f64::from(i)), success, volume.voxel_size());
-        writer.append(u64::from(number), &[volume.values().to_vec()], &[0, 1, 2, 3].map(trial)).unwrap();
+        writer.append(u64::from(number), &[volume.values().to_vec()], &[0, 1, 2, 3].map(trial), None).unwrap();
     }
     path
 }

@@ -35,6 +35,7 @@ fn settings() -> TrainingSettings {
         balance: false,
         quality: QualityTarget::Label,
         rotation_weight: 1.0,
+        occupancy: 0.0,
         voxel_origin: VoxelOrigin::Center,
         bf16: false,
     }
@@ -265,7 +266,7 @@ fn scenes_added_during_a_run_are_used() {
             let scene = support::scene(number, N);
             let volume: Vec<f32> = scene.volumes[0].iter().map(|&byte| grasp_data::value(byte)).collect();
             // Two volumes per scene, from which the plan draws one.
-            writer.append(number, &[volume.clone(), volume], &scene.trials).unwrap();
+            writer.append(number, &[volume.clone(), volume], &scene.trials, None).unwrap();
         }
     };
     write(0..4);
@@ -289,6 +290,51 @@ fn scenes_added_during_a_run_are_used() {
         epoch(trainer);
     }
     assert_eq!(resumed.model(), whole.model(), "bit-identical");
+}
+
+#[test]
+fn shapes_are_completed_by_a_head_that_the_model_does_not_contain() {
+    let settings = TrainingSettings { batch: 8, learning_rate: 1e-3, validation: 0.2, occupancy: 1.0, ..settings() };
+    let mut whole = trainer(support::dataset(16, N), &settings, EXECUTION);
+    let first = epoch(&mut whole);
+    let checkpoint = whole.checkpoint();
+    let mut resumed = trainer(support::dataset(16, N), &settings, EXECUTION);
+    resumed.resume(&checkpoint).unwrap();
+    assert_eq!(epoch(&mut resumed).loss_occupancy, epoch(&mut whole).loss_occupancy);
+    assert_eq!(resumed.model(), whole.model(), "bit-identical");
+
+    let last = (0..40).map(|_| epoch(&mut whole)).last().unwrap();
+    // A head that knows nothing but the share of occupied voxels has ln 2, because half of the voxels are occupied.
+    let (before, after) = (first.loss_occupancy.unwrap(), last.loss_occupancy.unwrap());
+    assert!(before > 0.5 && after < 0.2, "{before} before, {after} after");
+    assert!(last.validation.unwrap().loss_occupancy.unwrap() < 0.4, "{:?}", last.validation);
+    let names = |model: &ModelProto| -> Vec<String> {
+        let graph = model.graph.as_ref().unwrap();
+        let weights = graph.initializer.iter().map(|weight| weight.name().to_owned());
+        weights.chain(graph.output.iter().map(|output| output.name().to_owned())).collect()
+    };
+    assert_eq!(names(&whole.model()), names(&Architecture::Vgn.build(N, 0).unwrap()));
+
+    let mut without = trainer(support::dataset(16, N), &TrainingSettings { occupancy: 0.0, ..settings }, EXECUTION);
+    assert!(without.resume(&checkpoint).is_err(), "another run");
+    let record = epoch(&mut without);
+    assert_eq!((record.loss_occupancy, record.validation.unwrap().loss_occupancy), (None, None));
+}
+
+#[test]
+fn completion_of_shapes_needs_scenes_with_their_occupancy() {
+    let scene = |seed, known: bool| {
+        let scene = support::scene(seed, N);
+        grasp_data::Scene { occupancy: scene.occupancy.filter(|_| known), ..scene }
+    };
+    let settings = TrainingSettings { occupancy: 1.0, ..settings() };
+    let start = |known: u64| {
+        let dataset = Dataset::of((0..8).map(|seed| scene(seed, seed < known)).collect()).unwrap();
+        Trainer::new(Architecture::Vgn.build(N, 0).unwrap(), dataset, settings.clone(), EXECUTION)
+    };
+    let error = start(0).err().unwrap().to_string();
+    assert!(error.contains("--occupancy needs scenes with their occupancy"), "{error}");
+    assert!(epoch(&mut start(4).unwrap()).loss_occupancy.is_some(), "the others are used without");
 }
 
 #[test]

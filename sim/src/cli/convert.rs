@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use anyhow::{Context, bail, ensure};
 use clap::Args;
 use grasp::{DepthImage, Fusion, RESOLUTION};
-use grasp_data::{DataFormat, Dataset, Setup, Trial, packed, processed, raw, scene_id, scene_number};
+use grasp_data::{DataFormat, Dataset, Occupancy, Setup, Trial, packed, processed, raw, scene_id, scene_number};
 use grasp_sim::ordered;
 use indicatif::ProgressBar;
 use nalgebra::Isometry3;
@@ -76,7 +76,7 @@ impl Convert {
                     })
                     .collect();
                 dropped += trials.len() - kept.len();
-                if kept.is_empty() { Ok(()) } else { writer.append(index, id, &[volume], &kept) }
+                if kept.is_empty() { Ok(()) } else { writer.append(index, id, &[volume], &kept, None) }
             },
         )?;
         progress.finish_and_clear();
@@ -101,7 +101,8 @@ impl Convert {
         for index in 0..dataset.len() {
             let volumes: Vec<Vec<f32>> =
                 (0..dataset.volumes(index)).map(|observation| values(dataset.volume(index, observation))).collect();
-            writer.append(index as u64, &dataset.id(index), &volumes, &dataset.trials(index))?;
+            let occupancy = dataset.occupancy(index);
+            writer.append(index as u64, &dataset.id(index), &volumes, &dataset.trials(index), occupancy.as_ref())?;
             progress.inc(1);
         }
         progress.finish_and_clear();
@@ -139,15 +140,22 @@ impl Writer {
         Ok(writer)
     }
 
-    /// Appends a scene; the processed format takes its first volume. The packed format needs a number: that of `id`, else
-    /// `index`.
-    fn append(&mut self, index: u64, id: &str, volumes: &[Vec<f32>], trials: &[Trial]) -> anyhow::Result<()> {
+    /// Appends a scene; the processed format takes its first volume and no occupancy. The packed format needs a number:
+    /// that of `id`, else `index`.
+    fn append(
+        &mut self,
+        index: u64,
+        id: &str,
+        volumes: &[Vec<f32>],
+        trials: &[Trial],
+        occupancy: Option<&Occupancy>,
+    ) -> anyhow::Result<()> {
         match self {
             Self::Processed(writer) => {
                 let id = scene_number(id).map_or_else(|| id.to_owned(), scene_id);
                 writer.append(&id, &volumes[0], trials)?;
             }
-            Self::Packed(writer) => writer.append(scene_number(id).unwrap_or(index), volumes, trials)?,
+            Self::Packed(writer) => writer.append(scene_number(id).unwrap_or(index), volumes, trials, occupancy)?,
         }
         Ok(())
     }

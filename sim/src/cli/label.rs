@@ -230,7 +230,7 @@ impl Writer {
                 let trials = trials(voxel_size);
                 let volumes: Vec<Vec<f32>> =
                     scene.observations.drain(..).map(|observation| observation.volume).collect();
-                writer.append(number, &volumes, &trials)?;
+                writer.append(number, &volumes, &trials, Some(&scene.occupancy))?;
             }
         }
         Ok(())

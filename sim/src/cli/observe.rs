@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use anyhow::{Context, ensure};
 use clap::{Args, ValueEnum};
 use grasp_data::packed::{Reader, Writer};
-use grasp_data::{Provenance, Setup, quantise};
+use grasp_data::{Occupancy, Provenance, Setup, quantise};
 use grasp_sim::camera::DepthNoise;
 use grasp_sim::label::SceneConfig;
 use grasp_sim::ordered;
@@ -82,8 +82,8 @@ impl Observe {
             seed: made.seed,
         };
         if let Some(&first) = scenes.first() {
-            let observations = before.observe_again(data.number(first), made.observation_seed.unwrap_or(made.seed));
-            let same = observations.first().is_some_and(|first_of| quantise(&first_of.volume) == data.volume(first, 0));
+            let seen = before.observe_again(data.number(first), made.observation_seed.unwrap_or(made.seed));
+            let same = seen.observations.first().is_some_and(|found| quantise(&found.volume) == data.volume(first, 0));
             ensure!(
                 same,
                 "{} was labelled with another simulator or version: its first scene differs; label the scenes again",
@@ -113,14 +113,14 @@ impl Observe {
         ordered::for_each(
             done as u64..scenes.len() as u64,
             // Drops the depth images, which are larger than the volumes.
-            |place| -> Vec<Vec<f32>> {
-                let observations = config.observe_again(data.number(scenes[place as usize]), self.seed);
-                observations.into_iter().map(|observation| observation.volume).collect()
+            |place| -> (Vec<Vec<f32>>, Occupancy) {
+                let seen = config.observe_again(data.number(scenes[place as usize]), self.seed);
+                (seen.observations.into_iter().map(|observation| observation.volume).collect(), seen.occupancy)
             },
-            |place, volumes| {
+            |place, (volumes, occupancy)| {
                 let index = scenes[place as usize];
                 if !volumes.is_empty() {
-                    writer.append(data.number(index), &volumes, &data.trials(index))?;
+                    writer.append(data.number(index), &volumes, &data.trials(index), Some(&occupancy))?;
                 }
                 progress.inc(1);
                 anyhow::Ok(())

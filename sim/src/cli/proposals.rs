@@ -60,7 +60,7 @@ impl Proposals {
             |number| config.proposals(number, &planner, &params),
             |number, scene| {
                 if let Some(scene) = scene? {
-                    writer.append(number, &[scene.volume], &scene.trials)?;
+                    writer.append(number, &[scene.volume], &scene.trials, Some(&scene.occupancy))?;
                 }
                 progress.inc(1);
                 anyhow::Ok(())

@@ -1,7 +1,10 @@
 use std::sync::Arc;
 
+use grasp::WORKSPACE_SIZE;
+use grasp_data::Occupancy;
 use nalgebra::{Isometry3, Point3, Quaternion, UnitQuaternion, Vector3};
 use rapier3d::math::{Pose, Rotation, Vector};
+use rapier3d::parry::bounding_volume::Aabb;
 use rapier3d::parry::query::{self, ClosestPoints};
 use rapier3d::prelude::{
     BoundingVolume, BroadPhaseBvh, CCDSolver, CoefficientCombineRule, ColliderBuilder, ColliderHandle, ColliderSet,
@@ -285,6 +288,33 @@ impl World {
         let (collider, _) = self.objects_query().project_point(vector(&(point.coords * SCALE)), REACH, true)?;
         let id = self.object_of(collider)?;
         self.objects.iter().position(|body| body.id == id)
+    }
+
+    /// The voxels of the task volume with `resolution`³ voxels whose centres are inside an object.
+    #[must_use]
+    pub fn occupancy(&self, resolution: usize) -> Occupancy {
+        let mut occupancy = Occupancy::empty(resolution.pow(3));
+        let voxel = (WORKSPACE_SIZE * SCALE) as f32 / resolution as f32;
+        // The voxels whose centres are between two coordinates.
+        let between = |lower: f32, upper: f32| {
+            let [first, end] = [lower, upper].map(|bound| (bound / voxel + 0.5).clamp(0.0, resolution as f32) as usize);
+            first..end
+        };
+        for collider in self.objects.iter().flat_map(|body| self.colliders_of(body.id.0)) {
+            let collider = &self.colliders[collider];
+            let Aabb { mins, maxs } = collider.compute_aabb();
+            for x in between(mins.x, maxs.x) {
+                for y in between(mins.y, maxs.y) {
+                    for z in between(mins.z, maxs.z) {
+                        let centre = [x, y, z].map(|index| (index as f32 + 0.5) * voxel);
+                        if collider.shape().contains_point(collider.position(), centre.into()) {
+                            occupancy.insert((x * resolution + y) * resolution + z);
+                        }
+                    }
+                }
+            }
+        }
+        occupancy
     }
 
     /// The object that a collider belongs to.

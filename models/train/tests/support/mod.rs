@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use grasp_data::{Dataset, Provenance, Scene, Setup, Trial, processed};
+use grasp_data::{Dataset, Occupancy, Provenance, Scene, Setup, Trial, processed};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -14,7 +14,10 @@ pub fn scene(seed: u64, n: usize) -> Scene {
     let low: [usize; 3] = std::array::from_fn(|_| rng.random_range(2..n / 2));
     let size: [usize; 3] = std::array::from_fn(|_| rng.random_range(3..n / 3));
     let inside = |cell: [usize; 3]| (0..3).all(|axis| (low[axis]..low[axis] + size[axis]).contains(&cell[axis]));
-    let value = |i: usize| if inside([i / (n * n), i / n % n, i % n]) { 64 } else { 191 };
+    let inside = |i: usize| inside([i / (n * n), i / n % n, i % n]);
+    let value = |i: usize| if inside(i) { 64 } else { 191 };
+    let mut occupancy = Occupancy::empty(n.pow(3));
+    (0..n.pow(3)).filter(|&i| inside(i)).for_each(|i| occupancy.insert(i));
     let yaw = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), rng.random_range(0.0..3.0));
     let down = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
     let at = |fraction: f64| Point3::from(std::array::from_fn(|axis| low[axis] as f64 + fraction * size[axis] as f64));
@@ -28,6 +31,7 @@ pub fn scene(seed: u64, n: usize) -> Scene {
             Trial { position: at(0.5), rotation: yaw * down, width, success: true, share: 1.0, ..failure },
             failure,
         ],
+        occupancy: Some(occupancy),
     }
 }
 
