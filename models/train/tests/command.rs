@@ -303,8 +303,8 @@ fn errors_name_the_flag_or_the_file() {
         ("train --network vgn --data data --follow --cosine --out x.onnx", "--cosine with --follow needs --minutes"),
         ("train --network vgn --data data --max-shift 1 --out x.onnx", "--max-shift needs --augment shift"),
         ("train --network vgn --data data --val 0 --keep best --out x.onnx", "--patience and --keep best need results"),
-        ("classify --network evaluator --data data --out x.onnx --val 1", "--val is 1"),
-        ("classify --network evaluator --data data --out x.onnx --lr 0", "--lr is 0"),
+        ("classify --network gpd --data data --out x.onnx --val 1", "--val is 1"),
+        ("classify --network gpd --data data --out x.onnx --lr 0", "--lr is 0"),
         (
             "train --network vgn --data data --evaluate true --out x.onnx",
             "must contain {} in place of the model's file",
