@@ -179,7 +179,7 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
             // A reader that has closed the pipe does not end the run.
             let _ = writeln!(std::io::stdout(), "{}", serde_json::to_string(&record)?);
             better = best.update(training, &record);
-            records.push(record);
+            records.push(*record);
             let drawn = files.write_log(&records).and_then(|()| learning_curves::draw(&files.curves, &records));
             failure = failure.or(drawn.err());
         }

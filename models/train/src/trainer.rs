@@ -57,7 +57,7 @@ pub enum TrainError {
 #[derive(Clone, Debug, PartialEq)]
 pub enum EpochOutcome {
     /// All scenes were used.
-    Completed(EpochRecord),
+    Completed(Box<EpochRecord>),
     /// Stopped after a step; the next call continues.
     Interrupted,
 }
@@ -315,7 +315,7 @@ impl Trainer {
         let sums = std::mem::take(&mut self.sums);
         self.epoch += 1;
         self.batch = 0;
-        Ok(EpochOutcome::Completed(EpochRecord {
+        Ok(EpochOutcome::Completed(Box::new(EpochRecord {
             epoch: self.epoch,
             steps: self.steps(),
             learning_rate,
@@ -328,7 +328,7 @@ impl Trainer {
             benchmark: None,
             seconds,
             volumes_per_second: volumes as f64 / seconds,
-        }))
+        })))
     }
 
     /// One step over `passes` batches, whose gradients are averaged. Returns the number of volumes.

@@ -50,7 +50,7 @@ fn trainer(dataset: Dataset, settings: &TrainingSettings, execution: ExecutionOp
 
 fn epoch(trainer: &mut Trainer) -> EpochRecord {
     match trainer.epoch(&AtomicBool::new(false), |_, _| {}).unwrap() {
-        EpochOutcome::Completed(record) => record,
+        EpochOutcome::Completed(record) => *record,
         EpochOutcome::Interrupted => panic!("the epoch was interrupted"),
     }
 }
