@@ -152,8 +152,8 @@ struct TrainArgs {
     #[arg(long, default_value_t = 1.0)]
     rotation_weight: f64,
     /// Completion of shapes: also train a head that predicts which voxels are inside an object, with this weight in the
-    /// loss; 1 is a good weight. The model does not contain the head. Scenes without their occupancy, such as those of VGN
-    /// and GIGA, are used without.
+    /// loss, such as 1. The model does not contain the head. Scenes without their occupancy, such as those of VGN and
+    /// GIGA, are used without.
     #[arg(long, value_name = "WEIGHT", default_value_t = 0.0)]
     occupancy: f64,
     /// Distillation: also train on the outputs of this model in front of surfaces.
