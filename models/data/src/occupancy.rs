@@ -27,12 +27,6 @@ impl Occupancy {
         &self.bits
     }
 
-    /// Number of voxels, occupied or not.
-    #[must_use]
-    pub fn voxels(&self) -> usize {
-        self.voxels
-    }
-
     /// Marks a voxel as occupied.
     ///
     /// # Panics

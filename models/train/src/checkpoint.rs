@@ -187,52 +187,18 @@ fn copy(stored: &TensorProto, tensor: &Tensor) -> Result<(), CheckpointError> {
 
 impl LossSums {
     /// The sums as a list, for a checkpoint.
-    pub(crate) fn to_list(self) -> Vec<f64> {
-        let Self { voxels, quality, rotation, width, angle, true_positives, false_positives, false_negatives, .. } =
-            self;
-        let Self { occupancy_voxels, occupancy, .. } = self;
-        vec![
-            voxels,
-            quality,
-            rotation,
-            width,
-            angle,
-            true_positives,
-            false_positives,
-            false_negatives,
-            occupancy_voxels,
-            occupancy,
-        ]
+    pub(crate) fn to_list(mut self) -> Vec<f64> {
+        self.fields().map(|sum| *sum).to_vec()
     }
 
     /// The inverse of [`to_list`](Self::to_list); `None` if the length is wrong.
     pub(crate) fn from_list(list: &[f64]) -> Option<Self> {
-        let &[
-            voxels,
-            quality,
-            rotation,
-            width,
-            angle,
-            true_positives,
-            false_positives,
-            false_negatives,
-            occupancy_voxels,
-            occupancy,
-        ] = list
-        else {
+        let mut sums = Self::default();
+        let fields = sums.fields();
+        if list.len() != fields.len() {
             return None;
-        };
-        Some(Self {
-            voxels,
-            quality,
-            rotation,
-            width,
-            angle,
-            true_positives,
-            false_positives,
-            false_negatives,
-            occupancy_voxels,
-            occupancy,
-        })
+        }
+        fields.into_iter().zip(list).for_each(|(sum, value)| *sum = *value);
+        Some(sums)
     }
 }

@@ -204,16 +204,24 @@ fn voxel_of(trial: &Trial, n: usize, origin: VoxelOrigin) -> Option<usize> {
 impl LossSums {
     /// Adds the sums of another batch.
     pub fn add(&mut self, other: &Self) {
-        self.voxels += other.voxels;
-        self.quality += other.quality;
-        self.rotation += other.rotation;
-        self.width += other.width;
-        self.angle += other.angle;
-        self.true_positives += other.true_positives;
-        self.false_positives += other.false_positives;
-        self.false_negatives += other.false_negatives;
-        self.occupancy_voxels += other.occupancy_voxels;
-        self.occupancy += other.occupancy;
+        let mut other = *other;
+        self.fields().into_iter().zip(other.fields()).for_each(|(sum, more)| *sum += *more);
+    }
+
+    /// All sums, in the order of checkpoints.
+    pub(crate) fn fields(&mut self) -> [&mut f64; 10] {
+        [
+            &mut self.voxels,
+            &mut self.quality,
+            &mut self.rotation,
+            &mut self.width,
+            &mut self.angle,
+            &mut self.true_positives,
+            &mut self.false_positives,
+            &mut self.false_negatives,
+            &mut self.occupancy_voxels,
+            &mut self.occupancy,
+        ]
     }
 
     /// The mean loss of a labelled voxel.

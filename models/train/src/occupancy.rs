@@ -14,8 +14,8 @@ use tch::{Reduction, TchError, Tensor};
 use crate::augment::Transform;
 use crate::pointwise::{PaddedFeatures, head_convolutions, largest_kernel};
 
-/// Edge of the kernel, as in the output heads. With 3 and half of the voxels the trained networks were no better than
-/// without this head (models/ablations.md).
+/// Edge of the kernel, as in the output heads. With 3 and half of the voxels a trained network was no better than without
+/// this head (models/ablations.md).
 const KERNEL: usize = 5;
 
 /// Voxels per volume: this many inside objects, and as many anywhere. Three in 100 voxels are inside an object.

@@ -70,8 +70,8 @@ fn is_pointwise(graph: &GraphProto, node: &NodeProto) -> bool {
     }
 }
 
-/// Features `[batch, channels, N, N, N]`, padded with zeros, to be read at single voxels. Several heads that read the same
-/// features share one, because padding and its gradient take as long as a head.
+/// Features `[batch, channels, N, N, N]`, padded with zeros, to be read at single voxels. Heads that read the same features
+/// share one, so that they are padded once.
 pub(crate) struct PaddedFeatures {
     /// `[voxels of the padded arrays, channels]`.
     rows: Tensor,
