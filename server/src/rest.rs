@@ -286,7 +286,7 @@ async fn infer(
     if let Some(length) = header_length {
         response.headers_mut().insert(HEADER_LENGTH, HeaderValue::from(length));
     }
-    Ok(keep_permit(response).map(Body::new))
+    Ok(keep_permit(response, rest.limits).map(Body::new))
 }
 
 impl Rest {

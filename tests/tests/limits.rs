@@ -1,8 +1,9 @@
 //! Size limits, at the exact boundaries.
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
-use grasp_proto::{FILE_DESCRIPTOR_SET, encode, pb};
+use grasp_proto::{FILE_DESCRIPTOR_SET, encode, oip, pb};
 use grasp_tests::{RESOLUTION, Raw, Server, TestModel, blobs};
 use nalgebra::Isometry3;
 use prost::Message;
@@ -10,9 +11,11 @@ use prost::bytes::Bytes;
 use prost::encoding::WireType;
 use prost_types::field_descriptor_proto::{Label, Type};
 use prost_types::{DescriptorProto, FileDescriptorSet};
+use tokio::task::JoinSet;
 use tokio_stream::StreamExt;
-use tonic::codec::CompressionEncoding;
-use tonic::{Code, Request};
+use tonic::codec::{CompressionEncoding, Streaming};
+use tonic::transport::Channel;
+use tonic::{Code, Request, Status};
 
 fn request(padding: usize) -> pb::DetectGraspsRequest {
     let volume = encode(&blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]]), pb::DataType::F32, "");
@@ -161,4 +164,65 @@ async fn request_ids_are_accepted_up_to_the_limit() {
     let mut client = server.raw().await;
     assert_eq!(client.detect_grasps(request(256)).await.unwrap().into_inner().request_id.len(), 256);
     assert_eq!(client.detect_grasps(request(257)).await.unwrap_err().code(), Code::InvalidArgument);
+}
+
+/// Calls ModelInfer. Its response is read only when the stream is.
+async fn infer(
+    channel: Channel,
+    request: oip::ModelInferRequest,
+) -> Result<Streaming<oip::ModelInferResponse>, Status> {
+    let mut client = tonic::client::Grpc::new(channel).max_decoding_message_size(usize::MAX);
+    client.ready().await.unwrap();
+    let path = "/inference.GRPCInferenceService/ModelInfer".parse().unwrap();
+    let codec = tonic_prost::ProstCodec::default();
+    Ok(client.server_streaming(Request::new(request), path, codec).await?.into_inner())
+}
+
+#[tokio::test]
+async fn the_rest_of_a_response_is_dropped_if_the_client_does_not_read_it() {
+    // Its maps have 50 MB, of which the buffer of unread responses holds five.
+    let resolution: usize = 128;
+    let server = Server::run(&[TestModel::new("mirror").resolution(resolution)], &["--stall-timeout", "3"]);
+    let edge = i64::try_from(resolution).unwrap();
+    let request = oip::ModelInferRequest {
+        model_name: "mirror".to_owned(),
+        inputs: vec![oip::model_infer_request::InferInputTensor {
+            name: "tsdf".to_owned(),
+            datatype: "FP32".to_owned(),
+            shape: vec![1, 1, edge, edge, edge],
+            ..Default::default()
+        }],
+        raw_input_contents: vec![0.5_f32.to_le_bytes().repeat(resolution.pow(3)).into()],
+        ..Default::default()
+    };
+    let channel = server.channel().await;
+    let mut calls = JoinSet::new();
+    for _ in 0..8 {
+        calls.spawn(infer(channel.clone(), request.clone()));
+    }
+    let mut unread = Vec::new();
+    let mut refusals = Vec::new();
+    for call in calls.join_all().await {
+        match call {
+            Ok(response) => unread.push(response),
+            Err(refusal) => refusals.push(refusal),
+        }
+    }
+    assert!(!unread.is_empty() && !refusals.is_empty(), "{refusals:?}");
+    for refusal in refusals {
+        assert_eq!(refusal.code(), Code::ResourceExhausted, "{refusal}");
+        assert!(refusal.message().contains("unread"), "{refusal}");
+    }
+    // The buffer has room again although no client has read.
+    let mut attempts = 0..600;
+    let mut later = loop {
+        attempts.next().expect("the unread responses are still kept");
+        match infer(channel.clone(), request.clone()).await {
+            Ok(response) => break response,
+            Err(refusal) => assert_eq!(refusal.code(), Code::ResourceExhausted, "{refusal}"),
+        }
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    };
+    drop(unread);
+    assert_eq!(later.message().await.unwrap().unwrap().raw_output_contents.len(), 3);
 }

@@ -207,7 +207,8 @@ pub(super) struct Flags {
     #[arg(long, env = "GRASPD_RECENT", value_name = "N")]
     pub recent: Option<usize>,
 
-    /// Maximum pause within a message, seconds. After it the request is refused.
+    /// Maximum pause within a message, seconds. After it the request is refused. Also the maximum pause of a client
+    /// that reads a large response; after it the rest is dropped.
     #[arg(
         long,
         env = "GRASPD_STALL_TIMEOUT",

@@ -77,7 +77,8 @@ pub(crate) async fn serve(
     let limit = metrics.connections(connections, limits.stall);
     let incoming = connections::accept(listener, tls.map(|tls| tls.grpc), limit, Arc::clone(&budget));
     let (counted, drain) = (Arc::clone(&metrics), state.clone());
-    let outgoing = MapResponseLayer::new(move |response| keep_permit(request_body::unreadable(response, &counted)));
+    let outgoing =
+        MapResponseLayer::new(move |response| keep_permit(request_body::unreadable(response, &counted), limits));
     let intake = MapRequestLayer::new(move |request: http::Request<Body>| {
         let (mut parts, body) = request.into_parts();
         let deadline = deadline::read(&parts.headers);

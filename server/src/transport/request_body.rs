@@ -38,7 +38,8 @@ type Draining = Pin<Box<dyn Future<Output = ()> + Send>>;
 pub(crate) struct Limits {
     /// Maximum message size, bytes.
     pub message_bytes: usize,
-    /// Maximum pause within a message, and before the HTTP/2 preface of a connection.
+    /// Maximum pause within a message, before the HTTP/2 preface of a connection, and while a client reads a large
+    /// response.
     pub stall: Duration,
 }
 
@@ -73,7 +74,7 @@ impl Limits {
         ))
     }
 
-    /// Maximum time in which a message of this length is received.
+    /// Maximum time in which a message of this length is received, or read by the client.
     pub fn longest(&self, length: usize) -> Duration {
         2 * self.stall + Duration::from_secs_f64(length as f64 / MIN_RATE)
     }
