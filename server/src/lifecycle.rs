@@ -172,7 +172,8 @@ async fn serve(
     let pages = HttpState::new(Arc::clone(metrics), Arc::clone(&models), Arc::clone(&recent));
     let Config { tls, tokens, limits, max_tracked, track_timeout, queue, .. } = config;
     let budget = metrics.receiving(config.max_receiving_bytes);
-    let http_config = HttpConfig { connections: crate::http::CONNECTIONS, tls: None, budget: Arc::clone(&budget) };
+    let limit = metrics.connections("http", crate::http::CONNECTIONS);
+    let http_config = HttpConfig { limit, tls: None, budget: Arc::clone(&budget) };
     let http = tokio::spawn(crate::http::serve(http, config.http_hosts.clone(), pages, http_config, state.clone()));
     let calls = Calls::new(Arc::clone(metrics), recent, state.clone(), tokens.clone());
     let (folder, control) =
@@ -187,10 +188,11 @@ async fn serve(
     let service = GraspRpc::new(Arc::clone(&models), calls, tracked_volumes, recorder, turns, *queue, at_once);
     let rest = rest.map(|listener| {
         let (tokens, limits, metrics) = (tokens.clone(), *limits, Arc::clone(metrics));
+        let limit = metrics.connections("rest", connections);
         let conversions = Arc::new(Semaphore::new(processors()));
         let rest = Rest { inference: inference.clone(), tokens, limits, metrics, conversions };
         let tls = tls.as_ref().map(|tls| tls.http.clone());
-        let config = HttpConfig { connections, tls, budget: Arc::clone(&budget) };
+        let config = HttpConfig { limit, tls, budget: Arc::clone(&budget) };
         tokio::spawn(crate::rest::serve(listener, rest, config, state.clone()))
     });
     if let Some(tokens) = tokens {

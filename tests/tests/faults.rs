@@ -289,13 +289,13 @@ async fn connections_without_a_preface_are_closed() {
     let mut silent =
         [TcpStream::connect(server.grpc()).await.unwrap(), TcpStream::connect(server.grpc()).await.unwrap()];
     silent[1].write_all(b"PRI * HTTP/2.0").await.unwrap();
-    server.wait_for("graspd_connections", 2.0).await;
-    server.wait_for("graspd_connections", 0.0).await;
+    server.wait_for("graspd_connections{listener=\"grpc\"}", 2.0).await;
+    server.wait_for("graspd_connections{listener=\"grpc\"}", 0.0).await;
     // After the preface a connection may stay idle.
     let client = server.client().await;
     client.detect(&volume(), Options::default()).await.unwrap();
     tokio::time::sleep(Duration::from_millis(600)).await;
-    assert_eq!(server.metric("graspd_connections"), 1.0);
+    assert_eq!(server.metric("graspd_connections{listener=\"grpc\"}"), 1.0);
     client.detect(&volume(), Options::default()).await.unwrap();
 }
 
@@ -361,7 +361,7 @@ async fn connections_above_the_limit_are_closed_and_others_stay() {
     for client in &clients {
         client.detect(&volume(), Options::default()).await.unwrap();
     }
-    assert_eq!(server.metric("graspd_connections"), 2.0);
+    assert_eq!(server.metric("graspd_connections{listener=\"grpc\"}"), 2.0);
     let third = Client::connect(server.grpc().to_string()).await;
     let answered = match third {
         Ok(third) => third.detect(&volume(), Options::default()).await.is_ok(),
@@ -370,7 +370,7 @@ async fn connections_above_the_limit_are_closed_and_others_stay() {
     assert!(!answered);
     let [first, second] = clients;
     drop(first);
-    server.wait_for("graspd_connections", 1.0).await;
+    server.wait_for("graspd_connections{listener=\"grpc\"}", 1.0).await;
     server.client().await.detect(&volume(), Options::default()).await.unwrap();
     second.detect(&volume(), Options::default()).await.unwrap();
 }
@@ -419,7 +419,7 @@ async fn ten_thousand_idle_connections_use_little_memory_and_delay_no_requests()
     for _ in 0..CONNECTIONS {
         idle.push(connect(&server).await);
     }
-    server.wait_for("graspd_connections", CONNECTIONS as f64 + 1.0).await;
+    server.wait_for("graspd_connections{listener=\"grpc\"}", CONNECTIONS as f64 + 1.0).await;
     for _ in 0..100 {
         assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 1);
     }
@@ -428,7 +428,7 @@ async fn ten_thousand_idle_connections_use_little_memory_and_delay_no_requests()
     println!("{each} bytes a connection");
     assert!(each < 100_000, "{each} bytes a connection");
     drop(idle);
-    server.wait_for("graspd_connections", 1.0).await;
+    server.wait_for("graspd_connections{listener=\"grpc\"}", 1.0).await;
 }
 
 async fn connect(server: &Server) -> SendRequest<Bytes> {

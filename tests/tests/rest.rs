@@ -108,3 +108,19 @@ async fn accepted_requests_are_answered_before_the_exit() {
     }
     assert_eq!(server.wait().unwrap().code(), Some(0));
 }
+
+#[tokio::test]
+async fn connections_are_limited_and_counted() {
+    let flags = ["--rest", "127.0.0.1:0", "--max-connections", "2"];
+    let server = Server::run(&[TestModel::new("mirror")], &flags);
+    let metric = |name: &str| server.metric(&format!("graspd_connections{name}{{listener=\"rest\"}}"));
+    assert_eq!((metric(""), metric("_limit"), metric("_refused_total")), (0.0, 2.0, 0.0));
+    // The header is complete, the body is not.
+    let held = [open(&server, INFER, 100, b"{").await, open(&server, INFER, 100, b"{").await];
+    server.wait_until("graspd_receiving_bytes", |bytes| bytes > 1.0).await;
+    let mut third = TcpStream::connect(server.rest().unwrap()).await.unwrap();
+    assert_eq!(third.read(&mut [0]).await.unwrap_or(0), 0);
+    assert_eq!((metric(""), metric("_refused_total")), (2.0, 1.0));
+    drop(held);
+    server.wait_for("graspd_connections{listener=\"rest\"}", 0.0).await;
+}

@@ -159,13 +159,13 @@ async fn a_client_that_is_silent_after_the_tls_handshake_is_disconnected() {
         Server::run(&[TestModel::new("mirror")], &["--tls-cert", &cert, "--tls-key", &key, "--stall-timeout", "0.5"]);
     let mut silent = [authority.connect(server.grpc()).await.unwrap(), authority.connect(server.grpc()).await.unwrap()];
     silent[1].write_all(b"PRI * HTTP/2.0").await.unwrap();
-    server.wait_for("graspd_connections", 2.0).await;
-    server.wait_for("graspd_connections", 0.0).await;
+    server.wait_for("graspd_connections{listener=\"grpc\"}", 2.0).await;
+    server.wait_for("graspd_connections{listener=\"grpc\"}", 0.0).await;
     // After the preface a connection may stay idle.
     let client = Client::connect_with(server.grpc().to_string(), authority.access()).await.unwrap();
     client.health().await.unwrap();
     tokio::time::sleep(Duration::from_millis(900)).await;
-    assert_eq!(server.metric("graspd_connections"), 1.0);
+    assert_eq!(server.metric("graspd_connections{listener=\"grpc\"}"), 1.0);
     client.health().await.unwrap();
 }
 

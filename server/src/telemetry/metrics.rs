@@ -46,11 +46,11 @@ pub(crate) struct Metrics {
     models: IntGaugeVec,
     reloads: IntCounterVec,
     rejected: IntGauge,
-    connections: IntGauge,
+    connections: IntGaugeVec,
     receiving: IntGauge,
     receiving_limit: IntGauge,
-    connections_limit: IntGauge,
-    connections_refused: IntCounter,
+    connections_limit: IntGaugeVec,
+    connections_refused: IntCounterVec,
     certificate: IntGauge,
     ready: IntGauge,
     tracked: IntGauge,
@@ -150,13 +150,14 @@ impl Metrics {
                 &["outcome"],
             ),
             rejected: gauge("graspd_rejected_files", "Model files that could not be loaded at the last reload."),
-            connections: gauge("graspd_connections", "Open connections to the gRPC listener."),
+            connections: gauges("graspd_connections", "Open connections.", &["listener"]),
             receiving: gauge("graspd_receiving_bytes", "Received bytes of messages that are not complete yet."),
             receiving_limit: gauge("graspd_receiving_limit_bytes", "Maximum of graspd_receiving_bytes."),
-            connections_limit: gauge("graspd_connections_limit", "Maximum number of open connections."),
-            connections_refused: counter(
+            connections_limit: gauges("graspd_connections_limit", "Maximum number of open connections.", &["listener"]),
+            connections_refused: counters(
                 "graspd_connections_refused_total",
                 "Connections refused because the limit was reached.",
+                &["listener"],
             ),
             certificate: gauge(
                 "graspd_certificate_expiry_seconds",
@@ -323,10 +324,14 @@ impl Metrics {
         }
     }
 
-    /// A limit on open connections with its metrics.
-    pub fn connections(&self, limit: usize, timeout: Duration) -> ConnectionLimit {
-        self.connections_limit.set(i64::try_from(limit).unwrap_or(i64::MAX));
-        ConnectionLimit { limit, timeout, open: self.connections.clone(), refused: self.connections_refused.clone() }
+    /// A limit on the open connections of a listener (`grpc`, `http` or `rest`), with its metrics.
+    pub fn connections(&self, listener: &str, limit: usize) -> ConnectionLimit {
+        self.connections_limit.with_label_values(&[listener]).set(i64::try_from(limit).unwrap_or(i64::MAX));
+        ConnectionLimit {
+            limit,
+            open: self.connections.with_label_values(&[listener]),
+            refused: self.connections_refused.with_label_values(&[listener]),
+        }
     }
 
     /// A budget of `capacity` bytes for messages that are being received, with its metrics.

@@ -18,24 +18,41 @@ use tracing::warn;
 use crate::transport::address::{Listener, Socket, peer};
 use crate::transport::receive_budget::{ConnectionShare, ReceiveBudget};
 
-/// The limit on open connections, with its metrics.
+/// The limit on the open connections of a listener, with its metrics.
+#[derive(Clone)]
 pub(crate) struct ConnectionLimit {
     pub limit: usize,
-    /// Maximum time until a client has sent the HTTP/2 preface, with the TLS handshake.
-    pub timeout: Duration,
     pub open: IntGauge,
     pub refused: IntCounter,
 }
 
+impl ConnectionLimit {
+    /// Counts an open connection until the value is dropped.
+    pub fn count(&self) -> Counted {
+        self.open.inc();
+        Counted(self.open.clone())
+    }
+}
+
+/// An open connection in the metrics.
+pub(crate) struct Counted(IntGauge);
+
+impl Drop for Counted {
+    fn drop(&mut self) {
+        self.0.dec();
+    }
+}
+
 /// Accepts the connections of a listener, with TLS if it is given. Connections beyond the limit are closed immediately,
-/// which clients report as UNAVAILABLE.
+/// which clients report as UNAVAILABLE. `timeout` is the maximum time until a client has sent the HTTP/2 preface, with
+/// the TLS handshake.
 pub(crate) fn accept(
     listener: Listener,
     tls: Option<TlsAcceptor>,
     limit: ConnectionLimit,
+    timeout: Duration,
     budget: Arc<ReceiveBudget>,
 ) -> impl Stream<Item = io::Result<Connection>> {
-    let ConnectionLimit { limit, timeout, open, refused } = limit;
     let accepted = listener.sockets().then(async |accepted| {
         if let Err(error) = &accepted {
             // The most likely cause is the limit of open files. An immediate retry would fail again.
@@ -45,12 +62,12 @@ pub(crate) fn accept(
         accepted
     });
     accepted.filter_map(move |accepted| match accepted {
-        Ok(stream) if open.get() < i64::try_from(limit).unwrap_or(i64::MAX) => {
-            Some(Ok(Connection::new(stream, tls.as_ref(), timeout, &open, &budget)))
+        Ok(stream) if limit.open.get() < i64::try_from(limit.limit).unwrap_or(i64::MAX) => {
+            Some(Ok(Connection::new(stream, tls.as_ref(), timeout, limit.count(), &budget)))
         }
         Ok(_) => {
-            refused.inc();
-            warn!(open = open.get(), "connection refused: the limit is reached (--max-connections)");
+            limit.refused.inc();
+            warn!(open = limit.open.get(), "connection refused: the limit is reached (--max-connections)");
             None
         }
         Err(error) => Some(Err(error)),
@@ -64,12 +81,12 @@ const ERROR_PAUSE: Duration = Duration::from_millis(100);
 /// connections.
 const PREFACE: usize = 24;
 
-/// A connection, counted in `open` until it is dropped.
+/// A connection to the gRPC listener.
 pub(crate) struct Connection {
     stream: Stage,
     /// Missing bytes of the preface and their timeout; None after the preface.
     preface: Option<(usize, Pin<Box<Sleep>>)>,
-    open: IntGauge,
+    _counted: Counted,
     peer: Peer,
 }
 
@@ -107,16 +124,15 @@ impl Connection {
         stream: Socket,
         tls: Option<&TlsAcceptor>,
         timeout: Duration,
-        open: &IntGauge,
+        counted: Counted,
         budget: &Arc<ReceiveBudget>,
     ) -> Self {
-        open.inc();
         let peer = Peer { address: peer(&stream), share: budget.connection() };
         let stream = match tls {
             None => Stage::Plain(stream),
             Some(tls) => Stage::Handshake(Box::new(tls.accept(stream))),
         };
-        Self { stream, preface: Some((PREFACE, Box::pin(sleep(timeout)))), open: open.clone(), peer }
+        Self { stream, preface: Some((PREFACE, Box::pin(sleep(timeout)))), _counted: counted, peer }
     }
 
     /// The bytes, when the handshake is done.
@@ -146,12 +162,6 @@ impl Connection {
     fn check_time(&mut self, context: &mut Context<'_>) -> io::Result<()> {
         let is_late = self.preface.as_mut().is_some_and(|(_, timeout)| timeout.as_mut().poll(context).is_ready());
         if is_late { Err(io::ErrorKind::TimedOut.into()) } else { Ok(()) }
-    }
-}
-
-impl Drop for Connection {
-    fn drop(&mut self) {
-        self.open.dec();
     }
 }
 
@@ -242,8 +252,8 @@ mod tests {
         let open = IntGauge::new("open", "Open connections.").unwrap();
         let refused = IntCounter::new("refused", "Refused connections.").unwrap();
         let timeout = Duration::from_secs(10);
-        let limit = ConnectionLimit { limit: 1, timeout, open, refused };
-        let mut incoming = pin!(accept(listener, None, limit, budget()));
+        let limit = ConnectionLimit { limit: 1, open, refused };
+        let mut incoming = pin!(accept(listener, None, limit, timeout, budget()));
 
         let _silent = TcpStream::connect(address).await.unwrap();
         let mut connection = incoming.next().await.unwrap().unwrap();
@@ -257,13 +267,8 @@ mod tests {
         let (listener, address) = listener().await;
         let open = IntGauge::new("open", "Open connections.").unwrap();
         let refused = IntCounter::new("refused", "Refused connections.").unwrap();
-        let limit = ConnectionLimit {
-            limit: 1,
-            timeout: Duration::from_secs(10),
-            open: open.clone(),
-            refused: refused.clone(),
-        };
-        let mut incoming = pin!(accept(listener, None, limit, budget()));
+        let limit = ConnectionLimit { limit: 1, open: open.clone(), refused: refused.clone() };
+        let mut incoming = pin!(accept(listener, None, limit, Duration::from_secs(10), budget()));
 
         let _first = TcpStream::connect(address).await.unwrap();
         let connection = incoming.next().await.unwrap().unwrap();

@@ -21,7 +21,7 @@ use tower::Service;
 use tracing::{debug, warn};
 
 use crate::readiness::{State, draining};
-use crate::transport::connections::Peer;
+use crate::transport::connections::{ConnectionLimit, Counted, Peer};
 use crate::transport::receive_budget::ReceiveBudget;
 
 /// Maximum time for the header of a request, and between two requests of a connection.
@@ -36,8 +36,7 @@ const ERROR_PAUSE: Duration = Duration::from_millis(100);
 /// Settings of a listener.
 #[derive(Clone)]
 pub(crate) struct HttpConfig {
-    /// Maximum number of open connections.
-    pub connections: usize,
+    pub limit: ConnectionLimit,
     /// None for plaintext.
     pub tls: Option<TlsAcceptor>,
     /// The messages that are being received.
@@ -70,9 +69,10 @@ pub(crate) async fn serve(listener: TcpListener, config: HttpConfig, app: Router
             }
         };
         open.retain(|connection| !connection.task.is_finished());
-        if open.len() >= config.connections {
+        if open.len() >= config.limit.limit {
             let is_silent = |connection: &Open| !connection.has_requested.load(Ordering::Relaxed);
             let Some(silent) = open.iter().position(is_silent) else {
+                config.limit.refused.inc();
                 warn!(open = open.len(), "HTTP connection refused: the limit is reached");
                 continue;
             };
@@ -80,7 +80,8 @@ pub(crate) async fn serve(listener: TcpListener, config: HttpConfig, app: Router
         }
         let has_requested = Arc::new(AtomicBool::new(false));
         let (app, requested) = (app.clone(), Arc::clone(&has_requested));
-        let task = tasks.spawn(serve_connection(stream, config.clone(), app, requested, state.clone()));
+        let connection = serve_connection(stream, config.clone(), app, requested, config.limit.count(), state.clone());
+        let task = tasks.spawn(connection);
         open.push(Open { task: task.abort_handle(), has_requested });
     }
     drop(listener);
@@ -93,6 +94,7 @@ async fn serve_connection(
     HttpConfig { tls, budget, .. }: HttpConfig,
     app: Router,
     has_requested: Arc<AtomicBool>,
+    _counted: Counted,
     state: watch::Receiver<State>,
 ) {
     let peer = Peer { address: stream.peer_addr().ok(), share: budget.connection() };

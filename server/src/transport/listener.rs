@@ -74,8 +74,8 @@ pub(crate) async fn serve(
     let grasps = grasps.accept_compressed(CompressionEncoding::Gzip).accept_compressed(CompressionEncoding::Zstd);
     let inference = inference.accept_compressed(CompressionEncoding::Gzip).accept_compressed(CompressionEncoding::Zstd);
     let guard = tokens::guard(tokens, Arc::clone(&metrics));
-    let limit = metrics.connections(connections, limits.stall);
-    let incoming = connections::accept(listener, tls.map(|tls| tls.grpc), limit, Arc::clone(&budget));
+    let limit = metrics.connections("grpc", connections);
+    let incoming = connections::accept(listener, tls.map(|tls| tls.grpc), limit, limits.stall, Arc::clone(&budget));
     let (counted, drain) = (Arc::clone(&metrics), state.clone());
     let outgoing =
         MapResponseLayer::new(move |response| keep_permit(request_body::unreadable(response, &counted), limits));
