@@ -74,7 +74,9 @@ struct Unread {
 impl PermitBody {
     fn new(body: Body, permit: ResponsePermit, limits: Limits) -> Self {
         let now = Instant::now();
-        let end = now + limits.longest(permit.bytes);
+        // Only REST knows the length: JSON is longer than its maps.
+        let length = http_body::Body::size_hint(&body).exact().and_then(|length| usize::try_from(length).ok());
+        let end = now + limits.longest(length.unwrap_or(permit.bytes));
         let unread = Unread { body, rest: Bytes::new(), last: now, _permit: permit };
         let shared = Arc::new(Mutex::new(Some(unread)));
         // A task, because hyper does not poll the body of a client that does not read.
