@@ -27,6 +27,18 @@ const PILE_SCALE: Range<f64> = 0.8..1.0;
 /// Scale of packed objects.
 const PACKED_SCALE: Range<f64> = 0.7..0.9;
 
+impl SceneKind {
+    /// The average scale of the objects of a scene.
+    #[must_use]
+    pub fn mean_scale(self) -> f64 {
+        let range = match self {
+            Self::Pile => PILE_SCALE,
+            Self::Packed => PACKED_SCALE,
+        };
+        (range.start + range.end) / 2.0
+    }
+}
+
 /// Velocity norm (m/s and rad/s together) at which a body counts as resting.
 const REST_SPEED: f64 = 0.01;
 

@@ -527,6 +527,8 @@ fn errors_name_the_cause() {
         ("label --scenes 1 --views side,anywhere:1 --out never".to_owned(), "`anywhere` is now `random`"),
         ("label --scenes 1 --observations 0 --out never".to_owned(), "--observations is 0, must be greater than 0"),
         ("label --scenes 1 --stretch 1.2 --export x.jsonl --out never".to_owned(), "leave out --stretch"),
+        ("label --scenes 1 --clearance 0.02 --export x.jsonl --out never".to_owned(), "and --clearance"),
+        ("label --scenes 1 --clearance 25 --out never".to_owned(), "must be from 0.001 to 0.035 metres"),
         ("label --scenes 1 --export data.jsonl --out never".to_owned(), "--export data.jsonl already exists"),
         ("label --scene pile --scenes 3 --points 5 --out half".to_owned(), "half has scenes in another format"),
         ("observe half --views side --out never".to_owned(), "half has no packed scenes"),

@@ -48,6 +48,10 @@ pub struct Provenance {
     /// Greatest factor by which objects were stretched along an axis; absent if they were not.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stretch: Option<f64>,
+    /// Greatest distance between an object and each finger of the open hand, metres, if objects were resized to have
+    /// one from 0 to this; absent if they were not.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub clearance: Option<f64>,
     /// Grasp points per scene.
     pub points: usize,
     /// Camera views of the scenes.

@@ -16,6 +16,7 @@ fn setup() -> Setup {
         objects: "train".into(),
         part: "all".to_owned(),
         stretch: None,
+        clearance: None,
         points: 2,
         views: "side".into(),
         observations: 2,

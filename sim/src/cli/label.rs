@@ -71,8 +71,9 @@ impl Label {
             self.observations
         );
         ensure!(
-            self.export.is_none() || self.data.stretch.is_none(),
-            "--export names the objects of each scene, and does not describe stretched ones; leave out --stretch"
+            self.export.is_none() || (self.data.stretch.is_none() && self.data.clearance.is_none()),
+            "--export names the objects of each scene, and does not describe stretched or resized ones; leave out \
+             --stretch and --clearance"
         );
         let config = self.data.config(self.points, self.observations)?;
         let setup = Setup::benchmark(self.data.provenance(&config));

@@ -68,9 +68,13 @@ impl Observe {
         );
         let scene = Scene::from_str(&made.scene, false).map_err(anyhow::Error::msg)?;
         let part = Part::from_str(&made.part, false).map_err(anyhow::Error::msg)?;
+        let kind = scene.kind();
         let before = SceneConfig {
-            kind: scene.kind(),
-            objects: part.of(scene.objects(&made.objects)?, &made.objects)?.stretched(made.stretch),
+            kind,
+            objects: part
+                .of(scene.objects(&made.objects)?, &made.objects)?
+                .stretched(made.stretch)
+                .with_clearance(made.clearance, kind.mean_scale()),
             points: made.points,
             views: parse(&made.views)?,
             observations: made.observations,

@@ -51,6 +51,7 @@ pub fn provenance() -> Provenance {
         objects: "boxes".into(),
         part: "all".to_owned(),
         stretch: None,
+        clearance: None,
         points: 2,
         views: "all".into(),
         observations: 1,
