@@ -7,31 +7,19 @@ CARGO ?= cargo
 PYTHON ?= python3
 export CARGO_TARGET_DIR
 
-# Only grasp-train needs libtorch, so it is built separately.
+# Everything but grasp-train, which needs libtorch.
 WORKSPACE = --workspace --exclude grasp-train --locked
 TRAIN = --package grasp-train --locked
 RELEASE = $(CARGO_TARGET_DIR)/release
-# Ends tests that hang. cargo reports each test that runs for more than a minute.
-LIMIT ?= $(if $(shell command -v timeout),timeout --foreground 90m)
 
 # Prefixes of commands. A recipe stops if the library or program is not available.
 with_onnxruntime = ORT_DYLIB_PATH="$$($(PYTHON) deploy/native.py onnxruntime)" && export ORT_DYLIB_PATH &&
 with_python = GRASPD_PYTHON="$$($(PYTHON) tests/tools.py python)" && export GRASPD_PYTHON &&
-# Programs that tests run.
-with_programs = GRASPD_PROMETHEUS="$$($(PYTHON) tests/tools.py prometheus)" && export GRASPD_PROMETHEUS && \
-	GRASPD_PROMTOOL="$$($(PYTHON) tests/tools.py promtool)" && export GRASPD_PROMTOOL && \
-	GRASPD_CPP="$$($(PYTHON) tests/tools.py cpp)" && export GRASPD_CPP && \
-	GRASPD_CHROMIUM="$$($(PYTHON) tests/tools.py chromium)" && export GRASPD_CHROMIUM && \
-	GRASPD_HAPROXY="$$($(PYTHON) tests/tools.py haproxy)" && export GRASPD_HAPROXY && \
-	GRASPD_PERF_ANALYZER="$$($(PYTHON) tests/tools.py perf-analyzer)" && export GRASPD_PERF_ANALYZER &&
 with_libtorch = LIBTORCH="$$($(PYTHON) deploy/native.py libtorch)" && export LIBTORCH && \
 	LD_LIBRARY_PATH="$$LIBTORCH/lib$${LD_LIBRARY_PATH:+:$$LD_LIBRARY_PATH}" && export LD_LIBRARY_PATH &&
 
 
-.PHONY: help demo build test fmt fmt-check lint doc deny test-rust test-train test-python test-faults fuzz bench-sim \
-	bench-gpu bench-serve soak tables clean
-# The parts of `test` run in this order also under `make -j`: fast failures first.
-.NOTPARALLEL:
+.PHONY: help demo build test test-some fmt lint doc deny test-faults fuzz bench-sim bench-gpu bench-serve soak tables clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
@@ -43,36 +31,27 @@ demo: ## simulate a cluttered table, detect grasps with the server, execute the 
 build: ## build the server, the simulator and the client, optimised
 	$(CARGO) build --release $(WORKSPACE)
 
-test: fmt-check lint doc test-rust test-train ## all checks that a change must pass
+test: ## all checks that a change must pass
+	$(PYTHON) tests/run.py
 
 fmt: ## format the code
 	$(CARGO) fmt --all
 
-fmt-check: ## check the format
-	$(CARGO) fmt --all --check
-
 lint: ## run clippy; warnings are errors
-	$(CARGO) clippy $(WORKSPACE) --all-targets -- -D warnings
-	$(with_libtorch) $(CARGO) clippy $(TRAIN) --all-targets -- -D warnings
+	$(with_libtorch) $(CARGO) clippy --workspace --locked --all-targets -- -D warnings
 
 doc: ## build the documentation; broken links are errors
-	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --no-deps $(WORKSPACE)
-	$(with_libtorch) RUSTDOCFLAGS="-D warnings" $(CARGO) doc --no-deps $(TRAIN)
+	$(with_libtorch) RUSTDOCFLAGS="-D warnings" $(CARGO) doc --no-deps --workspace --locked
 
 deny: ## check licences, advisories and sources of the dependencies (needs cargo-deny)
 	$(CARGO) deny check
 
-test-rust: ## run all tests except training, including the Python end-to-end tests
-	$(with_onnxruntime) $(with_python) $(with_programs) $(LIMIT) $(CARGO) test $(WORKSPACE)
-
-test-train: ## run the tests of training, in libtorch on the CPU
-	$(with_onnxruntime) $(with_libtorch) $(LIMIT) $(CARGO) test $(TRAIN)
-
-test-python: ## run only the tests of test-rust with `python` in their names
-	$(with_onnxruntime) $(with_python) $(with_programs) $(CARGO) test $(WORKSPACE) python
+test-some: ## compile, and run the tests whose names contain NAME: make test-some NAME=python
+	$(PYTHON) tests/run.py $(NAME)
 
 test-faults: ## run the test that `test` excludes: ten thousand connections
-	$(with_onnxruntime) $(CARGO) test $(WORKSPACE) --test faults -- --ignored --nocapture
+	$(with_libtorch) $(CARGO) build --workspace --locked --bins
+	$(with_onnxruntime) $(with_libtorch) $(CARGO) test --workspace --locked --test it faults -- --ignored --nocapture
 
 fuzz: ## fuzz the decoders of volumes and views, twenty million inputs each (needs cargo-fuzz)
 	for target in request views; do RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run --fuzz-dir tests/fuzz \

@@ -15,8 +15,9 @@ Variables and downloads are handled as in deploy/native.py.
 
 import os
 import sys
+from functools import lru_cache
 from pathlib import Path
-from typing import List
+from typing import List, Set, Tuple
 
 TESTS = Path(__file__).resolve().parent
 sys.path.insert(0, str(TESTS.parent / "deploy"))
@@ -126,24 +127,23 @@ def from_debian(package: str, name: str, variable: str) -> Path:
 
 
 def unpacked(name: str, packages: List[str], title: str, variable: str) -> Path:
-    """A folder with Debian packages and the libraries that this machine lacks, unpacked instead of installed: this needs no
-    root, and no service starts."""
+    """A folder with Debian packages and all that they depend on, unpacked instead of installed: this needs no root, and no
+    service starts. The contents do not depend on what is installed on this machine: an installed package may have files
+    that an unpacked program looks for beside itself."""
     import shutil
     import subprocess
 
     if not shutil.which("apt-get"):
         raise Unavailable(f"{title} not found, and no apt-get to download it; set {variable} to its path.")
-    folder = CACHE / f"debian-{name}-{PLATFORM}"
+    folder = CACHE / f"debian-complete-{name}-{PLATFORM}"
 
     def build(part: Path) -> None:
         wanted = " ".join(packages)
-        say(f"Debian's {wanted} -> {folder}")
-        simulate = ["apt-get", "install", "--simulate", "--no-install-recommends", *packages]
-        plan = subprocess.run(simulate, capture_output=True, text=True)
-        names = [line.split()[1] for line in plan.stdout.splitlines() if line.startswith("Inst ")]
-        if not names or subprocess.run(["apt-get", "download", *names], cwd=part, stdout=sys.stderr).returncode:
-            said = plan.stderr.strip() or "apt-get says above why"
-            raise Unavailable(f"{wanted} could not be downloaded ({said}); run `apt-get update` as root or set {variable}.")
+        # The machine has apt, dpkg, a compiler, and what they depend on, such as the C library.
+        names = sorted(dependencies(tuple(packages), variable) - dependencies(("apt", "dpkg", "g++", "perl"), variable))
+        say(f"Debian's {wanted}, {len(names)} packages -> {folder}")
+        if subprocess.run(["apt-get", "download", "--quiet", *names], cwd=part, stdout=subprocess.DEVNULL).returncode:
+            raise Unavailable(f"{wanted} could not be downloaded; run `apt-get update` as root or set {variable}.")
         for archive in part.glob("*.deb"):
             subprocess.run(["dpkg-deb", "--extract", archive, part], check=True)
             archive.unlink()
@@ -162,6 +162,22 @@ def unpacked(name: str, packages: List[str], title: str, variable: str) -> Path:
             script.chmod(0o755)
 
     return built_once(folder, build)
+
+
+@lru_cache
+def dependencies(packages: Tuple[str, ...], variable: str) -> Set[str]:
+    """The packages that apt would install on a machine without any."""
+    import subprocess
+
+    simulate = ["apt-get", "install", "--simulate", "--no-install-recommends", "-o", "Dir::State::status=/dev/null"]
+    # In English, because the lines are parsed.
+    environment = {**os.environ, "LC_ALL": "C"}
+    plan = subprocess.run([*simulate, *packages], capture_output=True, text=True, env=environment)
+    names = {line.split()[1] for line in plan.stdout.splitlines() if line.startswith("Inst ")}
+    if not names:
+        cause = plan.stderr.strip().splitlines()[-1:]
+        raise Unavailable(f"{' '.join(packages)} not found ({' '.join(cause)}); run `apt-get update` as root or set {variable}.")
+    return names
 
 
 def interpreter(name: str, base: str, title: str, megabytes: int, variable: str) -> Path:

@@ -1,6 +1,6 @@
 """Tests a client generated from the .proto file against the server at GRASPD_SERVER, which serves the model "mirror".
 
-The crate grasp-tests (tests/python.rs) starts that server and runs this file. To run it separately:
+The crate grasp-tests (tests/it/python.rs) starts that server and runs this file. To run it separately:
     GRASPD_SERVER=127.0.0.1:50051 GRASPD_PROTO=proto/proto python -m unittest discover tests/python
 """
 

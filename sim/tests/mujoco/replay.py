@@ -1,4 +1,4 @@
-"""Replays trials of grasp-sim in MuJoCo, for sim/tests/agreement.rs. Needs `pip install mujoco numpy`.
+"""Replays trials of grasp-sim in MuJoCo, for sim/tests/it/agreement.rs. Needs `pip install mujoco numpy`.
 
     grasp-sim objects --objects train --out objects
     grasp-sim label --scene pile --objects train --points 40 --scenes 8 --seed 77 --out pile --export pile.jsonl

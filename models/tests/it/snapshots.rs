@@ -2,8 +2,6 @@
 //! runtime, of the graph rewriting or of a dependency has not changed what is served. After a network is replaced, set
 //! `UPDATE_SNAPSHOTS=1` once and commit the new file. `ORT_DYLIB_PATH` must name ONNX Runtime's library.
 
-mod scenes;
-
 use std::env;
 use std::fmt::Write;
 use std::fs;
@@ -11,6 +9,8 @@ use std::path::Path;
 
 use grasp::Maps;
 use grasp_models::{Network, Options};
+
+use crate::scenes;
 
 /// Two libraries or processors sum in a different order.
 const TOLERANCE: f64 = 2e-3;

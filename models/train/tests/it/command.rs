@@ -1,7 +1,5 @@
 //! The program `grasp-train`.
 
-mod support;
-
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
@@ -12,6 +10,8 @@ use grasp::VoxelOrigin;
 use grasp_models::onnx::ModelProto;
 use grasp_models::{Architecture, Calibration, Metadata, Orientation, Store};
 use grasp_train::{Checkpoint, EpochRecord};
+
+use crate::support;
 
 const N: usize = 16;
 

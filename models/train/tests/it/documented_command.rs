@@ -1,12 +1,12 @@
 //! The training command of docs/training.md, on a small data set in the folder that it names.
 
-mod support;
-
 use std::fs;
 use std::process::Command;
 
 use grasp::RESOLUTION;
 use grasp_models::Store;
+
+use crate::support;
 
 #[test]
 fn the_training_command_of_the_documentation_works() {

@@ -2,10 +2,10 @@
 //! CPU kernels in fp32, on several scenes and batch sizes. `ORT_DYLIB_PATH` must name ONNX Runtime's library; `make test`
 //! sets it. Providers that this machine does not have are listed in the test's output.
 
-mod scenes;
-
 use grasp::{Maps, Volume};
 use grasp_models::{Backend, BackendError, LoadReason, Network, Options, Precision, Provider};
+
+use crate::scenes;
 
 const PROVIDERS: [Provider; 4] = [Provider::Cpu, Provider::OpenVino, Provider::Cuda, Provider::TensorRt];
 const PRECISIONS: [Precision; 3] = [Precision::Fp32, Precision::Bf16, Precision::Fp16];

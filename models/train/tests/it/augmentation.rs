@@ -1,12 +1,12 @@
 //! Augmentation of scenes together with their grasps.
 
-mod support;
-
 use grasp_data::{MAX_CLEARANCE, Trial};
 use grasp_train::{Augmentation, Transform};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+
+use crate::support;
 
 const N: usize = 16;
 

@@ -2,8 +2,6 @@
 //! evaluator is replaced, set `UPDATE_SNAPSHOTS=1` once and commit the new file. `ORT_DYLIB_PATH` must name ONNX
 //! Runtime's library.
 
-mod scenes;
-
 use std::env;
 use std::f64::consts::PI;
 use std::fmt::Write;
@@ -13,6 +11,8 @@ use std::path::Path;
 use grasp::{Patch, Volume};
 use grasp_models::{Classifier, Options, Precision, Provider};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion};
+
+use crate::scenes;
 
 /// Largest difference of a score from its snapshot. Two libraries or processors sum in a different order.
 const TOLERANCE: f32 = 2e-3;

@@ -1,7 +1,5 @@
 //! Small training runs.
 
-mod support;
-
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use grasp::VoxelOrigin;
@@ -14,6 +12,8 @@ use grasp_train::{
 };
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use tch::{Device, Kind, Tensor};
+
+use crate::support;
 
 const N: usize = 16;
 const EXECUTION: ExecutionOptions = ExecutionOptions { device: Device::Cpu, bf16: false, channels_last: true };

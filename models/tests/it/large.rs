@@ -1,12 +1,11 @@
 //! The large model, which is not in the zoo. `ORT_DYLIB_PATH` must name ONNX Runtime's library.
 
-#[expect(dead_code, reason = "the files of the zoo are for other tests")]
-mod scenes;
-
 use std::path::Path;
 
 use grasp::{Decoded, decode};
 use grasp_models::{Network, Options, Precision};
+
+use crate::scenes;
 
 /// Corners of the block of the scene, metres, and how far from it the fingers may begin.
 const BLOCK: [[f64; 3]; 2] = [[0.13, 0.11, 0.05], [0.17, 0.19, 0.15]];

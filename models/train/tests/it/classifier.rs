@@ -21,7 +21,7 @@ use grasp_train::{CandidateDataset, ClassifierSettings, ClassifierTrainer, Examp
 use nalgebra::{Isometry3, Point3, Vector3};
 use tch::Device;
 
-mod support;
+use crate::support;
 
 /// Adds a candidate with a wall between the fingers. It succeeds if the wall is parallel to the approach, and fails if
 /// it is perpendicular.
