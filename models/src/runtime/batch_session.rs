@@ -103,7 +103,9 @@ impl BatchSession {
 
     fn session_and_buffers(&mut self, batch: usize, resolution: usize) -> ort::Result<(&mut Session, &mut Buffers)> {
         let size = self.size.unwrap_or_else(|| padded(batch, &self.padded_sizes));
-        if !size.is_power_of_two() && !self.buffers.contains_key(&size) {
+        // A recorded graph has the addresses of its buffers.
+        let may_forget = !self.uses_cuda_graphs && !size.is_power_of_two();
+        if may_forget && !self.buffers.contains_key(&size) {
             self.buffers.retain(|size, _| size.is_power_of_two());
         }
         let buffers = match self.buffers.entry(size) {
