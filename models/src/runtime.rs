@@ -34,12 +34,14 @@ pub struct Options {
     pub precision: Option<Precision>,
     /// Largest batch. Some providers prepare for each batch size.
     pub max_batch: usize,
+    /// Whether networks use CUDA graphs, if the provider is `cuda` and their outputs with them match the reference.
+    pub cuda_graphs: bool,
 }
 
 impl Default for Options {
     /// One thread of ONNX Runtime's CPU kernels, one volume at a time. The results are the same on every machine.
     fn default() -> Self {
-        Self { threads: 1, provider: Some(Provider::Cpu), precision: None, max_batch: 1 }
+        Self { threads: 1, provider: Some(Provider::Cpu), precision: None, max_batch: 1, cuda_graphs: true }
     }
 }
 

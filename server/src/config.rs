@@ -48,6 +48,8 @@ pub(crate) struct Config {
     pub provider: Option<Provider>,
     /// Numeric precision; None selects the fastest.
     pub precision: Option<Precision>,
+    /// Whether networks use CUDA graphs where the provider has them.
+    pub cuda_graphs: bool,
     /// Queued requests per model.
     pub queue: usize,
     pub batching: Batching,
@@ -151,6 +153,7 @@ impl Config {
             threads: flags.threads.map_or((cpus / workers).max(1), usize::from),
             provider,
             precision,
+            cuda_graphs: !flags.no_cuda_graphs,
             queue: flags.queue.into(),
             batching: Batching { max: flags.max_batch.into(), delay: flags.batch_delay },
             inference_timeout: Some(flags.inference_timeout).filter(|timeout| !timeout.is_zero()),

@@ -37,6 +37,8 @@ pub struct Backend {
     pub provider: Provider,
     /// Precision.
     pub precision: Precision,
+    /// Whether the kernels of one run are launched together, as a CUDA graph.
+    pub cuda_graph: bool,
 }
 
 /// Why the requested backend cannot run a network.
@@ -111,7 +113,7 @@ impl AvailableBackends {
         };
         let of = |provider| {
             let precisions = if is_int8 { vec![Precision::Int8] } else { self.precisions(provider) };
-            precisions.into_iter().map(move |precision| Backend { provider, precision })
+            precisions.into_iter().map(move |precision| Backend { provider, precision, cuda_graph: false })
         };
         let all: Vec<Backend> = providers.into_iter().flat_map(of).collect();
         let Some(wanted) = precision else { return Ok(all) };
@@ -186,7 +188,13 @@ impl Precision {
 
 impl Backend {
     /// ONNX Runtime's CPU kernels in f32: the reference for all other backends.
-    pub const REFERENCE: Self = Self { provider: Provider::Cpu, precision: Precision::Fp32 };
+    pub const REFERENCE: Self = Self { provider: Provider::Cpu, precision: Precision::Fp32, cuda_graph: false };
+
+    /// This backend, before it with a CUDA graph where the provider has them.
+    pub(crate) fn and_with_cuda_graph(self) -> impl Iterator<Item = Self> {
+        let graph = (self.provider == Provider::Cuda).then_some(Self { cuda_graph: true, ..self });
+        graph.into_iter().chain([self])
+    }
 
     /// The provider to register with a session of `threads` threads. A failed registration is an error; the default
     /// of ONNX Runtime is to use the CPU without an error.
@@ -201,7 +209,7 @@ impl Backend {
                 let provider = ep::OpenVINO::default().with_device_type("CPU").with_precision("ACCURACY");
                 provider.with_arbitrary_config("load_config", config).build()
             }
-            Provider::Cuda => ep::CUDA::default().build(),
+            Provider::Cuda => ep::CUDA::default().with_cuda_graph(self.cuda_graph).build(),
             Provider::TensorRt => {
                 let provider = ep::TensorRT::default().with_fp16(self.precision == Precision::Fp16);
                 provider
@@ -237,7 +245,7 @@ impl<T: fmt::Display> fmt::Display for Choice<T> {
 
 impl fmt::Display for Backend {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        write!(f, "{} {}", self.provider, self.precision)
+        write!(f, "{} {}{}", self.provider, self.precision, if self.cuda_graph { " with CUDA graphs" } else { "" })
     }
 }
 
@@ -309,6 +317,16 @@ mod tests {
             ["tensorrt fp16", "tensorrt bf16", "tensorrt fp32", "cuda fp32", "cuda fp16", "cpu fp32"]
         );
         assert_eq!(names(machine(OPENVINO, true).backends(None, None, true)), ["openvino int8", "cpu int8"]);
+    }
+
+    #[test]
+    fn cuda_graphs_are_tried_first_where_there_are_any() {
+        let names = |provider| {
+            let backend = Backend { provider, ..Backend::REFERENCE };
+            backend.and_with_cuda_graph().map(|backend| backend.to_string()).collect::<Vec<_>>()
+        };
+        assert_eq!(names(Provider::Cuda), ["cuda fp32 with CUDA graphs", "cuda fp32"]);
+        assert_eq!(names(Provider::OpenVino), ["openvino fp32"]);
     }
 
     #[test]

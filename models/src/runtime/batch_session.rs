@@ -2,8 +2,8 @@
 
 use std::collections::{BTreeMap, btree_map};
 
-use ort::memory::Allocator;
-use ort::session::{IoBinding, Session};
+use ort::memory::{AllocationDevice, Allocator, AllocatorType, MemoryInfo, MemoryType};
+use ort::session::{IoBinding, RunOptions, Session};
 use ort::value::Tensor;
 
 use super::backend::{Backend, Provider};
@@ -13,6 +13,7 @@ use super::{INPUT, LoadReason, OUTPUTS};
 /// A session with its buffers.
 pub(super) struct BatchSession {
     session: Session,
+    uses_cuda_graphs: bool,
     /// The fixed batch size; smaller batches are padded. `None` for any size.
     size: Option<usize>,
     /// Sizes that batches are padded to, smallest first; empty if they are not padded.
@@ -22,11 +23,20 @@ pub(super) struct BatchSession {
     buffers: BTreeMap<usize, Buffers>,
 }
 
-/// Input and outputs of one batch size, which ONNX Runtime reads and writes in place.
+/// Input and outputs of one batch size in the memory of the host. ONNX Runtime reads and writes them in place, or copies
+/// them if it runs a CUDA graph.
 struct Buffers {
     binding: IoBinding,
     input: Tensor<f32>,
     outputs: OutputTensors,
+    graph: Option<CudaGraph>,
+}
+
+/// The buffers of a CUDA graph in the memory of the GPU. The graph has their addresses, so that they stay bound.
+struct CudaGraph {
+    input: Tensor<f32>,
+    outputs: OutputTensors,
+    options: RunOptions,
 }
 
 /// In the order of [`OUTPUTS`].
@@ -46,7 +56,7 @@ impl BatchSession {
             if backend.provider == Provider::Cuda { batch_sizes(max_batch).collect() } else { Vec::new() };
         let session = |size| {
             let (session, padded_sizes) = (model.open(backend, size)?, padded_sizes.clone());
-            Ok(Self { session, size, padded_sizes, buffers: BTreeMap::new() })
+            Ok(Self { session, uses_cuda_graphs: backend.cuda_graph, size, padded_sizes, buffers: BTreeMap::new() })
         };
         sizes.into_iter().map(session).collect()
     }
@@ -73,20 +83,38 @@ impl BatchSession {
     /// ignored.
     pub fn run(&mut self, batch: usize, resolution: usize) -> ort::Result<&OutputTensors> {
         let (session, buffers) = self.session_and_buffers(batch, resolution)?;
-        // Bound again for each run, because on some devices binding copies the input.
-        buffers.binding.bind_input(INPUT, &buffers.input)?;
-        session.run_binding(&buffers.binding)?;
+        match &mut buffers.graph {
+            None => {
+                // Bound again for each run, because on some devices binding copies the input.
+                buffers.binding.bind_input(INPUT, &buffers.input)?;
+                session.run_binding(&buffers.binding)?;
+            }
+            Some(graph) => {
+                // The first runs record the graph, the later ones replay it.
+                buffers.input.copy_into(&mut graph.input)?;
+                session.run_binding_with_options(&buffers.binding, &graph.options)?;
+                for (output, copy) in graph.outputs.iter().zip(&mut buffers.outputs) {
+                    output.copy_into(copy)?;
+                }
+            }
+        }
         Ok(&buffers.outputs)
     }
 
     fn session_and_buffers(&mut self, batch: usize, resolution: usize) -> ort::Result<(&mut Session, &mut Buffers)> {
         let size = self.size.unwrap_or_else(|| padded(batch, &self.padded_sizes));
-        if !size.is_power_of_two() && !self.buffers.contains_key(&size) {
+        // A recorded graph has the addresses of its buffers.
+        let may_forget = !self.uses_cuda_graphs && !size.is_power_of_two();
+        if may_forget && !self.buffers.contains_key(&size) {
             self.buffers.retain(|size, _| size.is_power_of_two());
         }
         let buffers = match self.buffers.entry(size) {
             btree_map::Entry::Occupied(entry) => entry.into_mut(),
-            btree_map::Entry::Vacant(entry) => entry.insert(Buffers::new(&self.session, size, resolution)?),
+            btree_map::Entry::Vacant(entry) => entry.insert(if self.uses_cuda_graphs {
+                Buffers::with_cuda_graph(&self.session, size, resolution)?
+            } else {
+                Buffers::new(&self.session, size, resolution)?
+            }),
         };
         Ok((&mut self.session, buffers))
     }
@@ -105,17 +133,45 @@ pub fn batch_sizes(largest: usize) -> impl Iterator<Item = usize> {
 
 impl Buffers {
     fn new(session: &Session, batch: usize, resolution: usize) -> ort::Result<Self> {
-        let tensor =
-            |channels| Tensor::<f32>::new(&Allocator::default(), [batch, channels, resolution, resolution, resolution]);
-        let mut input = tensor(1)?;
-        input.extract_tensor_mut().1.fill(0.0);
-        let mut outputs = [tensor(OUTPUTS[0].1)?, tensor(OUTPUTS[1].1)?, tensor(OUTPUTS[2].1)?];
-        let mut binding = session.create_binding()?;
-        for ((name, _), tensor) in OUTPUTS.iter().zip(&mut outputs) {
-            binding.bind_output(*name, tensor)?;
-        }
-        Ok(Self { binding, input, outputs })
+        let (input, mut outputs) = tensors(&Allocator::default(), batch, resolution)?;
+        let binding = bound(session, &mut outputs)?;
+        Ok(Self { binding, input: zeroed(input), outputs, graph: None })
     }
+
+    fn with_cuda_graph(session: &Session, batch: usize, resolution: usize) -> ort::Result<Self> {
+        let allocator =
+            |device, memory| Allocator::new(session, MemoryInfo::new(device, 0, AllocatorType::Device, memory)?);
+        // The GPU copies from and to pinned memory without the processor.
+        let pinned = allocator(AllocationDevice::CUDA_PINNED, MemoryType::CPUOutput)?;
+        let (input, outputs) = tensors(&pinned, batch, resolution)?;
+        let device = allocator(AllocationDevice::CUDA, MemoryType::Default)?;
+        let (device_input, mut device_outputs) = tensors(&device, batch, resolution)?;
+        let mut binding = bound(session, &mut device_outputs)?;
+        binding.bind_input(INPUT, &device_input)?;
+        let mut options = RunOptions::new()?;
+        // One graph for each batch size.
+        options.set("gpu_graph_id", batch.to_string())?;
+        let graph = CudaGraph { input: device_input, outputs: device_outputs, options };
+        Ok(Self { binding, input: zeroed(input), outputs, graph: Some(graph) })
+    }
+}
+
+fn tensors(allocator: &Allocator, batch: usize, resolution: usize) -> ort::Result<(Tensor<f32>, OutputTensors)> {
+    let tensor = |channels| Tensor::<f32>::new(allocator, [batch, channels, resolution, resolution, resolution]);
+    Ok((tensor(1)?, [tensor(OUTPUTS[0].1)?, tensor(OUTPUTS[1].1)?, tensor(OUTPUTS[2].1)?]))
+}
+
+fn zeroed(mut input: Tensor<f32>) -> Tensor<f32> {
+    input.extract_tensor_mut().1.fill(0.0);
+    input
+}
+
+fn bound(session: &Session, outputs: &mut OutputTensors) -> ort::Result<IoBinding> {
+    let mut binding = session.create_binding()?;
+    for ((name, _), tensor) in OUTPUTS.iter().zip(outputs) {
+        binding.bind_output(*name, tensor)?;
+    }
+    Ok(binding)
 }
 
 #[cfg(test)]

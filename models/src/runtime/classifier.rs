@@ -33,7 +33,7 @@ impl Classifier {
     /// # Errors
     /// [`LoadError`] names the file and the problem.
     pub fn load(path: &Path, shape: &'static [usize], options: &Options) -> Result<Self, LoadError> {
-        loading::load(path, options, |model, backend| Self::open_checked(model, backend, shape))
+        loading::load(path, &Self::options(options), |model, backend| Self::open_checked(model, backend, shape))
     }
 
     /// Loads an entry of a store `count` times, once per thread. All copies use the same backend.
@@ -48,7 +48,12 @@ impl Classifier {
     ) -> Result<Vec<Self>, LoadError> {
         let checked = |model: &ModelFile<'_>, backend| Self::open_checked(model, backend, shape);
         let others = |model: &ModelFile<'_>, backend| Self::open(model, backend, shape);
-        loading::load_several(entry, options, count, checked, others)
+        loading::load_several(entry, &Self::options(options), count, checked, others)
+    }
+
+    /// Without CUDA graphs, because batches have any size.
+    fn options(options: &Options) -> Options {
+        Options { cuda_graphs: false, ..*options }
     }
 
     /// Loads with one backend and compares its scores with the reference, ONNX Runtime's CPU kernels.

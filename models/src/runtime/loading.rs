@@ -55,6 +55,11 @@ fn fastest<T>(
         return Err(LoadReason::Split(file.clone()));
     }
     let backends = AvailableBackends::here().backends(options.provider, options.precision, model.is_int8)?;
+    let backends: Vec<Backend> = if options.cuda_graphs {
+        backends.into_iter().flat_map(Backend::and_with_cuda_graph).collect()
+    } else {
+        backends
+    };
     let (&last, others) = backends.split_last().ok_or(RuntimeError::EmptyBatch)?;
     for &backend in others {
         match open_checked(model, backend) {

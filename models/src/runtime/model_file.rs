@@ -77,7 +77,7 @@ impl<'a> ModelFile<'a> {
         }
         // ONNX Runtime's CUDA kernels compute in the types of the graph.
         let bytes = match backend {
-            Backend { provider: Provider::Cuda, precision: Precision::Fp16 } => self.half()?,
+            Backend { provider: Provider::Cuda, precision: Precision::Fp16, .. } => self.half()?,
             _ => self.graph(),
         };
         Ok(builder.commit_from_memory(bytes)?)

@@ -364,7 +364,7 @@ fn openvino_outputs_match_the_reference() {
     let precisions = [(Precision::Fp32, 1e-4), (Precision::Bf16, 0.02)];
     for (precision, tolerance) in precisions {
         let provider = Some(Provider::OpenVino);
-        let options = Options { threads: 2, provider, precision: Some(precision), max_batch: 3 };
+        let options = Options { threads: 2, provider, precision: Some(precision), max_batch: 3, ..Options::default() };
         let mut network = match Network::load(&path, &options) {
             Ok(network) => network,
             // Older processors have no bf16 instructions.
@@ -373,7 +373,7 @@ fn openvino_outputs_match_the_reference() {
             }
             Err(error) => panic!("{error}"),
         };
-        assert_eq!(network.backend(), Backend { provider: Provider::OpenVino, precision });
+        assert_eq!(network.backend(), Backend { provider: Provider::OpenVino, precision, cuda_graph: false });
         for batch in [1, 3, 2, 1] {
             let batch: Vec<&Volume> = volumes.iter().take(batch).collect();
             let (got, expected) = (network.infer(&batch).unwrap(), reference.infer(&batch).unwrap());

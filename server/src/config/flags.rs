@@ -71,6 +71,10 @@ pub(super) struct Flags {
     #[arg(long, env = "GRASPD_PRECISION", value_name = "NAME", default_value = "auto")]
     pub precision: Choice<Precision>,
 
+    /// Launch the kernels of an inference one by one with the provider cuda, instead of together as a CUDA graph.
+    #[arg(long, env = "GRASPD_NO_CUDA_GRAPHS")]
+    pub no_cuda_graphs: bool,
+
     /// Queue length per model, requests. If the queue is full, requests are refused immediately.
     #[arg(long, env = "GRASPD_QUEUE", value_name = "N", default_value = "32", value_parser = count())]
     pub queue: u16,

@@ -1,10 +1,10 @@
-use std::sync::Arc;
+use std::sync::{Arc, mpsc};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use grasp::Volume;
 use grasp_models::{Backend, Options};
-use grasp_planner::{Loaded, Scene, Source};
+use grasp_planner::{Scene, Source};
 use grasp_proto::{Candidate, FieldError};
 use prometheus::IntCounter;
 use thiserror::Error;
@@ -15,7 +15,7 @@ use super::detection::{Detection, Score};
 use super::job::{EngineError, Job, Reply, Sender, Task, Tensors};
 use super::queue::{Batching, Queue, Refused, Ticket};
 use super::retries::Retries;
-use super::session::{ServiceTime, Session, warm_up};
+use super::session::{ServiceTime, Session};
 use super::session_threads::{Running, SessionThreads};
 use crate::telemetry::metrics::{Metrics, ModelLabels, QueueMetrics, RefusalCounters};
 use crate::transport::deadline::Deadline;
@@ -68,19 +68,12 @@ impl Engine {
         let Serving { workers, options, capacity, batching } = *serving;
         let label = format!("{} {}", source.name(), source.version());
         let started = Instant::now();
-        let (mut planners, backend) = source.load(&options, workers)?;
-        let mut service_time = Duration::ZERO;
-        for planner in &mut planners {
-            if let Loaded::Network(network) = planner {
-                service_time = warm_up(network, batching.max)
-                    .with_context(|| format!("the warm-up inference of the model {label} failed"))?;
-            }
-        }
+        let (planners, backend) = source.load(&options, workers)?;
         let QueueMetrics { waiting, batch, refused, queued, hanging } = metrics.queue(&label);
         let queue = Arc::new(Queue::new(workers, capacity, waiting));
         // Created before the threads, so that an early return drops it, which closes the queue and ends started
         // threads.
-        let service_time = Arc::new(ServiceTime::new(service_time));
+        let service_time = Arc::new(ServiceTime::new(Duration::ZERO));
         let retries = Retries::default();
         let running: Vec<_> = planners.iter().map(|_| Arc::new(Running::new(hanging.clone()))).collect();
         let engine = Self { source, label, backend, workers, queue, running, service_time, retries, refused, queued };
@@ -88,18 +81,25 @@ impl Engine {
             let (queue, service_time) = (Arc::clone(&engine.queue), Arc::clone(&engine.service_time));
             let defaults = engine.source.decode_params();
             let (running, batch) = (Arc::clone(&engine.running[worker]), batch.clone());
-            let session = Session { planner, defaults, queue, batching, batch, running, service_time };
+            let (warmed_up, warm_up) = mpsc::channel();
+            let session = Session { planner, defaults, queue, batching, batch, running, service_time, warmed_up };
             let name = format!("{} {worker}", engine.source.name());
             sessions.spawn(name, session, &engine.running, worker).with_context(|| {
                 format!("cannot start thread {worker} of {workers} for the model {}; lower --workers", engine.label)
             })?;
+            // One session after another, because others must not allocate memory while one records its CUDA graphs.
+            let time = warm_up.recv().map_err(|_| EngineError::Panic("the session ended".to_owned())).flatten();
+            let failed = || format!("the warm-up inference of the model {} failed", engine.label);
+            engine.service_time.start_with(time.with_context(failed)?);
         }
-        let (Backend { provider, precision }, threads, duration) = (backend, options.threads, started.elapsed());
+        let (Backend { provider, precision, cuda_graph }, threads, duration) =
+            (backend, options.threads, started.elapsed());
         info!(
             model = engine.label,
             sha256 = engine.source.sha256(),
             %provider,
             %precision,
+            cuda_graph,
             workers,
             threads,
             took = ?duration,
@@ -140,7 +140,7 @@ impl Engine {
 
     /// The labels of the served model in the metrics.
     pub fn labels(&self) -> ModelLabels {
-        let Backend { provider, precision } = self.backend;
+        let Backend { provider, precision, .. } = self.backend;
         ModelLabels([self.label.clone(), provider.to_string(), precision.to_string(), self.source.sha256().to_owned()])
     }
 

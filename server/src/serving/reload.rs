@@ -84,8 +84,8 @@ impl ModelFolder {
         state: watch::Receiver<State>,
     ) -> (Self, ModelControl) {
         let (control, commands) = ModelControl::new(config.allow_model_control);
-        let Config { workers, threads, provider, precision, queue, batching, .. } = *config;
-        let options = Options { threads, provider, precision, max_batch: batching.max };
+        let Config { workers, threads, provider, precision, cuda_graphs, queue, batching, .. } = *config;
+        let options = Options { threads, provider, precision, max_batch: batching.max, cuda_graphs };
         let serving = Serving { workers, options, capacity: queue, batching };
         let (directory, default_model) = (config.store.directory().to_owned(), config.default_model.clone());
         let stamps = config.stamps.clone();

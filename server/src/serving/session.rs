@@ -1,7 +1,7 @@
 //! Session threads: each owns a planner, takes jobs from its model's queue, and sends the results.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use std::time::{Duration, Instant};
 
 use grasp::{DecodeParams, Volume};
@@ -27,6 +27,8 @@ pub(super) struct Session {
     pub batch: Histogram,
     pub running: Arc<Running>,
     pub service_time: Arc<ServiceTime>,
+    /// For the time of one volume in the warm-up.
+    pub warmed_up: mpsc::Sender<Result<Duration, EngineError>>,
 }
 
 /// Mean times of a scene and of a batch, in which the latest batches count most.
@@ -122,6 +124,12 @@ impl ServiceTime {
         Self(Mutex::new(Times { scene: mean, batch: mean }))
     }
 
+    /// Replaces the initial time.
+    pub fn start_with(&self, duration: Duration) {
+        let Self(times) = Self::new(duration);
+        *self.times() = times.into_inner().unwrap_or_else(PoisonError::into_inner);
+    }
+
     /// Adds the time of a batch.
     pub fn add(&self, duration: Duration, scenes: u32) {
         let mut times = self.times();
@@ -143,7 +151,19 @@ impl ServiceTime {
 }
 
 impl Session {
+    /// Warms the planner up, and serves the queue until it is closed. Both on this thread, because a CUDA graph belongs to
+    /// the thread that has recorded it.
     pub fn run(mut self) {
+        let warmed_up = match &mut self.planner {
+            Loaded::Network(network) => warm_up(network, self.batching.max),
+            Loaded::Single(_) => Ok(Duration::ZERO),
+        };
+        let failed = warmed_up.is_err();
+        // If the receiver is gone, starting the model has failed, and the queue is closed.
+        let _ = self.warmed_up.send(warmed_up);
+        if failed {
+            return;
+        }
         let single = Batching { max: 1, delay: Duration::ZERO };
         let batching = if matches!(self.planner, Loaded::Single(_)) { single } else { self.batching };
         while let Some(mut jobs) = self.queue.take(batching) {
@@ -304,7 +324,7 @@ fn tensors(output: &Inference, index: usize) -> Tensors {
 
 /// Runs the network once for each batch size, because the first inference of a size allocates memory and tunes kernels.
 /// Returns the time of one volume.
-pub(super) fn warm_up(network: &mut NetworkPlanner, max_batch: usize) -> Result<Duration, EngineError> {
+fn warm_up(network: &mut NetworkPlanner, max_batch: usize) -> Result<Duration, EngineError> {
     let metadata = network.network().metadata();
     let values = vec![0.5; metadata.resolution.pow(3)];
     let volume = Volume::new(metadata.resolution, metadata.voxel_size, Isometry3::identity(), values);

@@ -92,7 +92,7 @@ impl Peer {
     /// Starts a server if GRASPD_PEERS is set, and waits until it is ready.
     pub fn run(name: &str, model: &Path, threads: usize, backend: Backend) -> anyhow::Result<Option<Self>> {
         let Some(mut command) = python(name) else { return Ok(None) };
-        let Backend { provider, precision } = backend;
+        let Backend { provider, precision, .. } = backend;
         command.args([
             "--provider",
             provider.name(),
