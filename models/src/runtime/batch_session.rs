@@ -16,8 +16,6 @@ pub(super) struct BatchSession {
     uses_cuda_graphs: bool,
     /// The fixed batch size; smaller batches are padded. `None` for any size.
     size: Option<usize>,
-    /// Sizes that batches are padded to, smallest first; empty if they are not padded.
-    padded_sizes: Vec<usize>,
     /// Buffers by batch size: the powers of two, and one other size. They need less than three times the memory of the
     /// largest batch.
     buffers: BTreeMap<usize, Buffers>,
@@ -47,16 +45,14 @@ impl BatchSession {
     /// supports changing shapes; otherwise there is one per size of [`batch_sizes`].
     ///
     /// OpenVINO fuses the operators after the heads only for a known shape, which halves the time of VGN's network in
-    /// bf16. TensorRT would build a new engine for each size. CUDA searches the fastest convolutions for each new size
-    /// (`cudnn_conv_algo_search`, by default exhaustive), so that batches are padded to sizes that were run when the model was loaded.
+    /// bf16. TensorRT would build a new engine for each size. CUDA prepares its convolutions again whenever the size
+    /// changes: with one session for all sizes, 64 callers waited for up to 0.8 s.
     pub fn all(model: &ModelFile, backend: Backend, max_batch: usize) -> Result<Vec<Self>, LoadReason> {
-        let fixed = matches!(backend.provider, Provider::OpenVino | Provider::TensorRt) && model.batch.is_some();
+        let fixed = backend.provider != Provider::Cpu && model.batch.is_some();
         let sizes = if fixed { batch_sizes(max_batch).map(Some).collect() } else { vec![None] };
-        let padded_sizes: Vec<usize> =
-            if backend.provider == Provider::Cuda { batch_sizes(max_batch).collect() } else { Vec::new() };
         let session = |size| {
-            let (session, padded_sizes) = (model.open(backend, size)?, padded_sizes.clone());
-            Ok(Self { session, uses_cuda_graphs: backend.cuda_graph, size, padded_sizes, buffers: BTreeMap::new() })
+            let session = model.open(backend, size)?;
+            Ok(Self { session, uses_cuda_graphs: backend.cuda_graph, size, buffers: BTreeMap::new() })
         };
         sizes.into_iter().map(session).collect()
     }
@@ -102,7 +98,7 @@ impl BatchSession {
     }
 
     fn session_and_buffers(&mut self, batch: usize, resolution: usize) -> ort::Result<(&mut Session, &mut Buffers)> {
-        let size = self.size.unwrap_or_else(|| padded(batch, &self.padded_sizes));
+        let size = self.size.unwrap_or(batch);
         // A recorded graph has the addresses of its buffers.
         let may_forget = !self.uses_cuda_graphs && !size.is_power_of_two();
         if may_forget && !self.buffers.contains_key(&size) {
@@ -120,11 +116,6 @@ impl BatchSession {
     }
 }
 
-/// The smallest of `sizes` that holds a batch, or the size of the batch if there is none.
-fn padded(batch: usize, sizes: &[usize]) -> usize {
-    sizes.iter().copied().find(|&size| size >= batch).unwrap_or(batch)
-}
-
 /// The batch sizes that networks are prepared for: the powers of two below `largest`, and `largest`.
 pub fn batch_sizes(largest: usize) -> impl Iterator<Item = usize> {
     let powers = (0..usize::BITS).map(|bit| 1 << bit);
@@ -139,12 +130,10 @@ impl Buffers {
     }
 
     fn with_cuda_graph(session: &Session, batch: usize, resolution: usize) -> ort::Result<Self> {
-        let allocator =
-            |device, memory| Allocator::new(session, MemoryInfo::new(device, 0, AllocatorType::Device, memory)?);
-        // The GPU copies from and to pinned memory without the processor.
-        let pinned = allocator(AllocationDevice::CUDA_PINNED, MemoryType::CPUOutput)?;
-        let (input, outputs) = tensors(&pinned, batch, resolution)?;
-        let device = allocator(AllocationDevice::CUDA, MemoryType::Default)?;
+        // Not in pinned memory: ort's copies take it for memory of the GPU, and fail.
+        let (input, outputs) = tensors(&Allocator::default(), batch, resolution)?;
+        let memory = MemoryInfo::new(AllocationDevice::CUDA, 0, AllocatorType::Device, MemoryType::Default)?;
+        let device = Allocator::new(session, memory)?;
         let (device_input, mut device_outputs) = tensors(&device, batch, resolution)?;
         let mut binding = bound(session, &mut device_outputs)?;
         binding.bind_input(INPUT, &device_input)?;
@@ -185,7 +174,5 @@ mod tests {
         assert_eq!(sizes(2), [1, 2]);
         assert_eq!(sizes(6), [1, 2, 4, 6]);
         assert_eq!(sizes(8), [1, 2, 4, 8]);
-        assert_eq!([1, 2, 3, 5, 6].map(|batch| padded(batch, &sizes(6))), [1, 2, 4, 6, 6]);
-        assert_eq!(padded(5, &[]), 5, "a provider that needs no padding");
     }
 }
