@@ -32,8 +32,6 @@ if not HAS_LIBTORCH:
     WORKSPACE += ["--exclude", "grasp-train"]
 # Seconds after which a test program is stopped.
 LIMIT = 1200
-# Tests that start servers and clients wait more than they compute.
-THREADS = 2 * (os.cpu_count() or 1)
 
 # Downloads by the variable that has their paths.
 NEEDED_TO_COMPILE = {"LIBTORCH": native.libtorch} if HAS_LIBTORCH else {}
@@ -134,7 +132,7 @@ def cargo(arguments: List[str], environment: Dict[str, str]) -> None:
 
 
 def test_programs(environment: Dict[str, str]) -> List[TestProgram]:
-    """Compiles the test programs, those with the most tests last in Cargo's order."""
+    """Compiles the test programs."""
     command = [CARGO, "test", *WORKSPACE, "--lib", "--bins", "--tests", "--no-run", "--message-format", "json-render-diagnostics"]
     output = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True)
     if output.returncode:
@@ -157,7 +155,7 @@ def run_tests(programs: List[TestProgram], name: Optional[str], environment: Dic
 
 
 def run_program(program: TestProgram, name: Optional[str], environment: Dict[str, str]) -> Outcome:
-    command = [program.executable, f"--test-threads={THREADS}", *([name] if name else [])]
+    command = [program.executable, *([name] if name else [])]
     return counted(program.title, command, program.folder, environment)
 
 

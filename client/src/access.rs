@@ -71,7 +71,10 @@ impl Default for Retry {
 /// Whether the same request may succeed later. A status with a source was created by this client because the connection
 /// broke; a status from the server has no source.
 pub(crate) fn is_transient(status: &Status) -> bool {
-    matches!(status.code(), Code::Unavailable | Code::ResourceExhausted) || std::error::Error::source(status).is_some()
+    // What tonic reports if a connection ended within a response, for example when a load balancer lost the server.
+    let is_truncated = status.code() == Code::Unknown && status.message().contains("missing grpc-status");
+    let is_refused = matches!(status.code(), Code::Unavailable | Code::ResourceExhausted);
+    is_refused || is_truncated || std::error::Error::source(status).is_some()
 }
 
 /// Whether this client ended the call because its time limit has passed. tonic reports that as CANCELLED.
@@ -180,5 +183,12 @@ mod tests {
         assert!(" ".parse::<Token>().is_err() && "a\nb".parse::<Token>().is_err());
         let request = Bearer(access.token).call(Request::new(())).unwrap();
         assert_eq!(request.metadata().get("authorization").unwrap(), "Bearer secret");
+    }
+
+    #[test]
+    fn a_truncated_response_is_transient_and_other_unknown_errors_are_not() {
+        let status = |message: &str| Status::new(Code::Unknown, message);
+        assert!(is_transient(&status("protocol error: missing grpc-status trailer, stream was terminated")));
+        assert!(!is_transient(&status("the model is broken")));
     }
 }

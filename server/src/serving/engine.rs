@@ -81,7 +81,7 @@ impl Engine {
             let (queue, service_time) = (Arc::clone(&engine.queue), Arc::clone(&engine.service_time));
             let defaults = engine.source.decode_params();
             let (running, batch) = (Arc::clone(&engine.running[worker]), batch.clone());
-            let (warmed_up, warm_up) = mpsc::channel();
+            let (warmed_up, warm_up) = mpsc::sync_channel(1);
             let session = Session { planner, defaults, queue, batching, batch, running, service_time, warmed_up };
             let name = format!("{} {worker}", engine.source.name());
             sessions.spawn(name, session, &engine.running, worker).with_context(|| {

@@ -28,7 +28,7 @@ pub(super) struct Session {
     pub running: Arc<Running>,
     pub service_time: Arc<ServiceTime>,
     /// For the time of one volume in the warm-up.
-    pub warmed_up: mpsc::Sender<Result<Duration, EngineError>>,
+    pub warmed_up: mpsc::SyncSender<Result<Duration, EngineError>>,
 }
 
 /// Mean times of a scene and of a batch, in which the latest batches count most.
