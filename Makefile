@@ -53,8 +53,8 @@ test-faults: ## run the test that `test` excludes: ten thousand connections
 	$(with_libtorch) $(CARGO) build --workspace --locked --bins
 	$(with_onnxruntime) $(with_libtorch) $(CARGO) test --workspace --locked --test it faults -- --ignored --nocapture
 
-fuzz: ## fuzz the decoders of volumes and views, twenty million inputs each (needs cargo-fuzz)
-	for target in request views; do RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run --fuzz-dir tests/fuzz \
+fuzz: ## fuzz the decoders of volumes, views and model files, twenty million inputs each (needs cargo-fuzz)
+	for target in request views model; do RUSTC_BOOTSTRAP=1 $(CARGO) fuzz run --fuzz-dir tests/fuzz \
 		--target-dir $(CARGO_TARGET_DIR)/fuzz --sanitizer none $$target -- -runs=20000000 -max_len=4096 || exit; done
 
 bench-sim: ## measure how fast scenes are generated, rendered and labelled on one core

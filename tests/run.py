@@ -202,6 +202,7 @@ class Downloads:
             for variable, path in NEEDED_TO_RUN.items():
                 self.paths[variable] = str(path())
         except native.Unavailable as error:
+            print(f"run.py: {error}", flush=True)  # now, while others compile
             self.error = error
 
     def wait(self) -> Dict[str, str]:

@@ -87,7 +87,7 @@ def perf_analyzer() -> Path:
                 for name in archive.namelist():
                     if name.endswith(("/bin/perf_analyzer", "/libcudart.so.12")):
                         archive.extract(name, part)
-        if subprocess.run(["apt-get", "download", "libb64-0d"], cwd=part, stdout=sys.stderr).returncode:
+        if subprocess.run(["apt-get", "download", *NONE_INSTALLED, "libb64-0d"], cwd=part, stdout=sys.stderr).returncode:
             raise Unavailable(f"libb64-0d could not be downloaded; run `apt-get update` as root or {otherwise}.")
         for archive in part.glob("*.deb"):
             subprocess.run(["dpkg-deb", "--extract", archive, part], check=True)
@@ -142,7 +142,7 @@ def unpacked(name: str, packages: List[str], title: str, variable: str) -> Path:
         # The machine has apt, dpkg, a compiler, and what they depend on, such as the C library.
         names = sorted(dependencies(tuple(packages), variable) - dependencies(("apt", "dpkg", "g++", "perl"), variable))
         say(f"Debian's {wanted}, {len(names)} packages -> {folder}")
-        if subprocess.run(["apt-get", "download", "--quiet", *names], cwd=part, stdout=subprocess.DEVNULL).returncode:
+        if subprocess.run(["apt-get", "download", "--quiet", *NONE_INSTALLED, *names], cwd=part, stdout=subprocess.DEVNULL).returncode:
             raise Unavailable(f"{wanted} could not be downloaded; run `apt-get update` as root or set {variable}.")
         for archive in part.glob("*.deb"):
             subprocess.run(["dpkg-deb", "--extract", archive, part], check=True)
@@ -164,12 +164,16 @@ def unpacked(name: str, packages: List[str], title: str, variable: str) -> Path:
     return built_once(folder, build)
 
 
+# As on a machine without any package. Otherwise apt downloads the version that is installed, which may be gone.
+NONE_INSTALLED = ["-o", "Dir::State::status=/dev/null"]
+
+
 @lru_cache
 def dependencies(packages: Tuple[str, ...], variable: str) -> Set[str]:
     """The packages that apt would install on a machine without any."""
     import subprocess
 
-    simulate = ["apt-get", "install", "--simulate", "--no-install-recommends", "-o", "Dir::State::status=/dev/null"]
+    simulate = ["apt-get", "install", "--simulate", "--no-install-recommends", *NONE_INSTALLED]
     # In English, because the lines are parsed.
     environment = {**os.environ, "LC_ALL": "C"}
     plan = subprocess.run([*simulate, *packages], capture_output=True, text=True, env=environment)

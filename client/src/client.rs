@@ -1,10 +1,10 @@
 use std::time::Duration;
 
-use grasp::Volume;
+use grasp::{RequestError, Volume};
+use grasp_proto::pb;
 use grasp_proto::pb::detect_grasps_stream_response::Outcome;
 use grasp_proto::pb::grasp_service_client::GraspServiceClient;
 use grasp_proto::pb::recording::{Answer, Request};
-use grasp_proto::{FieldError, pb};
 use nalgebra::Isometry3;
 use tokio::sync::mpsc;
 use tokio::time::{Instant, sleep, timeout, timeout_at};
@@ -251,7 +251,7 @@ impl Client {
             || (self.grasps(), message.clone()),
             async |(mut grasps, request)| grasps.find_table(request).await,
         );
-        response.await?.table.ok_or_else(|| FieldError::new("table", "absent", "must be given").into())
+        response.await?.table.ok_or_else(|| RequestError::invalid("table", "absent", "must be given").into())
     }
 
     /// Sends a recorded request again. `model` replaces its model; the version is dropped with it.

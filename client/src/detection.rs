@@ -1,7 +1,7 @@
 use std::time::{Duration, SystemTime};
 
-use grasp::{Grasp, Volume};
-use grasp_proto::{FieldError, encode, grey_png, pb};
+use grasp::{Grasp, RequestError, Volume};
+use grasp_proto::{encode, grey_png, pb};
 use nalgebra::Isometry3;
 
 use crate::Error;
@@ -240,7 +240,7 @@ impl TryFrom<&pb::Grasp> for Proposal {
         let Grasp { pose, width, quality } = message.try_into()?;
         // Not the identity: a robot would move there.
         let required = |pose: &Option<pb::Pose>, field: &'static str| {
-            let pose = pose.as_ref().ok_or_else(|| FieldError::new(field, "absent", "must be given"))?;
+            let pose = pose.as_ref().ok_or_else(|| RequestError::invalid(field, "absent", "must be given"))?;
             grasp_proto::pose(pose, field)
         };
         let pregrasp = required(&message.pregrasp, "grasps.pregrasp")?;

@@ -1,6 +1,7 @@
 use std::time::Duration;
 
-use grasp_proto::{FieldError, pb};
+use grasp::RequestError;
+use grasp_proto::pb;
 use thiserror::Error;
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
@@ -44,7 +45,7 @@ pub enum Error {
     },
     /// The server's reply violates the protocol.
     #[error("invalid reply from the server: {0}; check that client and server have the same version")]
-    Reply(#[from] FieldError),
+    Reply(#[from] RequestError),
 }
 
 impl Error {

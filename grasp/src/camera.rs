@@ -1,3 +1,5 @@
+use std::borrow::Cow;
+
 use nalgebra::{Isometry3, Point3};
 use thiserror::Error;
 
@@ -26,11 +28,12 @@ impl Intrinsics {
     pub const BENCHMARK: Self = Self { width: 640, height: 480, fx: 540.0, fy: 540.0, cx: 320.0, cy: 240.0 };
 }
 
-/// A depth image: metres along the optical axis, row by row; 0, negative or NaN where there is no measurement.
-#[derive(Clone, Debug)]
+/// A depth image that fits its intrinsics: metres along the optical axis, row by row; 0, negative or NaN where there is no
+/// measurement.
+#[derive(Clone, Debug, PartialEq)]
 pub struct DepthImage<'a> {
     intrinsics: Intrinsics,
-    depth: &'a [f32],
+    depth: Cow<'a, [f32]>,
 }
 
 /// The probable unit of a depth image, judged by its median.
@@ -76,7 +79,8 @@ impl<'a> DepthImage<'a> {
     ///
     /// # Errors
     /// [`CameraError`] names the invalid value.
-    pub fn new(intrinsics: Intrinsics, depth: &'a [f32]) -> Result<Self, CameraError> {
+    pub fn new(intrinsics: Intrinsics, depth: impl Into<Cow<'a, [f32]>>) -> Result<Self, CameraError> {
+        let depth = depth.into();
         let Intrinsics { width, height, fx, fy, cx, cy } = intrinsics;
         for (name, value, positive) in [("fx", fx, true), ("fy", fy, true), ("cx", cx, false), ("cy", cy, false)] {
             if !value.is_finite() || (positive && value <= 0.0) {
@@ -99,7 +103,12 @@ impl<'a> DepthImage<'a> {
     /// The pixels, row by row.
     #[must_use]
     pub fn depth(&self) -> &[f32] {
-        self.depth
+        &self.depth
+    }
+
+    /// Multiplies the depths by a factor.
+    pub fn scale(&mut self, factor: f64) {
+        self.depth.to_mut().iter_mut().for_each(|depth| *depth *= factor as f32);
     }
 
     /// The probable unit of the image, from the median of the valid pixels.
@@ -139,7 +148,7 @@ impl<'a> DepthImage<'a> {
     }
 
     /// As [`points`](Self::points), of one in `every` pixels.
-    pub(crate) fn points_of_every(
+    pub fn points_of_every(
         &self,
         every: usize,
         camera_from_task: &Isometry3<f64>,

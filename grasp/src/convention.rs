@@ -68,17 +68,17 @@ pub struct Retreat {
 impl Retreat {
     /// The pose of the hand after the retreat from a grasp at `pose`.
     #[must_use]
-    pub fn from(&self, pose: &Isometry3<f64>) -> Isometry3<f64> {
+    pub fn pose(&self, pose: &Isometry3<f64>) -> Isometry3<f64> {
         match self.direction {
             Some(direction) => Translation3::from(direction.into_inner() * self.distance) * pose,
-            None => before(pose, self.distance),
+            None => pregrasp(pose, self.distance),
         }
     }
 }
 
 /// The pre-grasp: `pose` moved back along its approach by `distance` metres.
 #[must_use]
-pub fn before(pose: &Isometry3<f64>, distance: f64) -> Isometry3<f64> {
+pub fn pregrasp(pose: &Isometry3<f64>, distance: f64) -> Isometry3<f64> {
     pose * Translation3::new(0.0, 0.0, -distance)
 }
 
@@ -110,6 +110,6 @@ mod tests {
             let back = convention.grasp(&convention.pose(&pose, 0.05), 0.05);
             assert!((back.to_homogeneous() - pose.to_homogeneous()).norm() < 1e-12);
         }
-        same(before(&pose, 0.1), Point3::new(0.0, 0.04, 0.15));
+        same(pregrasp(&pose, 0.1), Point3::new(0.0, 0.04, 0.15));
     }
 }

@@ -3,7 +3,7 @@ use nalgebra::{Isometry3, Translation3, Vector3};
 use crate::filter::{dilate, gaussian, is_window_maximum, reaches};
 use crate::maps::PROBABLE;
 use crate::selection::{Decoded, Dropped, Selection};
-use crate::{Clearance, Constraints, DecodeError, FINGER_DEPTH, Grasp, Hand, Maps, Volume, VoxelOrigin, before};
+use crate::{Clearance, Constraints, DecodeError, FINGER_DEPTH, Grasp, Hand, Maps, Volume, VoxelOrigin};
 
 /// Parameters of the decoding of a network's maps into grasps.
 ///
@@ -126,7 +126,7 @@ pub fn quality_at(
     let smooth = gaussian(maps.quality, n, params.sigma, params.radius, f32::MIN_POSITIVE, *PROBABLE.end());
     let quality = |pose: &Isometry3<f64>| {
         // The inverse of `grasp_at`.
-        let pose = params.hand.map_or(*pose, |hand| before(pose, FINGER_DEPTH - hand.depth));
+        let pose = params.hand.map_or(*pose, |hand| pose * Translation3::new(0.0, 0.0, hand.depth - FINGER_DEPTH));
         let position = volume.pose().inverse_transform_point(&pose.translation.vector.into());
         let position = position.coords / volume.voxel_size();
         let is_inside = position.iter().all(|c| (0.0..=n as f64).contains(c));
@@ -168,7 +168,7 @@ fn candidates(
             || f64::from(width) * volume.voxel_size() > opening
         {
             &mut dropped.width
-        } else if params.border.is_some_and(|border| border.holds(index, n)) {
+        } else if params.border.is_some_and(|border| border.contains(index, n)) {
             &mut dropped.border
         } else {
             let grasp = grasp_at(volume, maps, index, q, params)?;
@@ -198,7 +198,7 @@ fn near_surface(volume: &Volume, params: &DecodeParams) -> Vec<bool> {
 }
 
 impl Border {
-    fn holds(self, index: usize, n: usize) -> bool {
+    fn contains(self, index: usize, n: usize) -> bool {
         let side = |c: usize| c < self.sides || c + self.sides >= n;
         side(index / (n * n)) || side(index / n % n) || index % n < self.bottom
     }
@@ -218,7 +218,7 @@ fn grasp_at(
     let pose = volume.pose() * Isometry3::from_parts(Translation3::from(position), rotation);
     Ok(Grasp {
         // A custom hand keeps the position of the fingertips.
-        pose: params.hand.map_or(pose, |hand| before(&pose, hand.depth - FINGER_DEPTH)),
+        pose: params.hand.map_or(pose, |hand| pose * Translation3::new(0.0, 0.0, FINGER_DEPTH - hand.depth)),
         width: f64::from(maps.width[index]) * volume.voxel_size(),
         quality,
     })
@@ -356,7 +356,7 @@ mod tests {
         let [own] = arrays.decode(&sharp()).grasps[..] else { panic!() };
         let hand = Hand::new(0.04, 0.12, 0.01, 0.02, [[0.0; 3]; 2]).unwrap();
         let [other] = arrays.decode(&DecodeParams { hand: Some(hand), ..sharp() }).grasps[..] else { panic!() };
-        let tips = |grasp: Grasp, depth: f64| before(&grasp.pose, -depth).translation.vector;
+        let tips = |grasp: Grasp, depth: f64| (grasp.pose * Translation3::new(0.0, 0.0, depth)).translation.vector;
         assert!((tips(own, FINGER_DEPTH) - tips(other, 0.12)).norm() < 1e-12);
         // 5 voxels are 0.0375 m.
         let narrow = Hand::new(0.037, 0.12, 0.01, 0.02, [[0.0; 3]; 2]).unwrap();

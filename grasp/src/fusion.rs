@@ -47,7 +47,7 @@ const CONTRADICTION: f32 = 0.5;
 
 /// Why a view measures no voxel of the workspace.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
-pub enum Blind {
+pub enum NoMeasurement {
     /// The whole workspace has negative depth.
     #[error(
         "the workspace is behind the camera; check that the pose is not inverted and is that of the optical frame \
@@ -126,7 +126,7 @@ impl Fusion {
 
     /// Adds one view. `camera_from_task` (`T_camera_task`) maps points of the cube's frame into the camera frame.
     ///
-    /// Returns the number of measured voxels. If it is 0, [`blind`](Self::blind) gives the reason.
+    /// Returns the number of measured voxels. If it is 0, [`no_measurement`](Self::no_measurement) gives the reason.
     pub fn integrate(&mut self, image: &DepthImage, camera_from_task: &Isometry3<f64>) -> usize {
         let decay = self.decay;
         let mut measured = 0;
@@ -199,7 +199,7 @@ impl Fusion {
 
     /// The reason why a view [measures](Self::integrate) no voxel.
     #[must_use]
-    pub fn blind(&self, image: &DepthImage, camera_from_task: &Isometry3<f64>) -> Blind {
+    pub fn no_measurement(&self, image: &DepthImage, camera_from_task: &Isometry3<f64>) -> NoMeasurement {
         const STEPS: usize = 16;
         let camera = image.intrinsics();
         let size = self.voxel_size * self.resolution as f64;
@@ -214,7 +214,7 @@ impl Fusion {
             (0..STEPS.pow(3)).map(|i| Point3::from([i / (STEPS * STEPS), i / STEPS % STEPS, i % STEPS].map(grid)));
         let before: Vec<_> = points.map(project).filter(|&(z, ..)| z > 0.0).collect();
         if before.is_empty() {
-            return Blind::Behind;
+            return NoMeasurement::Behind;
         }
         let inside = |u: f64, v: f64| {
             let pixel = (u.round() >= 0.0 && v.round() >= 0.0).then_some((u.round() as usize, v.round() as usize));
@@ -222,11 +222,11 @@ impl Fusion {
         };
         let pixels: Vec<_> = before.iter().filter_map(|&(_, u, v)| inside(u, v)).collect();
         if pixels.is_empty() {
-            return Blind::Outside { u: centre_u, v: centre_v };
+            return NoMeasurement::Outside { u: centre_u, v: centre_v };
         }
         let depth = pixels.iter().map(|&(u, v)| image.depth()[v * camera.width + u]);
         let depth = depth.filter(|depth| *depth > 0.0 && *depth <= DEPTH_MAX).fold(0.0, f32::max);
-        if depth > 0.0 { Blind::Hidden { depth, distance } } else { Blind::NoReading { distance } }
+        if depth > 0.0 { NoMeasurement::Hidden { depth, distance } } else { NoMeasurement::NoReading { distance } }
     }
 
     /// Share of the voxels that a view has measured, also as free space.
@@ -376,7 +376,7 @@ mod tests {
             let depth = vec![depth; camera.width * camera.height];
             let image = DepthImage::new(camera, &depth).unwrap();
             let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
-            (fusion.integrate(&image, &pose), fusion.blind(&image, &pose).to_string())
+            (fusion.integrate(&image, &pose), fusion.no_measurement(&image, &pose).to_string())
         };
         let measured = blind(0.65, facing()).0;
         assert!((20_000..=64_000).contains(&measured), "{measured}");

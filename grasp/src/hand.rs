@@ -115,7 +115,7 @@ impl Hand {
 
     /// Whether a finger hits a point of the grasp frame on an approach from any distance.
     #[must_use]
-    pub fn finger_meets(&self, point: &Point3<f64>) -> bool {
+    pub fn finger_collides(&self, point: &Point3<f64>) -> bool {
         point.x.abs() <= self.height / 2.0
             && (self.half_opening()..=self.outer_diameter / 2.0).contains(&point.y.abs())
             && point.z <= self.depth
@@ -123,7 +123,7 @@ impl Hand {
 
     /// Whether the open hand hits a point of the grasp frame on an approach from `from` metres back.
     #[must_use]
-    pub fn meets(&self, point: &Point3<f64>, from: f64) -> bool {
+    pub fn collides(&self, point: &Point3<f64>, from: f64) -> bool {
         let at_fingers = point.x.abs() <= self.height / 2.0
             && (self.half_opening()..=self.outer_diameter / 2.0).contains(&point.y.abs())
             && (-from..=self.depth).contains(&point.z);
@@ -151,14 +151,14 @@ impl Hand {
 
     /// Whether a point of the grasp frame is inside the palm.
     #[must_use]
-    pub fn palm_meets(&self, point: &Point3<f64>) -> bool {
+    pub fn palm_collides(&self, point: &Point3<f64>) -> bool {
         let [lower, upper] = self.palm;
         (0..3).all(|axis| (lower[axis]..=upper[axis]).contains(&point[axis]))
     }
 
     /// Whether a point of the grasp frame is between the fingers.
     #[must_use]
-    pub fn holds(&self, point: &Point3<f64>) -> bool {
+    pub fn contains(&self, point: &Point3<f64>) -> bool {
         point.x.abs() <= self.height / 2.0
             && point.y.abs() <= self.half_opening()
             && (0.0..=self.depth).contains(&point.z)
@@ -190,23 +190,30 @@ mod tests {
         let hand = Hand::GPD;
         assert!((2.0 * hand.half_opening() - MAX_OPENING).abs() < 1e-12);
         let between = Point3::new(0.0, 0.0, 0.03);
-        assert!(hand.holds(&between) && !hand.finger_meets(&between) && !hand.palm_meets(&between));
+        assert!(hand.contains(&between) && !hand.finger_collides(&between) && !hand.palm_collides(&between));
         for y in [-0.045, 0.045] {
-            assert!(hand.finger_meets(&Point3::new(0.005, y, 0.03)));
-            assert!(hand.finger_meets(&Point3::new(0.005, y, -0.1)), "during the approach");
-            assert!(!hand.finger_meets(&Point3::new(0.02, y, 0.03)) && !hand.finger_meets(&Point3::new(0.0, y, 0.06)));
+            assert!(hand.finger_collides(&Point3::new(0.005, y, 0.03)));
+            assert!(hand.finger_collides(&Point3::new(0.005, y, -0.1)), "during the approach");
+            assert!(
+                !hand.finger_collides(&Point3::new(0.02, y, 0.03)) && !hand.finger_collides(&Point3::new(0.0, y, 0.06))
+            );
         }
-        assert!(hand.palm_meets(&Point3::new(0.03, 0.09, -0.05)));
-        assert!(hand.meets(&Point3::new(0.005, 0.045, -0.05), 0.05) && !hand.meets(&Point3::new(0.0, 0.0, 0.03), 0.05));
-        assert!(hand.meets(&Point3::new(0.0, 0.0, -0.13), 0.05) && !hand.meets(&Point3::new(0.0, 0.0, -0.13), 0.04));
+        assert!(hand.palm_collides(&Point3::new(0.03, 0.09, -0.05)));
+        assert!(
+            hand.collides(&Point3::new(0.005, 0.045, -0.05), 0.05)
+                && !hand.collides(&Point3::new(0.0, 0.0, 0.03), 0.05)
+        );
+        assert!(
+            hand.collides(&Point3::new(0.0, 0.0, -0.13), 0.05) && !hand.collides(&Point3::new(0.0, 0.0, -0.13), 0.04)
+        );
     }
 
     #[test]
     fn a_hand_without_a_palm_gets_none_by_a_margin() {
         let hand = Hand::new(0.1, 0.06, 0.01, 0.02, Default::default()).unwrap().grown(0.02);
         let between_the_fingers = Point3::new(0.0, 0.0, 0.01);
-        assert!(!hand.meets(&between_the_fingers, 0.05));
-        assert!(Hand::PANDA.grown(0.02).meets(&between_the_fingers, 0.05));
+        assert!(!hand.collides(&between_the_fingers, 0.05));
+        assert!(Hand::PANDA.grown(0.02).collides(&between_the_fingers, 0.05));
     }
 
     #[test]

@@ -11,11 +11,10 @@
 #![warn(missing_docs)]
 
 mod camera;
-mod cloud;
 mod constraints;
 mod convention;
 mod decode;
-mod depth_scale;
+mod error;
 mod filter;
 mod fusion;
 pub mod gpd;
@@ -24,35 +23,28 @@ mod hand;
 mod maps;
 mod object_map;
 mod obstacles;
+mod params;
 mod patch;
 mod selection;
 mod surface;
-mod table;
-mod tabletop;
-mod tile;
 mod volume;
-mod warning;
 
 pub use camera::{CameraError, DepthImage, Intrinsics, Unit};
-pub use cloud::{View, overview, seen_from};
 pub use constraints::{Cone, Constraints, Region, Violation};
-pub use convention::{ClosingAxis, Convention, Origin, Retreat, before};
+pub use convention::{ClosingAxis, Convention, Origin, Retreat, pregrasp};
 pub use decode::{Border, DecodeParams, decode, quality_at};
-pub use depth_scale::depth_factor;
-pub use fusion::{Blind, DEPTH_MAX, Fusion, TRUNCATION_VOXELS};
+pub use error::{Code, RequestError, on_a_line};
+pub use fusion::{DEPTH_MAX, Fusion, NoMeasurement, TRUNCATION_VOXELS};
 pub use grasp::{FINGER_DEPTH, Grasp, MAX_OPENING};
 pub use hand::{Hand, HandError};
 pub use maps::{DecodeError, Maps, VoxelOrigin};
 pub use object_map::ObjectMap;
 pub use obstacles::{Clearance, Obstacles};
+pub use params::{Candidate, Collision, DetectParams, Priority, TABLE_HEIGHT};
 pub use patch::Patch;
 pub use selection::{Decoded, Dropped, select};
 pub use surface::{SurfaceMesh, SurfacePoint};
-pub use table::Table;
-pub use tabletop::{NoTabletop, Tabletop};
-pub use tile::Tile;
 pub use volume::{Volume, VolumeError};
-pub use warning::{TARGET_HEIGHT, TRAINED_ANGLE, TRAINED_DISTANCE, Warning};
 
 /// Edge of the workspace cube, metres (the paper, section "Problem formulation").
 pub const WORKSPACE_SIZE: f64 = 0.3;

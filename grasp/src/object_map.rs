@@ -72,7 +72,7 @@ impl ObjectMap {
 
     /// Whether a grasp holds an object that is wanted.
     #[must_use]
-    pub fn admits(&self, pose: &Isometry3<f64>, hand: &Hand) -> bool {
+    pub fn accepts(&self, pose: &Isometry3<f64>, hand: &Hand) -> bool {
         let Some(wanted) = &self.wanted else { return true };
         self.object(pose, hand).is_some_and(|object| wanted.contains(&object))
     }
@@ -137,10 +137,10 @@ mod tests {
         let map = ObjectMap::new(points(), &frame_from_task, BTreeSet::new());
         let object = |x| map.object(&over(x, &frame_from_task), &Hand::PANDA);
         assert_eq!([0.1, 0.2, 0.15].map(object), [Some(3), Some(7), None]);
-        assert!(map.admits(&over(0.15, &frame_from_task), &Hand::PANDA), "all grasps are wanted");
+        assert!(map.accepts(&over(0.15, &frame_from_task), &Hand::PANDA), "all grasps are wanted");
 
         let map = ObjectMap::new(points(), &frame_from_task, [7].into());
-        let admits = |x| map.admits(&over(x, &frame_from_task), &Hand::PANDA);
+        let admits = |x| map.accepts(&over(x, &frame_from_task), &Hand::PANDA);
         assert_eq!([0.1, 0.2, 0.15].map(admits), [false, true, false]);
         assert_eq!(map.missing(), None);
         assert_eq!(ObjectMap::new(points(), &frame_from_task, [7, 9].into()).missing(), Some(9));

@@ -1,6 +1,6 @@
 use nalgebra::{Isometry3, Point3};
 
-use crate::{Hand, Volume, before};
+use crate::{Hand, Volume, pregrasp};
 
 /// Parameters of the collision check between the open hand and the observed surfaces.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -82,8 +82,9 @@ impl Obstacles {
 
     /// Whether the open hand collides on its way from the pre-grasp to `pose` (frame of the volume's pose).
     #[must_use]
-    pub fn meet(&self, pose: &Isometry3<f64>) -> bool {
-        self.meet_table(pose, &self.hand) || self.near(pose).any(|point| self.hand.meets(&point, self.clearance.from))
+    pub fn collides(&self, pose: &Isometry3<f64>) -> bool {
+        self.meet_table(pose, &self.hand)
+            || self.near(pose).any(|point| self.hand.collides(&point, self.clearance.from))
     }
 
     /// The largest opening with which the hand is free of collisions on its way to `pose`, metres: at most that of the
@@ -121,7 +122,7 @@ impl Obstacles {
         // The motion is straight, so the lowest point is at one of its ends.
         let is_low =
             |pose: &Isometry3<f64>| table.is_some_and(|table| hand.lowest_point(&(self.pose.inverse() * pose)) < table);
-        is_low(pose) || is_low(&before(pose, from))
+        is_low(pose) || is_low(&pregrasp(pose, from))
     }
 
     /// The obstacles near the hand on its way to `pose`, in the frame of the hand.
@@ -179,8 +180,8 @@ mod tests {
             let turn = UnitQuaternion::from_euler_angles(0.7 * f, 1.3 * f, 2.1 * f);
             let at = Translation3::new(1.0 + (0.37 * f) % 0.3, 2.0 + (0.11 * f) % 0.3, 3.0 + (0.23 * f) % 0.4);
             let pose = Isometry3::from_parts(at, turn);
-            let meets = all.iter().any(|point| hand.meets(&pose.inverse_transform_point(point), from));
-            assert_eq!(obstacles.meet(&pose), meets, "{pose}");
+            let meets = all.iter().any(|point| hand.collides(&pose.inverse_transform_point(point), from));
+            assert_eq!(obstacles.collides(&pose), meets, "{pose}");
             met += usize::from(meets);
         }
         assert!((100..300).contains(&met), "{met} of 400 poses collide");
@@ -188,7 +189,7 @@ mod tests {
 
     #[test]
     fn a_hand_collides_with_observed_surfaces_only() {
-        let meet = |clearance: Clearance, x, z| Obstacles::observed(&wall(), clearance).meet(&down(x, z));
+        let meet = |clearance: Clearance, x, z| Obstacles::observed(&wall(), clearance).collides(&down(x, z));
         let clearance = Clearance { behind: 0.0, ..Clearance::default() };
         // The palm reaches 0.1 m to each side.
         assert!(!meet(clearance, 0.04, 0.15) && meet(clearance, 0.06, 0.15) && meet(clearance, 0.15, 0.15));
@@ -200,7 +201,7 @@ mod tests {
     #[test]
     fn a_hand_collides_with_the_table_at_the_grasp_and_at_the_pre_grasp() {
         let meet = |table, pose: &Isometry3<f64>| {
-            Obstacles::observed(&wall(), Clearance { table, behind: 1.0, ..Clearance::default() }).meet(pose)
+            Obstacles::observed(&wall(), Clearance { table, behind: 1.0, ..Clearance::default() }).collides(pose)
         };
         // The fingertips are 0.1 - 0.0502 m above the volume's bottom.
         let pose = down(0.04, 0.1);
@@ -218,8 +219,9 @@ mod tests {
         // The wall is 0.03 m thick in the volume; what is behind is hidden.
         let hidden = (0..N.pow(3)).map(|index| index / (N * N) >= 24).collect();
         let volume = wall().with_hidden(hidden);
-        let meet =
-            |hidden, x| Obstacles::observed(&volume, Clearance { hidden, ..Clearance::default() }).meet(&down(x, 0.15));
+        let meet = |hidden, x| {
+            Obstacles::observed(&volume, Clearance { hidden, ..Clearance::default() }).collides(&down(x, 0.15))
+        };
         assert!(!meet(false, 0.3) && meet(true, 0.3), "the palm reaches 0.1 m to each side");
         assert!(!meet(true, 0.04));
     }
@@ -228,7 +230,7 @@ mod tests {
     fn a_margin_keeps_the_hand_away_from_surfaces() {
         let meet = |margin, x| {
             let clearance = Clearance { behind: 0.0, margin, ..Clearance::default() };
-            Obstacles::observed(&wall(), clearance).meet(&down(x, 0.15))
+            Obstacles::observed(&wall(), clearance).collides(&down(x, 0.15))
         };
         // The first voxel of the wall is at 0.15375.
         assert!(!meet(0.0, 0.05) && !meet(0.003, 0.05) && meet(0.005, 0.05));

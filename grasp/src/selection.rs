@@ -88,8 +88,8 @@ impl<'a> Selection<'a> {
             Some(Violation::Region) => &mut dropped.region,
             Some(Violation::Approach) => &mut dropped.approach,
             Some(Violation::Height) => &mut dropped.height,
-            None if self.objects.is_some_and(|objects| !objects.admits(pose, &self.hand)) => &mut dropped.object,
-            None if self.obstacles.as_ref().is_some_and(|obstacles| obstacles.meet(pose)) => &mut dropped.collision,
+            None if self.objects.is_some_and(|objects| !objects.accepts(pose, &self.hand)) => &mut dropped.object,
+            None if self.obstacles.as_ref().is_some_and(|obstacles| obstacles.collides(pose)) => &mut dropped.collision,
             None => return true,
         };
         *count += 1;

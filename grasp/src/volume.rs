@@ -3,7 +3,7 @@ use std::sync::Arc;
 use nalgebra::Isometry3;
 use thiserror::Error;
 
-use crate::{ObjectMap, Region};
+use crate::{ObjectMap, Region, RequestError};
 
 /// A validated truncated signed distance field over a cube: the input of a network.
 ///
@@ -69,6 +69,12 @@ impl VolumeError {
             Self::VoxelSize(_) => "voxel_size",
             Self::Length { .. } | Self::NotFinite { .. } | Self::OutOfRange { .. } | Self::Empty => "data",
         }
+    }
+}
+
+impl From<VolumeError> for RequestError {
+    fn from(error: VolumeError) -> Self {
+        Self::of_field(format!("volume.{}", error.field()), &format!("volume.{error}"))
     }
 }
 

@@ -208,6 +208,7 @@ fn quantize_weight(
 ) -> Result<Vec<f32>, TensorError> {
     let QuantizableProduct { weight, axis, .. } = *product;
     let values = weight.to_f32()?;
+    // None is negative: the number of values has been checked.
     let dims: Vec<usize> = weight.dims.iter().map(|&dim| dim as usize).collect();
     let inner: usize = dims[axis + 1..].iter().product();
     let channel = |index: usize| index / inner % dims[axis];

@@ -12,6 +12,9 @@ use std::collections::{HashMap, HashSet};
 
 use crate::onnx::{AttributeProto, DataType, DimensionValue, GraphProto, ModelProto, NodeProto, TensorProto};
 
+/// Largest edge of an array that is considered, voxels. Files may contain any number.
+const MAX_EDGE: usize = 1 << 16;
+
 /// The model with all suitable convolutions folded, or `None` if there are none. Weights must be f32.
 pub(crate) fn with_upsampling_folded(model: &ModelProto) -> Option<ModelProto> {
     let graph = model.graph.as_ref()?;
@@ -135,7 +138,7 @@ impl<'a> GraphIndex<'a> {
                 };
                 (all(1, -1), all(2, i64::MIN), all(4, -1)).eq(&(Some(()), Some(()), Some(()))).then_some(edge)
             }
-            "Resize" => self.is_upsampling_by_2(node).then_some(2 * edge),
+            "Resize" => self.is_upsampling_by_2(node).then_some(2 * edge).filter(|edge| *edge <= MAX_EDGE),
             "Conv" => {
                 let ConvShape { kernel, pad, stride } = conv_shape(node)?;
                 Some((edge + 2 * pad).checked_sub(kernel)? / stride + 1)
@@ -336,7 +339,7 @@ fn conv_shape(node: &NodeProto) -> Option<ConvShape> {
         let Some(attribute) = node.attribute(name) else { return default };
         let first = attribute.ints.first()?;
         (attribute.ints.len() == count && attribute.ints.iter().all(|one| one == first)).then_some(())?;
-        usize::try_from(*first).ok()
+        usize::try_from(*first).ok().filter(|number| *number <= MAX_EDGE)
     };
     let whole = |name: &str| node.attribute(name).map_or(1, AttributeProto::i);
     let padded = node.attribute("auto_pad").is_none_or(|pad| pad.s() == b"NOTSET");
@@ -352,7 +355,7 @@ fn cube_edge(input: &crate::onnx::ValueInfoProto) -> Option<usize> {
     let shape = input.tensor_type()?.shape.as_ref()?;
     let [_, _, x, y, z] = shape.dim.as_slice() else { return None };
     match (&x.value, x == y && y == z) {
-        (Some(DimensionValue::DimValue(edge)), true) => usize::try_from(*edge).ok(),
+        (Some(DimensionValue::DimValue(edge)), true) => usize::try_from(*edge).ok().filter(|edge| *edge <= MAX_EDGE),
         _ => None,
     }
 }
@@ -402,6 +405,46 @@ mod tests {
         let averaged = averaged_over_rotations(&vgn).unwrap();
         assert_eq!(count(&with_upsampling_folded(&averaged).unwrap(), "Resize"), 1);
         assert!(with_upsampling_folded(&Architecture::TransformerSmall.build(40, 0).unwrap()).is_none());
+    }
+
+    #[test]
+    fn shapes_that_no_tensor_can_have_are_not_folded() {
+        let vgn = Architecture::Vgn.build_with(40, Orientation::Axes, 0).unwrap();
+        let folded = |change: &dyn Fn(&mut GraphProto)| {
+            let mut model = vgn.clone();
+            change(model.graph.as_mut().unwrap());
+            with_upsampling_folded(&model).is_some()
+        };
+        assert!(folded(&|_| {}));
+        let weights = |dims: [i64; 5]| {
+            move |graph: &mut GraphProto| {
+                for weight in graph.initializer.iter_mut().filter(|weight| weight.dims.len() == 5) {
+                    weight.dims = dims.to_vec();
+                }
+            }
+        };
+        for dims in [[-1, 16, 5, 5, 5], [i64::MAX, i64::MAX, 5, 5, 5], [i64::MIN, -1, 5, 5, 5], [1 << 60, 16, 5, 5, 5]]
+        {
+            assert!(!folded(&weights(dims)), "{dims:?}");
+        }
+        for edge in [i64::MAX, -40, 1 << 50] {
+            let resized = |graph: &mut GraphProto| {
+                let shape = graph.input[0].r#type.as_mut().and_then(|of| match of.value.as_mut()? {
+                    crate::onnx::TypeValue::TensorType(tensor) => tensor.shape.as_mut(),
+                    _ => None,
+                });
+                shape.unwrap().dim[2..].iter_mut().for_each(|dim| dim.value = Some(DimensionValue::DimValue(edge)));
+            };
+            assert!(!folded(&resized), "{edge}");
+        }
+        let strides = |graph: &mut GraphProto| {
+            for node in &mut graph.node {
+                for attribute in node.attribute.iter_mut().filter(|a| ["strides", "pads"].contains(&a.name())) {
+                    attribute.ints.iter_mut().for_each(|number| *number = i64::MAX);
+                }
+            }
+        };
+        assert!(!folded(&strides));
     }
 
     /// The graph with its Resize nodes as torch's exporters write `interpolate(x, 2 · edge)`.

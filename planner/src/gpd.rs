@@ -3,9 +3,10 @@ use std::path::Path;
 use grasp::gpd::{Image, scored};
 use grasp::{DecodeParams, Decoded};
 use grasp_models::{Classifier, LoadError, Options};
+use grasp_perception::Scene;
 
 use crate::hand_fit::HandFit;
-use crate::{PlanError, PlanParams, Planner, Scene};
+use crate::{PlanError, PlanParams, Planner};
 
 /// Number of candidates scored between two calls of `is_wanted`.
 const BATCH: usize = 64;

@@ -4,10 +4,11 @@ use std::borrow::Cow;
 
 use grasp::gpd::{Candidate, Cloud, Params, by_sample, is_on_an_object};
 use grasp::{DecodeParams, Decoded, Fusion, Grasp, Hand, SurfacePoint, select};
+use grasp_perception::Scene;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
-use crate::{PlanError, PlanParams, Scene};
+use crate::{PlanError, PlanParams};
 
 /// Smallest distance between the hand and the table, metres: a margin for camera noise.
 const TABLE_CLEARANCE: f64 = 0.002;

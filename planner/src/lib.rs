@@ -4,30 +4,21 @@
 mod evaluator;
 mod gpd;
 mod hand_fit;
+mod model_spec;
 mod network;
 mod shaf;
-mod source;
 
-use grasp::{DecodeError, DecodeParams, Decoded, SurfacePoint, Volume};
+use grasp::{Code, DecodeError, DecodeParams, Decoded, RequestError};
 use grasp_models::RuntimeError;
+use grasp_perception::Scene;
 use thiserror::Error;
 
 pub use evaluator::Evaluator;
 pub use gpd::Gpd;
 pub use hand_fit::{HandFit, object_points};
+pub use model_spec::{Loaded, ModelSpec};
 pub use network::{Inference, NetworkPlanner};
 pub use shaf::{HighestProposal, Shaf};
-pub use source::{Loaded, Source};
-
-/// Input of a planner.
-#[derive(Debug)]
-pub struct Scene {
-    /// The volume: input of networks and of the collision check.
-    pub volume: Volume,
-    /// The observed surface in the volume's own frame (metres), if it is known at a higher resolution than the
-    /// volume's.
-    pub points: Option<Vec<SurfacePoint>>,
-}
 
 /// Parameters of planning.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -50,6 +41,16 @@ pub enum PlanError {
     /// Planning stopped because `is_wanted` returned false.
     #[error("planning was cancelled")]
     Cancelled,
+}
+
+impl From<PlanError> for RequestError {
+    fn from(error: PlanError) -> Self {
+        match error {
+            PlanError::Run(_) | PlanError::Decode(_) => Self::new(Code::Internal, error.to_string()),
+            // Planning is cancelled when the deadline passes or the client cancels; the latter receives no response.
+            PlanError::Cancelled => Self::expired(),
+        }
+    }
 }
 
 /// Finds grasps in a scene.

@@ -3,9 +3,10 @@ use std::time::{Duration, Instant};
 
 use grasp::{DecodeParams, Decoded, Maps, Volume, decode, quality_at};
 use grasp_models::{LoadError, Network, Options, Output, RuntimeError};
+use grasp_perception::Scene;
 use nalgebra::Isometry3;
 
-use crate::{Evaluator, PlanError, PlanParams, Planner, Scene};
+use crate::{Evaluator, PlanError, PlanParams, Planner};
 
 /// A network with the inputs and outputs of VGN. Its output maps are decoded into grasps, which an [`Evaluator`] may
 /// score and move.

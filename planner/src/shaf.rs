@@ -2,10 +2,11 @@
 
 use grasp::gpd::ranked;
 use grasp::{DecodeParams, Decoded, Grasp};
+use grasp_perception::Scene;
 use nalgebra::Isometry3;
 
 use crate::hand_fit::HandFit;
-use crate::{NetworkPlanner, PlanError, PlanParams, Planner, Scene};
+use crate::{NetworkPlanner, PlanError, PlanParams, Planner};
 
 /// SHAF on the candidates of GPD: the highest comes first.
 pub struct Shaf;

@@ -3,14 +3,13 @@
 use std::cell::Cell;
 use std::path::{Path, PathBuf};
 
-use grasp::{DecodeParams, Decoded, DepthImage, Fusion, Hand, RESOLUTION, SurfacePoint, WORKSPACE_SIZE, seen_from};
+use grasp::{DecodeParams, Decoded, Fusion, Hand, RESOLUTION, SurfacePoint, WORKSPACE_SIZE};
 use grasp_models::onnx::ModelProto;
 use grasp_models::{
     ActivationRange, Backend, Network, Options, Precision, Store, quantized_activations, with_full_weights, with_int8,
 };
-use grasp_planner::{
-    Evaluator, Gpd, HighestProposal, NetworkPlanner, PlanError, PlanParams, Planner, Scene, Shaf, Source,
-};
+use grasp_perception::{Scene, seen_from};
+use grasp_planner::{Evaluator, Gpd, HighestProposal, ModelSpec, NetworkPlanner, PlanError, PlanParams, Planner, Shaf};
 use nalgebra::{Isometry3, Point3, Vector3};
 
 const TABLE: f64 = 0.05;
@@ -45,9 +44,8 @@ fn scene(frame: Isometry3<f64>) -> Scene {
     let positions: Vec<Point3<f64>> = points.iter().map(|point| point.position).collect();
     let view = seen_from(&positions, &Point3::new(0.15, -0.35, 0.45), WORKSPACE_SIZE).unwrap();
     let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
-    let image = DepthImage::new(view.intrinsics, &view.depth).unwrap();
-    assert!(fusion.integrate(&image, &view.camera_from_task) > 0);
-    Scene { volume: fusion.volume(frame).unwrap(), points: Some(points) }
+    assert!(fusion.integrate(&view.image, &view.camera_from_task) > 0);
+    Scene { points: Some(points), ..fusion.volume(frame).unwrap().into() }
 }
 
 fn zoo(file: &str) -> PathBuf {
@@ -147,7 +145,7 @@ fn the_fastest_backend_of_gpd_agrees_with_the_reference() {
 fn classifiers_run_beside_int8_networks() {
     let entry = |folder: &Path, name: &str| Store::open(folder).unwrap().get(name, None).unwrap().clone();
     let int8 = Options { precision: Some(Precision::Int8), ..Options::default() };
-    let gpd = Source::Gpd(entry(&zoo("classifiers"), "gpd"));
+    let gpd = ModelSpec::Gpd(entry(&zoo("classifiers"), "gpd"));
     let (planners, backend) = gpd.load(&int8, 2).unwrap();
     assert_eq!((planners.len(), backend), (2, Backend::REFERENCE));
 
@@ -157,7 +155,7 @@ fn classifiers_run_beside_int8_networks() {
     let ranges = quantized_activations(&network).into_iter().map(range).collect();
     with_int8(&network, &ranges).unwrap().write(&folder.path().join("vgn-packed.onnx")).unwrap();
     let network = entry(folder.path(), "vgn-packed");
-    let evaluated = Source::Evaluated { network, evaluator: entry(&zoo("evaluators"), "graspd") };
+    let evaluated = ModelSpec::Evaluated { network, evaluator: entry(&zoo("evaluators"), "graspd") };
     let (planners, backend) = evaluated.load(&int8, 2).unwrap();
     assert_eq!((planners.len(), backend.precision), (2, Precision::Int8));
 }

@@ -1,8 +1,7 @@
-use grasp::{Dropped, FINGER_DEPTH, Grasp};
-use nalgebra::Isometry3;
+use grasp::{Candidate, DetectParams, Dropped, Grasp, RequestError};
 
+use crate::pb;
 use crate::pose::{self, PoseFields};
-use crate::{DetectParams, FieldError, pb};
 
 const POSE: PoseFields = PoseFields { position: "grasps.pose.position", orientation: "grasps.pose.orientation" };
 
@@ -11,31 +10,22 @@ const CANDIDATE: PoseFields = PoseFields { position: "pose.position", orientatio
 /// Most candidates in a request.
 const MAX_CANDIDATES: usize = 1024;
 
-/// A grasp that the caller proposes.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Candidate {
-    /// `T_frame_grasp`, with the origin at the finger base and the fingers closing along ±y.
-    pub pose: Isometry3<f64>,
-    /// Opening between the fingers when the object is held, metres, if it is known.
-    pub width: Option<f64>,
-}
-
 /// Converts the candidates of a request from the convention of its options.
 ///
 /// # Errors
-/// [`FieldError`] names the invalid field.
-pub fn candidates(candidates: &[pb::Candidate], params: &DetectParams) -> Result<Vec<Candidate>, FieldError> {
+/// [`RequestError`] names the invalid field.
+pub fn candidates(candidates: &[pb::Candidate], params: &DetectParams) -> Result<Vec<Candidate>, RequestError> {
     if !(1..=MAX_CANDIDATES).contains(&candidates.len()) {
         let value = format_args!("a list of {}", candidates.len());
-        return Err(FieldError::new("candidates", value, format_args!("must have from 1 to {MAX_CANDIDATES}")));
+        return Err(RequestError::invalid("candidates", value, format_args!("must have from 1 to {MAX_CANDIDATES}")));
     }
-    let depth = params.hand.map_or(FINGER_DEPTH, |hand| hand.depth);
+    let depth = params.finger_depth();
     let candidate = |candidate: &pb::Candidate| {
-        let pose = candidate.pose.as_ref().ok_or_else(|| FieldError::new("pose", "absent", "must be given"))?;
+        let pose = candidate.pose.as_ref().ok_or_else(|| RequestError::invalid("pose", "absent", "must be given"))?;
         let pose = params.convention.grasp(&pose::decode(pose, &CANDIDATE)?, depth);
         match candidate.width {
             Some(width) if !(0.0..=1.0).contains(&width) => {
-                Err(FieldError::new("width", width, "must be from 0 to 1 m"))
+                Err(RequestError::invalid("width", width, "must be from 0 to 1 m"))
             }
             width => Ok(Candidate { pose, width }),
         }
@@ -52,10 +42,11 @@ impl From<&Grasp> for pb::Grasp {
 }
 
 impl TryFrom<&pb::Grasp> for Grasp {
-    type Error = FieldError;
+    type Error = RequestError;
 
-    fn try_from(grasp: &pb::Grasp) -> Result<Self, FieldError> {
-        let pose = grasp.pose.as_ref().ok_or_else(|| FieldError::new("grasps.pose", "absent", "must be given"))?;
+    fn try_from(grasp: &pb::Grasp) -> Result<Self, RequestError> {
+        let pose =
+            grasp.pose.as_ref().ok_or_else(|| RequestError::invalid("grasps.pose", "absent", "must be given"))?;
         Ok(Self { pose: pose::decode(pose, &POSE)?, width: grasp.width, quality: grasp.quality })
     }
 }
@@ -81,7 +72,7 @@ impl From<&Dropped> for pb::Dropped {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Vector3;
+    use nalgebra::{Isometry3, Vector3};
 
     use super::*;
 

@@ -1,30 +1,31 @@
-use crate::png;
-use crate::{FieldError, pb};
+use grasp::RequestError;
+
+use crate::{pb, png};
 
 /// The labels of the pixels of an image of `width` × `height`, row by row. Errors name the field in the message.
-pub(crate) fn of_image(labels: &pb::Labels, width: usize, height: usize) -> Result<Vec<u16>, FieldError> {
+pub(crate) fn of_image(labels: &pb::Labels, width: usize, height: usize) -> Result<Vec<u16>, RequestError> {
     match labels.r#type() {
         pb::LabelType::Png => {
-            png::grey(&labels.data, width, height).map_err(|reason| FieldError::refused("data", reason))
+            png::grey(&labels.data, width, height).map_err(|reason| RequestError::refused("data", reason))
         }
         _ => of_points(labels, width * height),
     }
 }
 
 /// The labels of `count` points or pixels. Errors name the field in the message.
-pub(crate) fn of_points(labels: &pb::Labels, count: usize) -> Result<Vec<u16>, FieldError> {
+pub(crate) fn of_points(labels: &pb::Labels, count: usize) -> Result<Vec<u16>, RequestError> {
     let size = match labels.r#type() {
         pb::LabelType::U8 => 1,
         pb::LabelType::U16 => 2,
-        pb::LabelType::Png => return Err(FieldError::new("type", "LABEL_TYPE_PNG", "which is only for images")),
+        pb::LabelType::Png => return Err(RequestError::invalid("type", "LABEL_TYPE_PNG", "which is only for images")),
         pb::LabelType::Unspecified => {
             let needed = "must be LABEL_TYPE_U8 (1), LABEL_TYPE_U16 (2) or LABEL_TYPE_PNG (3)";
-            return Err(FieldError::new("type", labels.r#type, needed));
+            return Err(RequestError::invalid("type", labels.r#type, needed));
         }
     };
     if labels.data.len() != count * size {
         let needed = format_args!("one label each needs {} ({})", count * size, labels.r#type().as_str_name());
-        return Err(FieldError::new("data", format_args!("{} bytes", labels.data.len()), needed));
+        return Err(RequestError::invalid("data", format_args!("{} bytes", labels.data.len()), needed));
     }
     Ok(match size {
         1 => labels.data.iter().map(|&label| u16::from(label)).collect(),

@@ -1,12 +1,11 @@
 //! The generated types of `grasp.v1` (`proto/grasp/v1/grasp.proto`) with their conversions to and from the domain
 //! types, and the generated types of the Open Inference Protocol.
 //!
-//! The conversions from messages validate every field. A [`FieldError`] names the invalid field and its value.
+//! The conversions from messages validate every field. A [`grasp::RequestError`] names the invalid field and its value.
 
 #![warn(missing_docs)]
 
 mod bounded;
-mod error;
 mod grasps;
 mod labels;
 mod options;
@@ -31,15 +30,12 @@ pub mod oip {
 }
 
 pub use bounded::{BoundedCodec, BoundedDecoder};
-pub use error::{FieldError, on_a_line};
-pub use grasps::{Candidate, candidates};
-pub use options::{Collision, DetectParams, TABLE_HEIGHT};
-pub use pb::Priority;
+pub use grasps::candidates;
 pub use png::grey_png;
 pub use pose::pose;
-pub use views::{MAX_VIEWS, Points, check_count, check_png, cloud_view, depth_view};
+pub use views::{MAX_VIEWS, check_views, cloud, clouds, frame, frames};
 pub use volume::{encode, resolution};
-pub use workspace::Workspace;
+pub use workspace::{FrameStamp, check_id};
 
 /// Encoded descriptors of both protocols, for the reflection service.
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));

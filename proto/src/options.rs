@@ -1,16 +1,13 @@
 use std::collections::BTreeSet;
 
 use grasp::{
-    Clearance, ClosingAxis, Cone, Constraints, Convention, DecodeParams, Hand, HandError, Origin, Region, Retreat,
-    before,
+    ClosingAxis, Collision, Cone, Constraints, Convention, DetectParams, Hand, HandError, Origin, Priority, Region,
+    RequestError, Retreat, TABLE_HEIGHT,
 };
 use nalgebra::{Isometry3, Unit, Vector3};
 
+use crate::pb;
 use crate::pose::{self, PoseFields};
-use crate::{FieldError, Priority, pb};
-
-/// Height of the table in training, metres above the volume's bottom.
-pub const TABLE_HEIGHT: f64 = 0.05;
 
 /// Default distance from the pre-grasp to the grasp, metres, as in VGN's trials.
 const PREGRASP: f64 = 0.05;
@@ -35,133 +32,14 @@ const PARENT: PoseFields = PoseFields {
     orientation: "options.convention.parent_from_grasp.orientation",
 };
 
-/// The validated options of a request.
-#[derive(Clone, Debug)]
-pub struct DetectParams {
-    /// Name of the model; empty for the default.
-    pub model: String,
-    /// Version of the model; empty for the newest.
-    pub version: String,
-    /// Smallest quality; `None` means the threshold of the model.
-    pub threshold: Option<f32>,
-    /// Smallest quality of the single best grasp if no grasp reaches the threshold; `None` disables it.
-    pub force: Option<f32>,
-    /// Largest number of grasps.
-    pub max_grasps: usize,
-    /// Largest number of grasps on one object.
-    pub max_grasps_per_object: usize,
-    /// Labels of the objects to grasp; empty means all surfaces.
-    pub objects: BTreeSet<u16>,
-    /// Smallest distance of the fingertips from the sides of the cube, metres.
-    pub margin: f64,
-    /// The place in the queue.
-    pub priority: Priority,
-    /// Whether to report the dropped grasps.
-    pub explain: bool,
-    /// Region, approach and height.
-    pub constraints: Constraints,
-    /// The hand; `None` means the Panda hand.
-    pub hand: Option<Hand>,
-    /// Mode of the collision check.
-    pub collision: Collision,
-    /// Height of the table above the volume's bottom, metres; `None` without a table.
-    pub table: Option<f64>,
-    /// Smallest distance between the hand and the obstacles, metres.
-    pub clearance: f64,
-    /// Whether space behind a surface counts as an obstacle.
-    pub hidden: bool,
-    /// Frame of the hand in which poses are reported.
-    pub convention: Convention,
-    /// Distance from the pre-grasp to the grasp, metres.
-    pub pregrasp: f64,
-    /// Motion of the hand after the grasp.
-    pub retreat: Retreat,
-}
-
-/// Mode of the collision check of the open hand.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Collision {
-    /// No check.
-    Off,
-    /// Grasps in collision are flagged.
-    Flag,
-    /// Grasps in collision are dropped.
-    Filter,
-}
-
-impl DetectParams {
-    /// The decoding parameters of a planner, overridden by the options.
-    #[must_use]
-    pub fn decode_params(&self, own: DecodeParams) -> DecodeParams {
-        DecodeParams {
-            threshold: self.threshold.unwrap_or(own.threshold),
-            force: self.force.or(own.force),
-            constraints: self.constraints,
-            hand: self.hand,
-            clearance: (self.collision == Collision::Filter).then(|| self.clearance()),
-            ..own
-        }
-    }
-
-    /// Parameters of the collision check.
-    #[must_use]
-    pub fn clearance(&self) -> Clearance {
-        let Self { pregrasp: from, table, clearance: margin, hidden, .. } = *self;
-        Clearance { hand: self.hand(), from, table, margin, hidden, ..Clearance::default() }
-    }
-
-    /// The hand that executes the grasps.
-    #[must_use]
-    pub fn hand(&self) -> Hand {
-        self.hand.unwrap_or(Hand::PANDA)
-    }
-
-    /// Refuses options that need views, for a request with a volume.
-    ///
-    /// # Errors
-    /// [`FieldError`] names the option.
-    pub fn check_without_views(&self) -> Result<(), FieldError> {
-        if self.hidden {
-            let needed = "needs depth images or point clouds: a volume does not distinguish hidden from free space";
-            return Err(FieldError::new("options.collision.hidden", true, needed));
-        }
-        self.check_objects(false)
-    }
-
-    /// Refuses options about objects if no view has labels.
-    ///
-    /// # Errors
-    /// [`FieldError`] names the option.
-    pub fn check_objects(&self, is_labelled: bool) -> Result<(), FieldError> {
-        const NEEDED: &str = "needs views with labels";
-        if is_labelled {
-            return Ok(());
-        }
-        if let Some(first) = self.objects.first() {
-            return Err(FieldError::new("options.objects", format_args!("[{first}, …]"), NEEDED));
-        }
-        if self.max_grasps_per_object < usize::MAX {
-            return Err(FieldError::new("options.max_grasps_per_object", self.max_grasps_per_object, NEEDED));
-        }
-        Ok(())
-    }
-
-    /// The reported poses of a grasp: grasp, pre-grasp and retreat, in the requested convention.
-    #[must_use]
-    pub fn poses(&self, grasp: &Isometry3<f64>) -> [Isometry3<f64>; 3] {
-        let depth = self.hand.map_or(grasp::FINGER_DEPTH, |hand| hand.depth);
-        [*grasp, before(grasp, self.pregrasp), self.retreat.from(grasp)].map(|pose| self.convention.pose(&pose, depth))
-    }
-}
-
 impl TryFrom<&pb::Options> for DetectParams {
-    type Error = FieldError;
+    type Error = RequestError;
 
-    fn try_from(options: &pb::Options) -> Result<Self, FieldError> {
+    fn try_from(options: &pb::Options) -> Result<Self, RequestError> {
         for (field, name) in [("options.model", &options.model), ("options.version", &options.version)] {
             if name.len() > MAX_NAME {
                 let value = format_args!("{} bytes long", name.len());
-                return Err(FieldError::new(field, value, format_args!("must be at most {MAX_NAME} bytes")));
+                return Err(RequestError::invalid(field, value, format_args!("must be at most {MAX_NAME} bytes")));
             }
         }
         let collision = options.collision.unwrap_or_default();
@@ -200,47 +78,52 @@ impl TryFrom<&pb::Options> for DetectParams {
     }
 }
 
-fn priority(number: i32) -> Result<Priority, FieldError> {
-    Priority::try_from(number)
-        .map_err(|_| FieldError::new("options.priority", number, "must be PRIORITY_NORMAL or PRIORITY_BATCH"))
+fn priority(number: i32) -> Result<Priority, RequestError> {
+    match pb::Priority::try_from(number) {
+        Ok(pb::Priority::Normal) => Ok(Priority::Normal),
+        Ok(pb::Priority::Batch) => Ok(Priority::Batch),
+        Err(_) => Err(RequestError::invalid("options.priority", number, "must be PRIORITY_NORMAL or PRIORITY_BATCH")),
+    }
 }
 
-fn probability(field: &'static str, value: Option<f32>) -> Result<Option<f32>, FieldError> {
+fn probability(field: &'static str, value: Option<f32>) -> Result<Option<f32>, RequestError> {
     match value {
         // Written so that NaN fails.
         Some(value) if !(value > 0.0 && value <= 1.0) => {
-            Err(FieldError::new(field, value, "must be above 0 and at most 1"))
+            Err(RequestError::invalid(field, value, "must be above 0 and at most 1"))
         }
         value => Ok(value),
     }
 }
 
-fn number(field: &'static str, value: Option<f64>) -> Result<Option<f64>, FieldError> {
+fn number(field: &'static str, value: Option<f64>) -> Result<Option<f64>, RequestError> {
     match value {
-        Some(value) if !value.is_finite() => Err(FieldError::new(field, value, "must be a finite number of metres")),
+        Some(value) if !value.is_finite() => {
+            Err(RequestError::invalid(field, value, "must be a finite number of metres"))
+        }
         value => Ok(value),
     }
 }
 
 /// A length of at most `most` metres.
-fn length(field: &'static str, value: Option<f64>, most: f64) -> Result<Option<f64>, FieldError> {
+fn length(field: &'static str, value: Option<f64>, most: f64) -> Result<Option<f64>, RequestError> {
     match value {
         Some(value) if !(0.0..=most).contains(&value) => {
-            Err(FieldError::new(field, value, format_args!("must be from 0 to {most} m")))
+            Err(RequestError::invalid(field, value, format_args!("must be from 0 to {most} m")))
         }
         value => Ok(value),
     }
 }
 
-fn corners(bounds: &pb::Box, field: &'static str) -> Result<[[f64; 3]; 2], FieldError> {
+fn corners(bounds: &pb::Box, field: &'static str) -> Result<[[f64; 3]; 2], RequestError> {
     let corner = |corner: Option<pb::Vector3>, name: &str| {
         let field = format!("{field}.{name}");
-        let corner = corner.ok_or_else(|| FieldError::new(field.clone(), "absent", "must be given"))?;
+        let corner = corner.ok_or_else(|| RequestError::invalid(field.clone(), "absent", "must be given"))?;
         let [x, y, z] = [corner.x, corner.y, corner.z];
         if [x, y, z].iter().all(|c| c.is_finite()) {
             return Ok([x, y, z]);
         }
-        Err(FieldError::new(field, format_args!("({x}, {y}, {z})"), "must be finite"))
+        Err(RequestError::invalid(field, format_args!("({x}, {y}, {z})"), "must be finite"))
     };
     Ok([corner(bounds.min, "min")?, corner(bounds.max, "max")?])
 }
@@ -250,18 +133,20 @@ fn limit(count: u32) -> usize {
     if count == 0 { usize::MAX } else { count as usize }
 }
 
-fn objects(labels: &[u32]) -> Result<BTreeSet<u16>, FieldError> {
+fn objects(labels: &[u32]) -> Result<BTreeSet<u16>, RequestError> {
     let label = |(index, &label): (usize, &u32)| {
         let valid = u16::try_from(label).ok().filter(|label| *label > 0);
-        valid.ok_or_else(|| FieldError::new(format!("options.objects[{index}]"), label, "must be from 1 to 65535"))
+        valid
+            .ok_or_else(|| RequestError::invalid(format!("options.objects[{index}]"), label, "must be from 1 to 65535"))
     };
     labels.iter().enumerate().map(label).collect()
 }
 
-fn region(options: &pb::Options) -> Result<Option<Region>, FieldError> {
+fn region(options: &pb::Options) -> Result<Option<Region>, RequestError> {
     const FIELD: &str = "options.region";
     let Some(bounds) = &options.region else {
-        let without = |_| FieldError::new("options.region_pose", "given", "must be absent without options.region");
+        let without =
+            |_| RequestError::invalid("options.region_pose", "given", "must be absent without options.region");
         return options.region_pose.as_ref().map_or(Ok(None), |pose| Err(without(pose)));
     };
     let frame = options.region_pose.as_ref().map_or(Ok(Isometry3::identity()), |pose| pose::decode(pose, &REGION))?;
@@ -269,43 +154,47 @@ fn region(options: &pb::Options) -> Result<Option<Region>, FieldError> {
     for (axis, name) in ["x", "y", "z"].into_iter().enumerate() {
         if lower[axis] > upper[axis] {
             let needed = format_args!("must be at least `min.{name}`, {}", lower[axis]);
-            return Err(FieldError::new(format!("{FIELD}.max.{name}"), upper[axis], needed));
+            return Err(RequestError::invalid(format!("{FIELD}.max.{name}"), upper[axis], needed));
         }
     }
     Ok(Some(Region { frame, lower, upper }))
 }
 
 /// The direction of a vector of any length above 0.
-pub(crate) fn direction(vector: Option<pb::Vector3>, field: &'static str) -> Result<Unit<Vector3<f64>>, FieldError> {
-    let pb::Vector3 { x, y, z } = vector.ok_or_else(|| FieldError::new(field, "absent", "must be given"))?;
+pub(crate) fn direction(vector: Option<pb::Vector3>, field: &'static str) -> Result<Unit<Vector3<f64>>, RequestError> {
+    let pb::Vector3 { x, y, z } = vector.ok_or_else(|| RequestError::invalid(field, "absent", "must be given"))?;
     let vector = Vector3::new(x, y, z);
     // Scaled by the largest component first, so that the squares do not overflow.
     let direction = Unit::try_new(vector / vector.amax().max(1e-9), 1e-9);
     let direction = direction.filter(|unit| unit.iter().all(|c| c.is_finite()) && vector.norm() > 1e-9);
     direction.ok_or_else(|| {
-        FieldError::new(field, format_args!("({x}, {y}, {z})"), "must be finite and of a length above 0")
+        RequestError::invalid(field, format_args!("({x}, {y}, {z})"), "must be finite and of a length above 0")
     })
 }
 
-fn cone(cone: &pb::Cone) -> Result<Cone, FieldError> {
+fn cone(cone: &pb::Cone) -> Result<Cone, RequestError> {
     let axis = direction(cone.axis, "options.approach.axis")?;
     if !(cone.angle > 0.0 && cone.angle <= std::f64::consts::PI) {
         let needed = "must be above 0 and at most π (radians)";
-        return Err(FieldError::new("options.approach.angle", cone.angle, needed));
+        return Err(RequestError::invalid("options.approach.angle", cone.angle, needed));
     }
     Ok(Cone { axis, angle: cone.angle })
 }
 
-fn hand(gripper: &pb::Gripper) -> Result<Hand, FieldError> {
+fn hand(gripper: &pb::Gripper) -> Result<Hand, RequestError> {
     let palm = gripper.palm.as_ref().map(|palm| corners(palm, "options.gripper.palm")).transpose()?;
     let pb::Gripper { max_opening, finger_depth, finger_width, finger_breadth, .. } = *gripper;
     let hand = Hand::new(max_opening, finger_depth, finger_width, finger_breadth, palm.unwrap_or_default());
     hand.map_err(|HandError { field, value, needed }| {
-        FieldError::new(format!("options.gripper.{field}"), format_args!("{value} m"), format_args!("must be {needed}"))
+        RequestError::invalid(
+            format!("options.gripper.{field}"),
+            format_args!("{value} m"),
+            format_args!("must be {needed}"),
+        )
     })
 }
 
-fn mode(collision: &pb::CollisionCheck) -> Result<Collision, FieldError> {
+fn mode(collision: &pb::CollisionCheck) -> Result<Collision, RequestError> {
     use pb::collision_check::Mode;
     match Mode::try_from(collision.mode) {
         Ok(Mode::Off) => Ok(Collision::Off),
@@ -313,12 +202,12 @@ fn mode(collision: &pb::CollisionCheck) -> Result<Collision, FieldError> {
         Ok(Mode::Filter) => Ok(Collision::Filter),
         Err(_) => {
             let needed = "must be MODE_OFF (0), MODE_FLAG (1) or MODE_FILTER (2)";
-            Err(FieldError::new("options.collision.mode", collision.mode, needed))
+            Err(RequestError::invalid("options.collision.mode", collision.mode, needed))
         }
     }
 }
 
-fn convention(convention: &pb::Convention) -> Result<Convention, FieldError> {
+fn convention(convention: &pb::Convention) -> Result<Convention, RequestError> {
     use pb::convention::{ClosingAxis as Axis, Origin as From};
     let parent = convention.parent_from_grasp.as_ref();
     const ORIGIN: &str = "options.convention.origin";
@@ -328,15 +217,15 @@ fn convention(convention: &pb::Convention) -> Result<Convention, FieldError> {
         (Ok(From::Parent), Some(pose)) => Origin::Parent(pose::decode(pose, &PARENT)?),
         (Ok(From::Parent), None) => {
             let needed = "must be given for ORIGIN_PARENT";
-            return Err(FieldError::new("options.convention.parent_from_grasp", "absent", needed));
+            return Err(RequestError::invalid("options.convention.parent_from_grasp", "absent", needed));
         }
         (Ok(origin), Some(_)) => {
             let needed = "must be ORIGIN_PARENT if parent_from_grasp is given";
-            return Err(FieldError::new(ORIGIN, origin.as_str_name(), needed));
+            return Err(RequestError::invalid(ORIGIN, origin.as_str_name(), needed));
         }
         (Err(_), _) => {
             let needed = "must be ORIGIN_FINGER_BASE (0), ORIGIN_TCP (1) or ORIGIN_PARENT (2)";
-            return Err(FieldError::new(ORIGIN, convention.origin, needed));
+            return Err(RequestError::invalid(ORIGIN, convention.origin, needed));
         }
     };
     let closing = match Axis::try_from(convention.closing_axis) {
@@ -344,13 +233,13 @@ fn convention(convention: &pb::Convention) -> Result<Convention, FieldError> {
         Ok(Axis::X) => ClosingAxis::X,
         Err(_) => {
             let needed = "must be CLOSING_AXIS_Y (0) or CLOSING_AXIS_X (1)";
-            return Err(FieldError::new("options.convention.closing_axis", convention.closing_axis, needed));
+            return Err(RequestError::invalid("options.convention.closing_axis", convention.closing_axis, needed));
         }
     };
     Ok(Convention { origin, closing })
 }
 
-fn retreat(retreat: &pb::Retreat) -> Result<Retreat, FieldError> {
+fn retreat(retreat: &pb::Retreat) -> Result<Retreat, RequestError> {
     let distance = length("options.retreat.distance", retreat.distance, REACH)?;
     let towards = retreat.direction.map(|vector| direction(Some(vector), "options.retreat.direction")).transpose()?;
     Ok(Retreat { distance: distance.unwrap_or(RETREAT), direction: towards })
@@ -358,6 +247,7 @@ fn retreat(retreat: &pb::Retreat) -> Result<Retreat, FieldError> {
 
 #[cfg(test)]
 mod tests {
+    use grasp::DecodeParams;
     use nalgebra::Translation3;
 
     use super::*;
@@ -370,7 +260,7 @@ mod tests {
     fn the_defaults_are_those_of_the_papers() {
         let params = DetectParams::try_from(&pb::Options::default()).unwrap();
         let own = DecodeParams { threshold: 0.8, force: Some(0.5), ..DecodeParams::default() };
-        assert_eq!(params.decode_params(own), own);
+        assert_eq!(params.decode_params(own, None), own);
         let grasp = Isometry3::new(Vector3::new(0.1, 0.2, 0.3), Vector3::new(3.0, 0.0, 0.0));
         let [pose, pregrasp, retreat] = params.poses(&grasp);
         assert_eq!(pose, grasp);
@@ -406,7 +296,7 @@ mod tests {
         assert_eq!(refused.to_string(), "options.objects is [3, …], needs views with labels");
         assert!(of_objects.check_objects(true).is_ok());
         let limited = params(&pb::Options { max_grasps_per_object: 2, ..Default::default() });
-        assert_eq!(limited.check_objects(false).unwrap_err().field, "options.max_grasps_per_object");
+        assert_eq!(limited.check_objects(false).unwrap_err().field(), "options.max_grasps_per_object");
         assert!(params(&pb::Options::default()).check_without_views().is_ok());
     }
 

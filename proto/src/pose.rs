@@ -1,6 +1,7 @@
+use grasp::RequestError;
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
-use crate::{FieldError, pb};
+use crate::pb;
 
 /// Largest deviation of an orientation's length from 1: room for single precision and for values printed with four
 /// digits.
@@ -9,8 +10,8 @@ const UNIT_TOLERANCE: f64 = 1e-3;
 /// Converts and validates a pose message. Errors name it `field`.
 ///
 /// # Errors
-/// [`FieldError`] if a part is absent or not finite, or the orientation has no unit length.
-pub fn pose(pose: &pb::Pose, field: &'static str) -> Result<Isometry3<f64>, FieldError> {
+/// [`RequestError`] if a part is absent or not finite, or the orientation has no unit length.
+pub fn pose(pose: &pb::Pose, field: &'static str) -> Result<Isometry3<f64>, RequestError> {
     const FIELDS: PoseFields = PoseFields { position: "position", orientation: "orientation" };
     decode(pose, &FIELDS).map_err(|error| error.inside(field))
 }
@@ -22,21 +23,22 @@ pub(crate) struct PoseFields {
 }
 
 /// The pose as an isometry with a normalised orientation.
-pub(crate) fn decode(pose: &pb::Pose, fields: &PoseFields) -> Result<Isometry3<f64>, FieldError> {
-    let position = pose.position.ok_or_else(|| FieldError::new(fields.position, "absent", "must be given"))?;
+pub(crate) fn decode(pose: &pb::Pose, fields: &PoseFields) -> Result<Isometry3<f64>, RequestError> {
+    let position = pose.position.ok_or_else(|| RequestError::invalid(fields.position, "absent", "must be given"))?;
     let pb::Vector3 { x, y, z } = position;
     if ![x, y, z].iter().all(|c| c.is_finite()) {
-        return Err(FieldError::new(fields.position, format_args!("({x}, {y}, {z})"), "must be finite"));
+        return Err(RequestError::invalid(fields.position, format_args!("({x}, {y}, {z})"), "must be finite"));
     }
     let translation = Translation3::new(x, y, z);
 
-    let orientation = pose.orientation.ok_or_else(|| FieldError::new(fields.orientation, "absent", "must be given"))?;
+    let orientation =
+        pose.orientation.ok_or_else(|| RequestError::invalid(fields.orientation, "absent", "must be given"))?;
     let pb::Quaternion { x, y, z, w } = orientation;
     let quaternion = Quaternion::new(w, x, y, z);
     let length = quaternion.norm();
     if length.is_nan() || (length - 1.0).abs() > UNIT_TOLERANCE {
         let value = format_args!("(x {x}, y {y}, z {z}, w {w}), of length {length}");
-        return Err(FieldError::new(fields.orientation, value, "must be of unit length to within 0.001"));
+        return Err(RequestError::invalid(fields.orientation, value, "must be of unit length to within 0.001"));
     }
     Ok(Isometry3::from_parts(translation, UnitQuaternion::new_normalize(quaternion)))
 }

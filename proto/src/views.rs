@@ -1,9 +1,10 @@
-use grasp::{DepthImage, Intrinsics, Unit as DepthUnit, View};
+use grasp::{DepthImage, Intrinsics, RequestError, Unit as DepthUnit};
+use grasp_perception::{CameraPose, Cloud, Frame};
 use nalgebra::{Isometry3, Point3};
 
 use crate::pb::depth_view::Extrinsics;
 use crate::pose::{self, PoseFields};
-use crate::{FieldError, labels, pb, png};
+use crate::{labels, pb, png};
 
 /// Largest number of views in one request.
 pub const MAX_VIEWS: usize = 64;
@@ -21,38 +22,33 @@ const OFF_CENTRE: f64 = 0.1;
 
 const CAMERA_FROM_TASK: PoseFields =
     PoseFields { position: "camera_from_task.position", orientation: "camera_from_task.orientation" };
-pub(crate) const FRAME_FROM_CAMERA: PoseFields =
+const FRAME_FROM_CAMERA: PoseFields =
     PoseFields { position: "frame_from_camera.position", orientation: "frame_from_camera.orientation" };
 const FRAME_FROM_CLOUD: PoseFields =
     PoseFields { position: "frame_from_cloud.position", orientation: "frame_from_cloud.orientation" };
 
-/// The points of one camera, in the task frame.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Points {
-    /// The points, metres.
-    pub points: Vec<Point3<f64>>,
-    /// Position of the camera, metres.
-    pub eye: Point3<f64>,
-    /// Label of the object of each point, if it is known; 0 is no object.
-    pub labels: Option<Vec<u16>>,
-}
-
-/// Checks the number of views.
+/// Checks the number of views of a request.
 ///
 /// # Errors
-/// [`FieldError`] if there are none or more than [`MAX_VIEWS`].
-pub fn check_count(views: usize) -> Result<(), FieldError> {
+/// [`RequestError`] if there are none or more than [`MAX_VIEWS`].
+pub fn check_views(views: usize) -> Result<(), RequestError> {
     if (1..=MAX_VIEWS).contains(&views) {
         return Ok(());
     }
-    Err(FieldError::new("views", format_args!("a list of {views}"), format_args!("must have from 1 to {MAX_VIEWS}")))
+    Err(RequestError::invalid(
+        "views",
+        format_args!("a list of {views}"),
+        format_args!("must have from 1 to {MAX_VIEWS}"),
+    ))
+}
+
+/// A request of a stream may have no views.
+fn check_number(views: usize) -> Result<(), RequestError> {
+    if views == 0 { Ok(()) } else { check_views(views) }
 }
 
 /// Checks the size of the images that are sent as PNG, before they are decoded: a small file can contain a large image.
-///
-/// # Errors
-/// [`FieldError`] if all of them together have too many pixels.
-pub fn check_png(views: &[pb::DepthView]) -> Result<(), FieldError> {
+fn check_png(views: &[pb::DepthView]) -> Result<(), RequestError> {
     /// 128 MiB of depths in f32: 109 images of 640 × 480 pixels.
     const MAX_PIXELS: u64 = 1 << 25;
     let pixels = |view: &pb::DepthView| {
@@ -69,35 +65,40 @@ pub fn check_png(views: &[pb::DepthView]) -> Result<(), FieldError> {
         return Ok(());
     }
     let needed = format_args!("must have at most {MAX_PIXELS}; send fewer or smaller images");
-    Err(FieldError::new("views", format_args!("PNG images with {sum} pixels in all"), needed))
+    Err(RequestError::invalid("views", format_args!("PNG images with {sum} pixels in all"), needed))
 }
 
-/// Converts depth view `index`: depth in metres, row by row, and the camera pose in the task frame.
+/// Decodes the depth images of a request.
 ///
 /// # Errors
-/// [`FieldError`] names the invalid field of the view.
-pub fn depth_view(view: &pb::DepthView, index: usize, frame_from_task: &Isometry3<f64>) -> Result<View, FieldError> {
-    try_depth_view(view, frame_from_task).map_err(|error| error.inside(format_args!("views[{index}]")))
+/// [`RequestError`] names the invalid field.
+pub fn frames(views: &[pb::DepthView]) -> Result<Vec<Frame>, RequestError> {
+    check_number(views.len())?;
+    check_png(views)?;
+    let indexed = views.iter().enumerate();
+    indexed.map(|(index, view)| frame(view).map_err(|error| error.inside(format_args!("views[{index}]")))).collect()
 }
 
-fn try_depth_view(view: &pb::DepthView, frame_from_task: &Isometry3<f64>) -> Result<View, FieldError> {
-    let (intrinsics, depth) = image(view)?;
-    let of_image = |message| labels::of_image(message, intrinsics.width, intrinsics.height);
+/// Decodes a depth image.
+///
+/// # Errors
+/// [`RequestError`] names the invalid field of the view.
+pub fn frame(view: &pb::DepthView) -> Result<Frame, RequestError> {
+    let image = image(view)?;
+    let Intrinsics { width, height, .. } = *image.intrinsics();
+    let of_image = |message| labels::of_image(message, width, height);
     let labels = view.labels.as_ref().map(of_image).transpose().map_err(|error| error.inside("labels"))?;
-    let camera_from_task = match &view.extrinsics {
-        Some(Extrinsics::CameraFromTask(pose)) => pose::decode(pose, &CAMERA_FROM_TASK)?,
-        Some(Extrinsics::FrameFromCamera(pose)) => pose::decode(pose, &FRAME_FROM_CAMERA)?.inverse() * frame_from_task,
-        None => {
-            let needed = "camera_from_task (T_camera_task) or frame_from_camera (T_frame_camera) must be given";
-            return Err(FieldError::new("extrinsics", "absent", needed));
-        }
+    let pose = match &view.extrinsics {
+        Some(Extrinsics::CameraFromTask(pose)) => CameraPose::InTask(pose::decode(pose, &CAMERA_FROM_TASK)?),
+        Some(Extrinsics::FrameFromCamera(pose)) => CameraPose::InFrame(pose::decode(pose, &FRAME_FROM_CAMERA)?),
+        None => CameraPose::Unknown,
     };
-    Ok(View { intrinsics, depth, camera_from_task, labels })
+    Ok(Frame { image, labels, pose })
 }
 
-/// The intrinsics and the depth, metres, row by row, of a view.
-pub(crate) fn image(view: &pb::DepthView) -> Result<(Intrinsics, Vec<f32>), FieldError> {
-    let camera = view.camera.as_ref().ok_or_else(|| FieldError::new("camera", "absent", "must be given"))?;
+/// The image of a view.
+fn image(view: &pb::DepthView) -> Result<DepthImage<'static>, RequestError> {
+    let camera = view.camera.as_ref().ok_or_else(|| RequestError::invalid("camera", "absent", "must be given"))?;
     let intrinsics = intrinsics(camera)?;
     let pixels = intrinsics.width * intrinsics.height;
     let value_size = match view.unit() {
@@ -107,7 +108,7 @@ pub(crate) fn image(view: &pb::DepthView) -> Result<(Intrinsics, Vec<f32>), Fiel
         pb::DepthUnit::Unspecified => {
             let needed = "must be DEPTH_UNIT_F32_METRES (1), DEPTH_UNIT_U16_MILLIMETRES (2) or \
                           DEPTH_UNIT_PNG_MILLIMETRES (3)";
-            return Err(FieldError::new("unit", view.unit, needed));
+            return Err(RequestError::invalid("unit", view.unit, needed));
         }
     };
     if let Some(value_size) = value_size
@@ -120,7 +121,7 @@ pub(crate) fn image(view: &pb::DepthView) -> Result<(Intrinsics, Vec<f32>), Fiel
             pixels * value_size,
             view.unit().as_str_name()
         );
-        return Err(FieldError::new("data", format_args!("{} bytes", view.data.len()), needed));
+        return Err(RequestError::invalid("data", format_args!("{} bytes", view.data.len()), needed));
     }
     let depth: Vec<f32> = match view.unit() {
         pb::DepthUnit::U16Millimetres => {
@@ -128,48 +129,47 @@ pub(crate) fn image(view: &pb::DepthView) -> Result<(Intrinsics, Vec<f32>), Fiel
         }
         pb::DepthUnit::PngMillimetres => {
             let values = png::deep_grey(&view.data, intrinsics.width, intrinsics.height);
-            let values = values.map_err(|reason| FieldError::refused("data", reason))?;
+            let values = values.map_err(|reason| RequestError::refused("data", reason))?;
             values.into_iter().map(|value| f32::from(value) * 1e-3).collect()
         }
         _ => view.data.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect(),
     };
-    let image = DepthImage::new(intrinsics, &depth).map_err(|error| FieldError::refused("camera", error))?;
+    let image = DepthImage::new(intrinsics, depth).map_err(|error| RequestError::refused("camera", error))?;
     match (image.unit(), view.unit()) {
         (DepthUnit::Millimetres, pb::DepthUnit::U16Millimetres | pb::DepthUnit::PngMillimetres) => {
             let needed = "is farther than depth cameras measure: send 0 for pixels without a reading";
-            return Err(FieldError::new("data", "in millimetres, with a median above 20,000", needed));
+            Err(RequestError::invalid("data", "in millimetres, with a median above 20,000", needed))
         }
         (DepthUnit::Millimetres, _) => {
             let needed = "must be metres but looks like millimetres: send u16 with DEPTH_UNIT_U16_MILLIMETRES, or divide \
                           by 1000";
-            return Err(FieldError::new("data", "in metres, with a median above 20", needed));
+            Err(RequestError::invalid("data", "in metres, with a median above 20", needed))
         }
         (DepthUnit::Thousandths, pb::DepthUnit::U16Millimetres | pb::DepthUnit::PngMillimetres) => {
             let needed = "must be millimetres but looks like metres: send f32 with DEPTH_UNIT_F32_METRES";
-            return Err(FieldError::new("data", "in millimetres, with a median below 20", needed));
+            Err(RequestError::invalid("data", "in millimetres, with a median below 20", needed))
         }
         (DepthUnit::Thousandths, _) => {
             let needed = "is closer than depth cameras measure: check that the values were not divided by 1000 twice";
-            return Err(FieldError::new("data", "in metres, with a median below 0.02", needed));
+            Err(RequestError::invalid("data", "in metres, with a median below 0.02", needed))
         }
-        (DepthUnit::Metres, _) => {}
+        (DepthUnit::Metres, _) => Ok(image),
     }
-    Ok((intrinsics, depth))
 }
 
 /// Validates the intrinsic matrix.
-fn intrinsics(camera: &pb::Camera) -> Result<Intrinsics, FieldError> {
+fn intrinsics(camera: &pb::Camera) -> Result<Intrinsics, RequestError> {
     const FORM: &str = "must be nine numbers, row by row: fx 0 cx, 0 fy cy, 0 0 1";
     for (field, edge) in [("camera.width", camera.width), ("camera.height", camera.height)] {
         if !(1..=MAX_EDGE).contains(&edge) {
-            return Err(FieldError::new(field, edge, format_args!("must be from 1 to {MAX_EDGE} pixels")));
+            return Err(RequestError::invalid(field, edge, format_args!("must be from 1 to {MAX_EDGE} pixels")));
         }
     }
     let k: &[f64] = &camera.k;
     let &[fx, skew, cx, zero, fy, cy, left, right, one] = k else {
-        return Err(FieldError::new("camera.k", format_args!("{} numbers", k.len()), FORM));
+        return Err(RequestError::invalid("camera.k", format_args!("{} numbers", k.len()), FORM));
     };
-    let wrong = |needed: &str| Err(FieldError::new("camera.k", format_args!("{k:?}"), needed));
+    let wrong = |needed: &str| Err(RequestError::invalid("camera.k", format_args!("{k:?}"), needed));
     if !k.iter().all(|value| value.is_finite()) {
         return wrong("must be finite");
     }
@@ -192,40 +192,50 @@ fn intrinsics(camera: &pb::Camera) -> Result<Intrinsics, FieldError> {
              centre: send the intrinsics of this resolution; if the image was cropped, send the whole image",
             camera.width, camera.height
         );
-        return Err(FieldError::new("camera.k", format_args!("{k:?}"), needed));
+        return Err(RequestError::invalid("camera.k", format_args!("{k:?}"), needed));
     }
     // No overflow: both are at most MAX_EDGE.
     Ok(Intrinsics { width: camera.width as usize, height: camera.height as usize, fx, fy, cx, cy })
 }
 
-/// Converts cloud view `index`: points and camera position in the task frame, metres.
+/// Decodes the point clouds of a request, in the caller's frame.
 ///
 /// # Errors
-/// [`FieldError`] names the invalid field of the view.
-pub fn cloud_view(view: &pb::CloudView, index: usize, frame_from_task: &Isometry3<f64>) -> Result<Points, FieldError> {
-    try_cloud_view(view, frame_from_task).map_err(|error| error.inside(format_args!("views[{index}]")))
+/// [`RequestError`] names the invalid field.
+pub fn clouds(views: &[pb::CloudView]) -> Result<Vec<Cloud>, RequestError> {
+    check_number(views.len())?;
+    let indexed = views.iter().enumerate();
+    indexed.map(|(index, view)| cloud(view).map_err(|error| error.inside(format_args!("views[{index}]")))).collect()
 }
 
-pub(crate) fn try_cloud_view(view: &pb::CloudView, frame_from_task: &Isometry3<f64>) -> Result<Points, FieldError> {
+/// Decodes a point cloud, in the caller's frame.
+///
+/// # Errors
+/// [`RequestError`] names the invalid field of the view.
+pub fn cloud(view: &pb::CloudView) -> Result<Cloud, RequestError> {
     const POINT: usize = 12;
     if view.points.is_empty() || !view.points.len().is_multiple_of(POINT) {
         let value = format_args!("{} bytes", view.points.len());
-        return Err(FieldError::new("points", value, "must be a multiple of 12 above 0: x, y, z of each point, f32"));
+        return Err(RequestError::invalid(
+            "points",
+            value,
+            "must be a multiple of 12 above 0: x, y, z of each point, f32",
+        ));
     }
     let frame_from_cloud = view.frame_from_cloud.as_ref();
     let frame_from_cloud =
         frame_from_cloud.map_or(Ok(Isometry3::identity()), |p| pose::decode(p, &FRAME_FROM_CLOUD))?;
-    let task_from_cloud = frame_from_task.inverse() * frame_from_cloud;
-    let eye = view.camera_position.ok_or_else(|| FieldError::new("camera_position", "absent", "must be given"))?;
+    let eye =
+        view.camera_position.ok_or_else(|| RequestError::invalid("camera_position", "absent", "must be given"))?;
     let pb::Vector3 { x, y, z } = eye;
     if ![x, y, z].iter().all(|c| c.is_finite()) {
-        return Err(FieldError::new("camera_position", format_args!("({x}, {y}, {z})"), "must be finite"));
+        return Err(RequestError::invalid("camera_position", format_args!("({x}, {y}, {z})"), "must be finite"));
     }
     let point = |bytes: &[u8; POINT]| {
         let [x, y, z] =
             [0, 4, 8].map(|at| f32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]));
         let finite = x.is_finite() && y.is_finite() && z.is_finite();
-        finite.then(|| task_from_cloud * Point3::new(x, y, z).cast::<f64>())
+        finite.then(|| frame_from_cloud * Point3::new(x, y, z).cast::<f64>())
     };
     let all = view.points.as_chunks().0;
     let points: Vec<_> = all.iter().filter_map(point).collect();
@@ -236,16 +246,16 @@ pub(crate) fn try_cloud_view(view: &pb::CloudView, frame_from_task: &Isometry3<f
         finite.map(|(_, label)| label).collect()
     });
     if points.is_empty() {
-        return Err(FieldError::new("points", "NaN throughout", "must have at least one finite point"));
+        return Err(RequestError::invalid("points", "NaN throughout", "must have at least one finite point"));
     }
-    let eye = task_from_cloud * Point3::new(x, y, z);
+    let eye = frame_from_cloud * Point3::new(x, y, z);
     let distance = median(points.iter().map(|point| (point - eye).norm()));
     if distance > FARTHEST {
         let value = format_args!("{distance:.0} m from the camera (median)");
         let needed = "must be in metres but looks like millimetres: divide by 1000";
-        return Err(FieldError::new("points", value, needed));
+        return Err(RequestError::invalid("points", value, needed));
     }
-    Ok(Points { points, eye, labels })
+    Ok(Cloud { points, eye, labels })
 }
 
 /// The median of a sample of the distances; 0 if there are none.
@@ -259,8 +269,9 @@ fn median(distances: impl Iterator<Item = f64>) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use grasp_perception::Workspace;
+
     use super::*;
-    use crate::Workspace;
 
     /// A wall at a distance of 0.5 m.
     fn view() -> pb::DepthView {
@@ -276,8 +287,8 @@ mod tests {
     fn refused(change: impl Fn(&mut pb::DepthView)) -> String {
         let mut view = view();
         change(&mut view);
-        let error = depth_view(&view, 1, &Isometry3::identity()).unwrap_err();
-        assert!(error.message.starts_with(&*error.field), "{error:?}");
+        let error = frames(&[self::view(), view]).unwrap_err();
+        assert!(error.message.starts_with(error.field()), "{error:?}");
         error.to_string()
     }
 
@@ -288,8 +299,7 @@ mod tests {
             unit: pb::DepthUnit::PngMillimetres.into(),
             ..view()
         };
-        let frame = Isometry3::identity();
-        assert_eq!(depth_view(&png, 0, &frame).unwrap().depth, depth_view(&view(), 0, &frame).unwrap().depth);
+        assert_eq!(frame(&png), frame(&view()));
         let other = png::grey_png(&[500; 12], 3);
         let unit = pb::DepthUnit::PngMillimetres.into();
         assert_eq!(
@@ -335,7 +345,7 @@ mod tests {
     fn labels_belong_to_pixels_and_points() {
         let labels = |data: Vec<u8>| Some(pb::Labels { data: data.into(), r#type: pb::LabelType::U8.into() });
         let labelled = pb::DepthView { labels: labels((0..12).collect()), ..view() };
-        let converted = depth_view(&labelled, 0, &Isometry3::identity()).unwrap();
+        let converted = frame(&labelled).unwrap();
         assert_eq!(converted.labels, Some((0..12).collect()));
         assert_eq!(
             refused(|view| view.labels = labels(vec![1; 11])),
@@ -349,12 +359,12 @@ mod tests {
             camera_position: Some(pb::Vector3::default()),
             labels: labels(vec![4, 5, 6]),
         };
-        let converted = cloud_view(&cloud, 0, &Isometry3::identity()).unwrap();
+        let converted = self::cloud(&cloud).unwrap();
         assert_eq!((converted.points.len(), converted.labels), (2, Some(vec![4, 6])));
         let millimetres = points.iter().flatten().flat_map(|c| (c * 1000.0).to_le_bytes());
         let cloud = pb::CloudView { points: millimetres.collect::<Vec<u8>>().into(), ..cloud };
         assert!(
-            cloud_view(&cloud, 0, &Isometry3::identity())
+            clouds(&[cloud])
                 .unwrap_err()
                 .to_string()
                 .starts_with("views[0].points is 500 m from the camera (median), must be in metres but looks like")
@@ -372,27 +382,27 @@ mod tests {
             workspace(0.9, 2.5).unwrap_err().to_string(),
             "workspace.extent.y is 2.5, must be above 0 and at most 2 m"
         );
-        assert_eq!(workspace(f64::NAN, 0.5).unwrap_err().field, "workspace.extent.x");
+        assert_eq!(workspace(f64::NAN, 0.5).unwrap_err().field(), "workspace.extent.x");
     }
 
     #[test]
     fn both_units_and_both_directions_give_the_same_view() {
         let frame_from_task = Isometry3::translation(1.0, 2.0, 3.0);
-        let expected = depth_view(&view(), 0, &frame_from_task).unwrap();
-        assert_eq!(expected.depth, [0.5; 12]);
+        let in_task = |view: &pb::DepthView| frame(view).unwrap().in_task(&frame_from_task).unwrap();
+        let expected = in_task(&view());
+        assert_eq!(expected.image.depth(), [0.5; 12]);
         let intrinsics = Intrinsics { width: 4, height: 3, fx: 5.0, fy: 5.0, cx: 2.0, cy: 1.5 };
-        assert_eq!(expected.intrinsics, intrinsics);
+        assert_eq!(expected.intrinsics(), intrinsics);
 
         let metres: Vec<u8> = [0.5_f32; 12].iter().flat_map(|v| v.to_le_bytes()).collect();
         let frame_from_camera = frame_from_task * expected.camera_from_task.inverse();
-        let other = pb::DepthView {
+        let other = in_task(&pb::DepthView {
             data: metres.into(),
             unit: pb::DepthUnit::F32Metres.into(),
             extrinsics: Some(Extrinsics::FrameFromCamera((&frame_from_camera).into())),
             ..view()
-        };
-        let other = depth_view(&other, 0, &frame_from_task).unwrap();
-        assert_eq!(other.depth, expected.depth);
+        });
+        assert_eq!(other.image, expected.image);
         assert!((other.camera_from_task.to_homogeneous() - expected.camera_from_task.to_homogeneous()).norm() < 1e-9);
     }
 
@@ -428,7 +438,8 @@ mod tests {
             refused(|v| v.unit = 0),
             "views[1].unit is 0, must be DEPTH_UNIT_F32_METRES (1), DEPTH_UNIT_U16_MILLIMETRES (2) or DEPTH_UNIT_PNG_MILLIMETRES (3)"
         );
-        assert!(refused(|v| v.extrinsics = None).starts_with("views[1].extrinsics is absent, camera_from_task"));
+        let no_pose = frame(&pb::DepthView { extrinsics: None, ..view() }).unwrap().in_task(&Isometry3::identity());
+        assert!(no_pose.unwrap_err().message.starts_with("extrinsics is absent, camera_from_task"));
         let nowhere = pb::Pose { position: None, orientation: None };
         assert_eq!(
             refused(|v| v.extrinsics = Some(Extrinsics::FrameFromCamera(nowhere))),
@@ -440,7 +451,7 @@ mod tests {
     fn a_cropped_image_is_accepted() {
         let camera = pb::Camera { width: 4, height: 3, k: vec![5.0, 0.0, -1.0, 0.0, 5.0, 1.2, 0.0, 0.0, 1.0] };
         let view = pb::DepthView { camera: Some(camera), ..view() };
-        assert_eq!(depth_view(&view, 0, &Isometry3::identity()).unwrap().intrinsics.cx, -1.0);
+        assert_eq!(frame(&view).unwrap().image.intrinsics().cx, -1.0);
     }
 
     #[test]
@@ -463,18 +474,15 @@ mod tests {
             camera_position: Some(pb::Vector3::default()),
             labels: None,
         };
-        let points = cloud_view(&view, 0, &Isometry3::translation(0.5, 0.0, 0.0)).unwrap();
+        let points = cloud(&view).unwrap().in_task(&Isometry3::translation(0.5, 0.0, 0.0));
         let [point] = points.points[..] else { panic!("the NaN point is ignored") };
         assert!((point - Point3::new(0.6, 0.2, 0.3)).norm() < 1e-6);
         assert!((points.eye - Point3::new(0.5, 0.0, 0.0)).norm() < 1e-12);
-        let refused = |view: pb::CloudView| cloud_view(&view, 2, &Isometry3::identity()).unwrap_err().to_string();
+        let refused = |view: pb::CloudView| cloud(&view).unwrap_err().to_string();
         assert!(
-            refused(pb::CloudView { points: vec![0; 13].into(), ..view.clone() })
-                .starts_with("views[2].points is 13 bytes")
+            refused(pb::CloudView { points: vec![0; 13].into(), ..view.clone() }).starts_with("points is 13 bytes")
         );
-        assert!(
-            refused(pb::CloudView { camera_position: None, ..view }).starts_with("views[2].camera_position is absent")
-        );
+        assert!(refused(pb::CloudView { camera_position: None, ..view }).starts_with("camera_position is absent"));
     }
 
     #[test]
@@ -487,7 +495,7 @@ mod tests {
                 workspace(size).unwrap_err().message.starts_with(&format!("workspace.size is {size}, must be above 0"))
             );
         }
-        assert!(check_count(1).is_ok() && check_count(64).is_ok());
-        assert_eq!(check_count(0).unwrap_err().message, "views is a list of 0, must have from 1 to 64");
+        assert!(check_views(1).is_ok() && check_views(64).is_ok());
+        assert_eq!(check_views(0).unwrap_err().message, "views is a list of 0, must have from 1 to 64");
     }
 }

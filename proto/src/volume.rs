@@ -1,10 +1,10 @@
-use grasp::{Volume, VolumeError};
+use grasp::{RequestError, Volume, VolumeError};
 use half::f16;
 use half::slice::HalfFloatSliceExt;
 use nalgebra::Isometry3;
 
+use crate::pb;
 use crate::pose::{self, PoseFields};
-use crate::{FieldError, pb};
 
 const POSE: PoseFields = PoseFields { position: "volume.pose.position", orientation: "volume.pose.orientation" };
 
@@ -12,15 +12,15 @@ const POSE: PoseFields = PoseFields { position: "volume.pose.position", orientat
 /// before the data is converted.
 ///
 /// # Errors
-/// [`FieldError`] if the resolution or the dtype is not supported, or the length of the data does not match.
-pub fn resolution(volume: &pb::Volume) -> Result<usize, FieldError> {
+/// [`RequestError`] if the resolution or the dtype is not supported, or the length of the data does not match.
+pub fn resolution(volume: &pb::Volume) -> Result<usize, RequestError> {
     let value_size = match volume.dtype() {
         pb::DataType::F32 => 4,
         pb::DataType::F16 => 2,
         pb::DataType::U8 => 1,
         pb::DataType::Unspecified => {
             let needed = "must be DATA_TYPE_F32 (1), DATA_TYPE_F16 (2) or DATA_TYPE_U8 (3)";
-            return Err(FieldError::new("volume.dtype", volume.dtype, needed));
+            return Err(RequestError::invalid("volume.dtype", volume.dtype, needed));
         }
     };
     let resolution = volume.resolution as usize;
@@ -33,16 +33,16 @@ pub fn resolution(volume: &pb::Volume) -> Result<usize, FieldError> {
             "a resolution of {resolution} needs {resolution}³ · {value_size} = {expected} ({dtype})",
             dtype = volume.dtype().as_str_name(),
         );
-        return Err(FieldError::new("volume.data", format_args!("{} bytes", volume.data.len()), needed));
+        return Err(RequestError::invalid("volume.data", format_args!("{} bytes", volume.data.len()), needed));
     }
     Ok(resolution)
 }
 
 impl TryFrom<&pb::Volume> for Volume {
-    type Error = FieldError;
+    type Error = RequestError;
 
     /// Validates every field. The data is copied once, during the conversion to f32.
-    fn try_from(volume: &pb::Volume) -> Result<Self, FieldError> {
+    fn try_from(volume: &pb::Volume) -> Result<Self, RequestError> {
         let resolution = resolution(volume)?;
         let pose = volume.pose.as_ref().map_or(Ok(Isometry3::identity()), |p| pose::decode(p, &POSE))?;
         let values = match volume.dtype() {
@@ -102,17 +102,6 @@ fn to_bytes<const N: usize>(values: &[f32], encode: impl Fn(f32) -> [u8; N]) -> 
     data
 }
 
-impl From<VolumeError> for FieldError {
-    fn from(error: VolumeError) -> Self {
-        let field = match error.field() {
-            "resolution" => "volume.resolution",
-            "voxel_size" => "volume.voxel_size",
-            _ => "volume.data",
-        };
-        Self { field: field.into(), message: format!("volume.{error}") }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use proptest::collection::vec;
@@ -162,7 +151,7 @@ mod tests {
     fn the_length_is_checked_without_converting_the_data() {
         let message = pb::Volume { dtype: pb::DataType::F16.into(), resolution: 256, ..Default::default() };
         let error = resolution(&message).unwrap_err();
-        assert_eq!(error.field, "volume.data");
+        assert_eq!(error.field(), "volume.data");
         assert_eq!(
             error.to_string(),
             "volume.data is 0 bytes, a resolution of 256 needs 256³ · 2 = 33554432 (DATA_TYPE_F16)"

@@ -1,4 +1,4 @@
-use grasp::Warning;
+use grasp_perception::Warning;
 
 use crate::pb;
 use crate::pb::geometry_warning::Code;

@@ -10,10 +10,9 @@ use std::thread::available_parallelism;
 use std::time::Duration;
 
 use clap::CommandFactory;
-use grasp_models::{Choice, Precision, Provider, Store};
+use grasp_engine::{Batching, Fingerprints, FolderSettings, ModelSettings, fingerprints};
+use grasp_models::{Choice, Options, Store};
 
-use crate::serving::queue::Batching;
-use crate::serving::stamps::{Stamps, stamps};
 use crate::transport::address::Address;
 use crate::transport::request_body::Limits;
 use crate::transport::tls::Tls;
@@ -25,34 +24,14 @@ pub(crate) use flags::LogFormat;
 /// The validated configuration.
 pub(crate) struct Config {
     pub store: Store,
-    /// Taken before the store's files were read.
-    pub stamps: Stamps,
-    /// Maximum size of a model file.
-    pub max_model_bytes: u64,
-    /// Time after which a reload no longer delays the next one.
-    pub reload_timeout: Duration,
-    pub default_model: Option<String>,
+    /// The model folder.
+    pub folder: FolderSettings,
     pub listen: Address,
     pub http: SocketAddr,
     /// Address of the REST listener; None without one.
     pub rest: Option<SocketAddr>,
-    /// Whether clients may load and unload models.
-    pub allow_model_control: bool,
     /// Further names of the HTTP listener.
     pub http_hosts: Vec<String>,
-    /// Sessions per model.
-    pub workers: usize,
-    /// Threads per session.
-    pub threads: usize,
-    /// Execution provider; None selects the fastest that the machine supports.
-    pub provider: Option<Provider>,
-    /// Numeric precision; None selects the fastest.
-    pub precision: Option<Precision>,
-    /// Whether networks use CUDA graphs where the provider has them.
-    pub cuda_graphs: bool,
-    /// Queued requests per model.
-    pub queue: usize,
-    pub batching: Batching,
     /// Time after which an inference counts as hanging; None disables the check.
     pub inference_timeout: Option<Duration>,
     /// Interval at which the model folder is polled; None disables polling.
@@ -115,7 +94,7 @@ impl Config {
             let needed = format_args!("is `{}`: must be at most --queue, {}", flags.max_batch, flags.queue);
             errors.add::<Flags>("max_batch", needed);
         }
-        let stamps = stamps(&flags.models);
+        let fingerprints = fingerprints(&flags.models);
         let store = Store::open_limited(&flags.models, flags.max_model_bytes);
         let store = store.inspect_err(|error| {
             errors.add::<Flags>("models", format_args!("is `{}`: {error}", flags.models.display()));
@@ -128,34 +107,40 @@ impl Config {
             })
         });
         match (store, tls.transpose()) {
-            (Ok(store), Ok(tls)) if errors.is_empty() => Ok(Self::new(flags, store, stamps, tls)),
+            (Ok(store), Ok(tls)) if errors.is_empty() => Ok(Self::new(flags, store, fingerprints, tls)),
             _ => Err(errors),
         }
     }
 
-    fn new(flags: Flags, store: Store, stamps: Stamps, tls: Option<Tls>) -> Self {
+    fn new(flags: Flags, store: Store, fingerprints: Fingerprints, tls: Option<Tls>) -> Self {
         let cpus = available_parallelism().map_or(1, NonZeroUsize::get);
-        let workers = usize::from(flags.workers);
+        let sessions = usize::from(flags.workers);
         let Choice(provider) = flags.provider;
         let Choice(precision) = flags.precision;
+        let batching = Batching { max: flags.max_batch.into(), delay: flags.batch_delay };
+        let options = Options {
+            threads: flags.threads.map_or((cpus / sessions).max(1), usize::from),
+            provider,
+            precision,
+            max_batch: batching.max,
+            cuda_graphs: !flags.no_cuda_graphs,
+        };
+        let folder = FolderSettings {
+            directory: store.directory().to_owned(),
+            fingerprints,
+            default_model: flags.default_model,
+            max_bytes: flags.max_model_bytes,
+            timeout: flags.reload_timeout,
+            is_controlled: flags.allow_model_control,
+            models: ModelSettings { sessions, options, capacity: flags.queue.into(), batching },
+        };
         Self {
             store,
-            stamps,
-            max_model_bytes: flags.max_model_bytes,
-            reload_timeout: flags.reload_timeout,
-            default_model: flags.default_model,
+            folder,
             listen: flags.listen,
             http: flags.http,
             rest: flags.rest,
-            allow_model_control: flags.allow_model_control,
             http_hosts: flags.http_host,
-            workers,
-            threads: flags.threads.map_or((cpus / workers).max(1), usize::from),
-            provider,
-            precision,
-            cuda_graphs: !flags.no_cuda_graphs,
-            queue: flags.queue.into(),
-            batching: Batching { max: flags.max_batch.into(), delay: flags.batch_delay },
             inference_timeout: Some(flags.inference_timeout).filter(|timeout| !timeout.is_zero()),
             watch: Some(flags.watch).filter(|interval| !interval.is_zero()),
             tls,

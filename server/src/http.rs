@@ -10,6 +10,7 @@ use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
+use grasp_engine::{Model, ModelRegistry};
 use serde_json::{Value, json};
 use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, watch};
@@ -17,8 +18,6 @@ use tokio_stream::wrappers::WatchStream;
 use tokio_stream::{Stream, StreamExt};
 
 use crate::readiness::State;
-use crate::serving::engine::Engine;
-use crate::serving::registry::ModelRegistry;
 use crate::telemetry::metrics::Metrics;
 use crate::telemetry::recent::RecentRequests;
 use crate::transport::http_connections::{self, HttpConfig};
@@ -97,20 +96,20 @@ fn is_own(host: &str, hosts: &[String]) -> bool {
         || hosts.iter().any(|own| own.eq_ignore_ascii_case(name))
 }
 
-const UNABLE: (StatusCode, &str) = (
+const UNHEALTHY: (StatusCode, &str) = (
     StatusCode::SERVICE_UNAVAILABLE,
     "all sessions of a model hang in an inference, or fail each one, see the log; restart the server\n",
 );
 
 fn liveness(state: State) -> impl IntoResponse {
-    if state == State::Unable { UNABLE } else { (StatusCode::OK, "ok\n") }
+    if state == State::Unhealthy { UNHEALTHY } else { (StatusCode::OK, "ok\n") }
 }
 
 fn readiness(state: State) -> impl IntoResponse {
     match state {
         State::Starting => (StatusCode::SERVICE_UNAVAILABLE, "warming up\n"),
         State::Ready => (StatusCode::OK, "ready\n"),
-        State::Unable => UNABLE,
+        State::Unhealthy => UNHEALTHY,
         State::Draining => (StatusCode::SERVICE_UNAVAILABLE, "draining\n"),
     }
 }
@@ -129,12 +128,12 @@ async fn request(Path(number): Path<u64>, Shared(pages): Shared<HttpState>) -> R
 
 /// The served models with their provider and precision.
 async fn models(Shared(pages): Shared<HttpState>) -> Json<Value> {
-    let model = |engine: &Arc<Engine>| {
+    let model = |model: &Arc<Model>| {
         json!({
-            "name": engine.source.name(),
-            "version": engine.source.version(),
-            "provider": engine.backend.provider.to_string(),
-            "precision": engine.backend.precision.to_string(),
+            "name": model.spec.name(),
+            "version": model.spec.version(),
+            "provider": model.backend.provider.to_string(),
+            "precision": model.backend.precision.to_string(),
         })
     };
     Json(pages.models.now().iter().map(model).collect())
@@ -145,7 +144,7 @@ async fn events(
     Shared(pages): Shared<HttpState>,
 ) -> Result<Sse<impl Stream<Item = Result<Event, Infallible>>>, (StatusCode, &'static str)> {
     let permit = Arc::clone(&pages.pages).try_acquire_owned();
-    let permit = permit.map_err(|_| (StatusCode::SERVICE_UNAVAILABLE, "too many pages are open; close others\n"))?;
+    let permit = permit.map_err(|_| (StatusCode::SERVICE_UNAVAILABLE, "too many open pages; close some\n"))?;
     let numbers = WatchStream::new(pages.recent.last()).map(move |number| {
         // Released when the page is closed.
         let _permit = &permit;

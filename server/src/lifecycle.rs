@@ -9,30 +9,33 @@ use std::thread::{self, available_parallelism};
 use std::time::{Duration, Instant, SystemTime};
 
 use anyhow::Context;
+use grasp_engine::{
+    FairSemaphore, Loads, ModelControl, ModelFolder, ModelRegistry, ModelSettings, Observer, SessionThreads,
+};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 use tokio::sync::{Semaphore, watch};
+use tokio::task::JoinHandle;
+use tokio_rustls::TlsAcceptor;
+use tokio_util::sync::CancellationToken;
 use tracing::{error, info, warn};
 
+use crate::api::call::Calls;
+use crate::api::grasp::GraspApi;
+use crate::api::inference::InferenceApi;
+use crate::api::rest::{self, Rest};
 use crate::config::Config;
 use crate::http::HttpState;
+use crate::open_streams::OpenStreams;
 use crate::readiness::Readiness;
-use crate::rest::Rest;
-use crate::rpc::call::Calls;
-use crate::rpc::grasp_service::GraspRpc;
-use crate::rpc::inference_service::InferenceRpc;
-use crate::serving::registry::ModelRegistry;
-use crate::serving::reload::ModelFolder;
-use crate::serving::session_threads::SessionThreads;
-use crate::serving::tracking::TrackedVolumes;
-use crate::serving::turns::Turns;
 use crate::signals::{Signals, hangup};
 use crate::telemetry::metrics::Metrics;
 use crate::telemetry::recent::RecentRequests;
 use crate::telemetry::recorder::Recorder;
 use crate::telemetry::subscriber::{self, Log, Traces};
-use crate::transport::address::Address;
+use crate::tracked_volumes::TrackedVolumes;
+use crate::transport::address::{Address, Listener};
 use crate::transport::http_connections::HttpConfig;
 use crate::transport::listener::{self, GrpcConfig};
 
@@ -99,12 +102,47 @@ fn serve_until_stopped(
     log: &Log,
     traces: &Traces,
 ) -> anyhow::Result<()> {
-    let listeners = 1 + u64::from(config.rest.is_some());
-    let connections = allow_connections(config.max_connections, listeners);
+    let metrics = Arc::new(Metrics::new(log.dropped.clone(), log.suppressed.clone()));
+    warn_about(config, &metrics);
+    let onnxruntime = grasp_models::init()?;
+    info!(version = onnxruntime.version, library = %onnxruntime.library.display(), "ONNX Runtime loaded");
+    let (recorder, recording) = match &config.record {
+        Some((folder, capacity)) => {
+            let (recorder, thread) = Recorder::start(folder, *capacity, metrics.recordings())?;
+            (recorder, Some(thread))
+        }
+        None => (Recorder::none(), None),
+    };
+    let threads = Arc::new(SessionThreads::default());
+    let process = Process {
+        config,
+        connections: allow_connections(config.max_connections, 1 + u64::from(config.rest.is_some())),
+        metrics,
+        models: Arc::default(),
+        threads: Arc::clone(&threads),
+        readiness: Readiness::starting(),
+        stopping: CancellationToken::new(),
+    };
+    let served = runtime.block_on(process.run(signals, recorder));
+    let until = Instant::now() + SHUTDOWN_TIMEOUT;
+    traces.finish();
+    // Dropping the runtime's tasks drops the models, which ends the sessions.
+    runtime.shutdown_timeout(until.saturating_duration_since(Instant::now()));
+    // ONNX Runtime may crash if the process exits during an inference.
+    threads.join(until);
+    if let Some(recording) = recording {
+        while !recording.is_finished() && Instant::now() < until {
+            thread::sleep(Duration::from_millis(1));
+        }
+    }
+    served
+}
+
+/// Warns about settings that work, but not as their user may think.
+fn warn_about(config: &Config, metrics: &Metrics) {
     for name in Config::unknown_variables() {
         warn!(name, "unknown environment variable; see `graspd --help` for the known ones");
     }
-    let metrics = Arc::new(Metrics::new(log.dropped.clone(), log.suppressed.clone()));
     if let Some(tls) = &config.tls {
         tls.warn_of_expiry(SystemTime::now());
         metrics.certificate(tls.expiry);
@@ -115,141 +153,188 @@ fn serve_until_stopped(
     if config.tokens.is_some() && config.tls.is_none() && is_reachable {
         warn!("clients send their tokens in plain text, because --token-file is set without --tls-cert");
     }
-    let onnxruntime = grasp_models::init()?;
-    info!(version = onnxruntime.version, library = %onnxruntime.library.display(), "ONNX Runtime loaded");
-    let sessions = Arc::new(SessionThreads::default());
-    let (recorder, recording) = match &config.record {
-        Some((folder, capacity)) => {
-            let (recorder, thread) = Recorder::start(folder, *capacity, metrics.recordings())?;
-            (recorder, Some(thread))
-        }
-        None => (Recorder::none(), None),
-    };
-    let served = runtime.block_on(serve(config, signals, connections, &metrics, &sessions, recorder));
-    let until = Instant::now() + SHUTDOWN_TIMEOUT;
-    traces.finish();
-    // Dropping the runtime's tasks drops the engines, which ends the sessions.
-    runtime.shutdown_timeout(until.saturating_duration_since(Instant::now()));
-    // ONNX Runtime may crash if the process exits during an inference.
-    sessions.join(until);
-    if let Some(recording) = recording {
-        while !recording.is_finished() && Instant::now() < until {
-            thread::sleep(Duration::from_millis(1));
-        }
-    }
-    served
 }
 
-/// Binds the listeners, loads the models, serves, and drains.
-async fn serve(
-    config: &Config,
-    mut signals: Signals,
-    connections: usize,
-    metrics: &Arc<Metrics>,
-    sessions: &Arc<SessionThreads>,
-    recorder: Recorder,
-) -> anyhow::Result<()> {
-    let hangup = hangup().context("cannot install a signal handler")?;
-    let grpc = config.listen.bind().await.with_context(|| format!("cannot listen on --listen {}", config.listen))?;
-    let http =
-        TcpListener::bind(config.http).await.with_context(|| format!("cannot listen on --http {}", config.http))?;
-    let rest = match config.rest {
-        None => None,
-        Some(address) => {
-            Some(TcpListener::bind(address).await.with_context(|| format!("cannot listen on --rest {address}"))?)
+/// The bound listeners.
+struct Listeners {
+    grpc: Listener,
+    http: TcpListener,
+    rest: Option<TcpListener>,
+}
+
+impl Listeners {
+    /// Binds them and announces their addresses.
+    async fn bind(config: &Config) -> anyhow::Result<Self> {
+        let grpc =
+            config.listen.bind().await.with_context(|| format!("cannot listen on --listen {}", config.listen))?;
+        let http = async |flag: &str, address: SocketAddr| {
+            TcpListener::bind(address).await.with_context(|| format!("cannot listen on {flag} {address}"))
+        };
+        let rest = match config.rest {
+            Some(address) => Some(http("--rest", address).await?),
+            None => None,
+        };
+        let http = http("--http", config.http).await?;
+        announce(&format!("grpc listening on {}", grpc.address));
+        announce(&format!("http listening on {}", http.local_addr()?));
+        if let Some(rest) = &rest {
+            announce(&format!("rest listening on {}", rest.local_addr()?));
         }
-    };
-    announce(&format!("grpc listening on {}", grpc.address));
-    announce(&format!("http listening on {}", http.local_addr()?));
-    if let Some(rest) = &rest {
-        announce(&format!("rest listening on {}", rest.local_addr()?));
+        Ok(Self { grpc, http, rest })
     }
+}
 
-    let readiness = Readiness::starting();
-    let state = readiness.subscribe();
-    let models = Arc::new(ModelRegistry::default());
-    let recent = Arc::new(RecentRequests::new(config.recent));
-    let pages = HttpState::new(Arc::clone(metrics), Arc::clone(&models), Arc::clone(&recent));
-    let Config { tls, tokens, limits, max_tracked, track_timeout, queue, .. } = config;
-    let budget = metrics.receiving(config.max_receiving_bytes);
-    let limit = metrics.connections("http", crate::http::CONNECTIONS);
-    let http_config = HttpConfig { limit, tls: None, budget: Arc::clone(&budget) };
-    let http = tokio::spawn(crate::http::serve(http, config.http_hosts.clone(), pages, http_config, state.clone()));
-    let calls = Calls::new(Arc::clone(metrics), recent, state.clone(), tokens.clone());
-    let (folder, control) =
-        ModelFolder::new(config, Arc::clone(&models), Arc::clone(sessions), Arc::clone(metrics), state.clone());
-    let loads = folder.loads();
-    // Requests that are converted and fused, one for each CPU; as many as in the queue of a model may wait.
-    let turns = Turns::new(processors(), *queue);
-    let (requests, counted) = (calls.clone(), Arc::clone(metrics));
-    let inference = InferenceRpc::new(Arc::clone(&models), requests, counted, control, Arc::clone(&turns));
-    let tracked_volumes = TrackedVolumes::new(*max_tracked, *track_timeout, metrics.tracked());
-    let at_once = config.workers * config.batching.max;
-    let service = GraspRpc::new(Arc::clone(&models), calls, tracked_volumes, recorder, turns, *queue, at_once);
-    let rest = rest.map(|listener| {
-        let (tokens, limits, metrics) = (tokens.clone(), *limits, Arc::clone(metrics));
-        let limit = metrics.connections("rest", connections);
-        let conversions = Arc::new(Semaphore::new(processors()));
-        let rest = Rest { inference: inference.clone(), tokens, limits, metrics, conversions };
-        let tls = tls.as_ref().map(|tls| tls.http.clone());
-        let config = HttpConfig { limit, tls, budget: Arc::clone(&budget) };
-        tokio::spawn(crate::rest::serve(listener, rest, config, state.clone()))
-    });
-    if let Some(tokens) = tokens {
-        tokio::spawn(Arc::clone(tokens).watch(self::hangup().context("cannot install a signal handler")?));
-    }
-    let grpc_config = GrpcConfig {
-        tls: tls.clone(),
-        tokens: tokens.clone(),
-        connections,
-        connection_age: config.max_connection_age,
-        budget,
-        limits: *limits,
-    };
-    let mut grpc =
-        tokio::spawn(listener::serve(grpc, grpc_config, service, inference, Arc::clone(metrics), state.clone()));
+/// What the process has from its start to its end.
+struct Process<'a> {
+    config: &'a Config,
+    /// Maximum number of connections of a listener.
+    connections: usize,
+    metrics: Arc<Metrics>,
+    models: Arc<ModelRegistry>,
+    threads: Arc<SessionThreads>,
+    readiness: Readiness,
+    /// Cancelled when no further model is to be loaded.
+    stopping: CancellationToken,
+}
 
-    let (is_able, mut able) = watch::channel(true);
-    let watch = Arc::clone(sessions).watch(Arc::clone(&models), config.inference_timeout, is_able);
-    let watch = tokio::spawn(watch);
-    let entries = config.store.entries().to_vec();
-    let mut loading = tokio::task::spawn_blocking(move || folder.load(&entries).map(|()| folder));
-    let loaded = tokio::select! {
-        loaded = &mut loading => Some(loaded),
-        () = signals.next() => None,
-    };
-    if let Some(folder) = loaded {
-        tokio::spawn(folder.context("the thread that loads the models panicked")??.watch(hangup, config.watch));
-        readiness.serving(true);
-        announce("ready");
-        loop {
-            tokio::select! {
-                () = signals.next() => break,
-                ended = &mut grpc => return ended?.context("the gRPC listener failed"),
-                Ok(()) = able.changed() => readiness.serving(*able.borrow_and_update()),
+/// The tasks that serve the listeners.
+struct Serving {
+    grpc: JoinHandle<anyhow::Result<()>>,
+    http: JoinHandle<()>,
+    rest: Option<JoinHandle<()>>,
+}
+
+impl Process<'_> {
+    /// Serves until a signal, and drains.
+    async fn run(self, mut signals: Signals, recorder: Recorder) -> anyhow::Result<()> {
+        let reload = hangup().context("cannot install a signal handler")?;
+        let listeners = Listeners::bind(self.config).await?;
+        let observer = Arc::clone(&self.metrics) as Arc<dyn Observer>;
+        let (models, threads) = (Arc::clone(&self.models), Arc::clone(&self.threads));
+        let folder = self.config.folder.clone();
+        let (folder, control) = ModelFolder::new(folder, models, threads, observer, self.stopping.clone());
+        let loads = folder.loads();
+        let mut serving = self.serve(listeners, control, recorder)?;
+        let (watch, mut healthy) = self.watch();
+        let entries = self.config.store.entries().to_vec();
+        let mut loading = tokio::task::spawn_blocking(move || folder.load(&entries).map(|()| folder));
+        let loaded = tokio::select! {
+            loaded = &mut loading => Some(loaded),
+            () = signals.next() => None,
+        };
+        if let Some(folder) = loaded {
+            let folder = folder.context("the thread that loads the models panicked")??;
+            tokio::spawn(folder.watch(reload, self.config.watch));
+            self.readiness.serving(true);
+            announce("ready");
+            loop {
+                tokio::select! {
+                    () = signals.next() => break,
+                    ended = &mut serving.grpc => return ended?.context("the gRPC listener failed"),
+                    Ok(()) = healthy.changed() => self.readiness.serving(*healthy.borrow_and_update()),
+                }
             }
         }
+        self.drain(serving, loads, signals).await?;
+        watch.abort();
+        Ok(())
     }
 
-    info!(timeout = ?config.drain_timeout, "draining");
-    readiness.drain();
-    let drained = async {
-        let ended = grpc.await;
-        if let Some(rest) = rest {
-            let _ = rest.await;
+    /// Starts to serve all listeners. Until the models are loaded, requests are refused.
+    fn serve(&self, listeners: Listeners, control: ModelControl, recorder: Recorder) -> anyhow::Result<Serving> {
+        let Self { config, metrics, models, readiness, .. } = self;
+        let state = readiness.subscribe();
+        let recent = Arc::new(RecentRequests::new(config.recent));
+        let budget = metrics.receiving(config.max_receiving_bytes);
+        let http_config = |name: &str, connections: usize, tls: Option<TlsAcceptor>| HttpConfig {
+            limit: metrics.connections(name, connections),
+            tls,
+            budget: Arc::clone(&budget),
+        };
+        let pages = HttpState::new(Arc::clone(metrics), Arc::clone(models), Arc::clone(&recent));
+        let of_pages = http_config("http", crate::http::CONNECTIONS, None);
+        let hosts = config.http_hosts.clone();
+        let http = tokio::spawn(crate::http::serve(listeners.http, hosts, pages, of_pages, state.clone()));
+
+        let ModelSettings { sessions, capacity, batching, .. } = config.folder.models;
+        let calls = Calls::new(Arc::clone(metrics), recent, state.clone(), config.tokens.clone());
+        // Requests that are converted and fused, one for each CPU; as many as in the queue of a model may wait.
+        let conversions = FairSemaphore::new(processors(), capacity);
+        let inference = InferenceApi::new(Arc::clone(models), calls.clone(), control, conversions.clone());
+        let rest = listeners.rest.map(|listener| {
+            let rest = Rest {
+                inference: inference.clone(),
+                tokens: config.tokens.clone(),
+                limits: config.limits,
+                metrics: Arc::clone(metrics),
+                conversions: Arc::new(Semaphore::new(processors())),
+                waiting: Arc::new(Semaphore::new(capacity)),
+            };
+            let tls = config.tls.as_ref().map(|tls| tls.http.clone());
+            let of_rest = http_config("rest", self.connections, tls);
+            tokio::spawn(rest::serve(listener, rest, of_rest, state.clone()))
+        });
+        let tracked_volumes = TrackedVolumes::new(config.max_tracked, config.track_timeout, metrics.tracked());
+        let grasps = GraspApi {
+            models: Arc::clone(models),
+            calls,
+            tracked_volumes: Arc::new(tracked_volumes),
+            recorder,
+            streams: OpenStreams::default(),
+            stall: config.limits.stall,
+            // A stream keeps the sessions busy, but never fills a queue.
+            read_ahead: (sessions * batching.max).min(capacity / 2).max(1),
+            conversions,
+        };
+        if let Some(tokens) = &config.tokens {
+            tokio::spawn(Arc::clone(tokens).watch(hangup().context("cannot install a signal handler")?));
         }
-        // ONNX Runtime may crash if the process exits while a model is loaded. The models after it are not loaded.
-        let _ = tokio::task::spawn_blocking(move || loads.wait()).await;
-        ended
-    };
-    tokio::select! {
-        ended = drained => { ended??; info!("drained") }
-        () = tokio::time::sleep(config.drain_timeout) => warn!("drain timeout: exiting with unfinished requests"),
-        () = signals.next() => warn!("second signal: exiting immediately"),
+        let grpc_config = GrpcConfig {
+            tls: config.tls.clone(),
+            tokens: config.tokens.clone(),
+            connections: self.connections,
+            connection_age: config.max_connection_age,
+            budget,
+            limits: config.limits,
+        };
+        let grpc = listener::serve(listeners.grpc, grpc_config, grasps, inference, Arc::clone(metrics), state);
+        Ok(Serving { grpc: tokio::spawn(grpc), http, rest })
     }
-    http.abort();
-    watch.abort();
-    Ok(())
+
+    /// Watches the sessions. The receiver has whether each model has a healthy one.
+    fn watch(&self) -> (JoinHandle<()>, watch::Receiver<bool>) {
+        let (sender, healthy) = watch::channel(true);
+        let models = Arc::clone(&self.models);
+        let are_healthy = move || models.now().iter().all(|model| model.is_healthy());
+        let threads = Arc::clone(&self.threads);
+        (tokio::spawn(threads.watch(are_healthy, self.config.inference_timeout, sender)), healthy)
+    }
+
+    /// Finishes the accepted requests, at most until the drain timeout or a second signal.
+    async fn drain(self, serving: Serving, loads: Loads, mut signals: Signals) -> anyhow::Result<()> {
+        info!(timeout = ?self.config.drain_timeout, "draining");
+        self.stopping.cancel();
+        self.readiness.drain();
+        let Serving { grpc, http, rest } = serving;
+        let drained = async {
+            let ended = grpc.await;
+            if let Some(rest) = rest {
+                let _ = rest.await;
+            }
+            // ONNX Runtime may crash if the process exits while a model is loaded. The models after it are not loaded.
+            let _ = tokio::task::spawn_blocking(move || loads.wait()).await;
+            ended
+        };
+        tokio::select! {
+            ended = drained => { ended??; info!("drained") }
+            () = tokio::time::sleep(self.config.drain_timeout) => {
+                warn!("drain timeout: exiting with unfinished requests");
+            }
+            () = signals.next() => warn!("second signal: exiting immediately"),
+        }
+        http.abort();
+        Ok(())
+    }
 }
 
 /// Raises the soft limit of open files, often 1024, to the hard limit. Returns the connection limit of each of the

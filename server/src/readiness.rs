@@ -1,5 +1,5 @@
+use grasp::on_a_line;
 use grasp_proto::oip::grpc_inference_service_server::SERVICE_NAME as INFERENCE;
-use grasp_proto::on_a_line;
 use grasp_proto::pb::grasp_service_server::SERVICE_NAME;
 use tokio::sync::watch;
 use tokio_stream::StreamExt;
@@ -17,8 +17,8 @@ pub(crate) enum State {
     Starting,
     /// Every session has completed an inference.
     Ready,
-    /// All sessions of a model hang in an inference, or fail each one; the other models are served. Only a restart helps.
-    Unable,
+    /// All sessions of a model hang in an inference, or fail each one; the other models are served. It ends only with a restart.
+    Unhealthy,
     /// Shutting down: accepted requests are finished, new connections and messages are not accepted.
     Draining,
 }
@@ -36,8 +36,8 @@ impl Readiness {
     }
 
     /// Sets the state while serving: whether every model has a session that neither hangs nor fails.
-    pub fn serving(&self, is_able: bool) {
-        self.0.send_replace(if is_able { State::Ready } else { State::Unable });
+    pub fn serving(&self, is_healthy: bool) {
+        self.0.send_replace(if is_healthy { State::Ready } else { State::Unhealthy });
     }
 
     /// Sets the last state and drops the sender, which ends all streams of [`Health::watch`].
@@ -85,7 +85,7 @@ fn is_known(service: &str) -> bool {
 fn serving_status(state: State) -> ServingStatus {
     match state {
         State::Ready => ServingStatus::Serving,
-        State::Starting | State::Unable | State::Draining => ServingStatus::NotServing,
+        State::Starting | State::Unhealthy | State::Draining => ServingStatus::NotServing,
     }
 }
 

@@ -5,4 +5,3 @@ pub(crate) mod metrics;
 pub(crate) mod recent;
 pub(crate) mod recorder;
 pub(crate) mod subscriber;
-pub(crate) mod timings;

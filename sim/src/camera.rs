@@ -3,8 +3,9 @@
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_3, TAU};
 use std::ops::{Range, RangeInclusive};
 
-use grasp::{DepthImage, Fusion, Intrinsics, SurfacePoint, TARGET_HEIGHT, TRAINED_ANGLE, TRAINED_DISTANCE};
+use grasp::{DepthImage, Fusion, Intrinsics, SurfacePoint};
 pub use grasp_data::raw::View;
+use grasp_perception::{TARGET_HEIGHT, TRAINED_ANGLE, TRAINED_DISTANCE, image_depth_factor};
 use nalgebra::{Isometry3, Point3, Vector3};
 use rand::seq::IndexedRandom;
 use rand::{Rng, RngExt};
@@ -143,7 +144,8 @@ pub fn observe(world: &World, views: &Views, noise: DepthNoise, rng: &mut impl R
 /// Multiplies the depths by the factor that puts the table at its height, if it is in view.
 fn correct_scale(view: &mut View) {
     let image = DepthImage::new(Intrinsics::BENCHMARK, &view.depth).expect("views are of the benchmark's camera");
-    if let Some(factor) = image.depth_factor(&view.camera_from_task, TABLE_HEIGHT, [grasp::WORKSPACE_SIZE; 2]) {
+    let extent = [grasp::WORKSPACE_SIZE; 2];
+    if let Some(factor) = image_depth_factor(&image, &view.camera_from_task, TABLE_HEIGHT, extent) {
         view.depth.iter_mut().for_each(|depth| *depth *= factor as f32);
     }
 }

@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 
 use grasp::{DecodeParams, Grasp, RESOLUTION, Volume};
 use grasp_models::{Network, Options};
-use grasp_planner::{Evaluator, Gpd, HighestProposal, NetworkPlanner, PlanParams, Planner, Scene, Shaf};
+use grasp_perception::Scene;
+use grasp_planner::{Evaluator, Gpd, HighestProposal, NetworkPlanner, PlanParams, Planner, Shaf};
 use nalgebra::Isometry3;
 use rand_chacha::ChaCha8Rng;
 
@@ -71,7 +72,7 @@ impl BenchPlanner {
             Self::Server(server) => server.plan(observation),
             Self::Local { planner, decode, reads_points } => {
                 let points = reads_points.then(|| points(&observation.views));
-                let scene = Scene { volume: observation.volume.clone(), points };
+                let scene = Scene { points, ..observation.volume.clone().into() };
                 let params = PlanParams { decode: **decode, table: Some(TABLE_HEIGHT) };
                 Ok(planner.plan(&scene, &params, &|| true)?.grasps)
             }

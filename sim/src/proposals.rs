@@ -6,7 +6,8 @@ use std::sync::{Mutex, PoisonError};
 use anyhow::Context;
 use grasp::{DecodeParams, FINGER_DEPTH, RESOLUTION};
 use grasp_data::{Occupancy, Trial};
-use grasp_planner::{PlanParams, Planner, Scene};
+use grasp_perception::Scene;
+use grasp_planner::{PlanParams, Planner};
 use nalgebra::{Isometry3, Translation3, Vector3};
 use rand::seq::IndexedRandom;
 use rand::{Rng, RngExt};
@@ -48,7 +49,7 @@ impl SceneConfig {
         else {
             return Ok(None);
         };
-        let scene = Scene { volume, points: None };
+        let scene = Scene::from(volume);
         let params = PlanParams { decode: *params, table: Some(TABLE_HEIGHT) };
         let mut planner = planner.lock().unwrap_or_else(PoisonError::into_inner);
         let proposed = planner.plan(&scene, &params, &|| true).context("the planner failed")?.grasps;

@@ -3,6 +3,7 @@
 use std::f64::consts::FRAC_PI_3;
 use std::sync::LazyLock;
 
+use grasp::pregrasp;
 use nalgebra::{Isometry3, Translation3, Vector3};
 
 use crate::physics::{BodyId, CONTACT_GAP, Gripper, HandPart, OPEN_HAND, STEPS_PER_SECOND, World};
@@ -99,7 +100,7 @@ pub fn clearance(world: &World, grasp: &Isometry3<f64>, limit: f64) -> f64 {
 pub fn execute(world: &mut World, grasp: &Isometry3<f64>) -> (Outcome, f64) {
     let touched_in = first_contact(world, grasp);
     let short_by = touched_in.map_or(0.0, distance_after);
-    match close_and_lift(world, &before(grasp, short_by), grasp, Until::TheEnd) {
+    match close_and_lift(world, &pregrasp(grasp, short_by), grasp, Until::TheEnd) {
         outcome if touched_in == Some(1) && !outcome.is_success() => (Outcome::BlockedAtPregrasp, short_by),
         outcome => (outcome, short_by),
     }
@@ -114,20 +115,15 @@ pub fn attempt(world: &World, grasp: &Isometry3<f64>) -> (Outcome, f64) {
     if touched_in == Some(1) {
         return (Outcome::BlockedAtPregrasp, short_by);
     }
-    (close_and_lift(&mut world.clone(), &before(grasp, short_by), grasp, Until::NothingIsHeld), short_by)
+    (close_and_lift(&mut world.clone(), &pregrasp(grasp, short_by), grasp, Until::NothingIsHeld), short_by)
 }
 
 /// The step of the approach in which the open hand first touches something.
 fn first_contact(world: &World, grasp: &Isometry3<f64>) -> Option<u32> {
     let steps = (PREGRASP_DISTANCE / APPROACH_STEP).round() as u32;
     let is_free = !world.is_near(&SWEPT_HAND, grasp, CONTACT_GAP);
-    let touches = |step| world.is_near(&OPEN_HAND, &before(grasp, distance_after(step) + LAG), CONTACT_GAP);
+    let touches = |step| world.is_near(&OPEN_HAND, &pregrasp(grasp, distance_after(step) + LAG), CONTACT_GAP);
     if is_free { None } else { (1..=steps).find(|&step| touches(step)) }
-}
-
-/// The grasp moved back along its approach, by `distance` metres.
-fn before(grasp: &Isometry3<f64>, distance: f64) -> Isometry3<f64> {
-    grasp * Translation3::new(0.0, 0.0, -distance)
 }
 
 /// Distance from the grasp after this many steps of the approach, metres.

@@ -1,4 +1,5 @@
-"""Tests a client generated from the .proto file against the server at GRASPD_SERVER, which serves the model "mirror".
+"""Tests a client generated from the .proto file against the server at GRASPD_SERVER, which serves the model "mirror"
+with --max-tracked 4.
 
 The crate grasp-tests (tests/it/python.rs) starts that server and runs this file. To run it separately:
     GRASPD_SERVER=127.0.0.1:50051 GRASPD_PROTO=proto/proto python -m unittest discover tests/python
@@ -7,6 +8,8 @@ The crate grasp-tests (tests/it/python.rs) starts that server and runs this file
 import os
 import sys
 import tempfile
+import threading
+import time
 import unittest
 from importlib import import_module
 
@@ -106,6 +109,23 @@ class ClientTest(unittest.TestCase):
         for index, reply in enumerate(replies):
             self.assertEqual(reply.WhichOneof("outcome"), "error" if index == 3 else "response")
         self.assertEqual(replies[3].error.code, grpc.StatusCode.NOT_FOUND.value[0])
+
+    def test_streams_that_are_refused_while_they_send_have_the_status_of_the_refusal(self):
+        sending = threading.Event()
+        self.addCleanup(sending.set)
+
+        def requests():
+            for _ in range(20):
+                yield self.pb.TrackGraspsRequest(workspace=self.pb.Workspace(frame_id="x" * 200))
+            sending.wait()
+
+        calls = [self.grasps.TrackGrasps(requests()) for _ in range(60)]
+        self.addCleanup(lambda: [call.cancel() for call in calls])
+        deadline = time.monotonic() + 20
+        while sum(not call.is_active() for call in calls) < 56 and time.monotonic() < deadline:
+            time.sleep(0.05)
+        ended = [call.code() for call in calls if not call.is_active()]
+        self.assertEqual(ended, [grpc.StatusCode.RESOURCE_EXHAUSTED] * 56)
 
     def test_errors_have_their_status_code(self):
         values = blobs()

@@ -144,7 +144,7 @@ impl<'a> TurnedHand<'a> {
         let bites = bites.take_while(|&bite| bite <= hand.depth + ROUNDING && self.is_above_table(offset, bite));
         let bite = bites.take_while(|&bite| self.is_free(&slice, offset, bite)).last()?;
 
-        let held = slice.iter().map(|point| self.in_hand(point, offset, bite)).filter(|point| hand.holds(point));
+        let held = slice.iter().map(|point| self.in_hand(point, offset, bite)).filter(|point| hand.contains(point));
         let (lower, upper) = held.fold((f64::MAX, f64::MIN), |(lower, upper), p| (lower.min(p.y), upper.max(p.y)));
         let candidate = Candidate { pose: self.pose(offset, bite), width: upper - lower, point: self.sample };
         // The palm is checked last, because its check is the slowest.
@@ -175,7 +175,7 @@ impl<'a> TurnedHand<'a> {
     fn is_free(&self, points: &[Vector3<f64>], offset: f64, bite: f64) -> bool {
         let hand = &self.params.hand;
         let mut points = points.iter().map(|point| self.in_hand(point, offset, bite));
-        points.all(|point| !hand.finger_meets(&point) && !hand.palm_meets(&point))
+        points.all(|point| !hand.finger_collides(&point) && !hand.palm_collides(&point))
     }
 }
 
@@ -184,7 +184,7 @@ fn palm_is_free(cloud: &Cloud, hand: &Hand, pose: &Isometry3<f64>) -> bool {
     let to_hand = pose.rotation.inverse().to_rotation_matrix();
     let in_hand = |point: &Point3<f64>| Point3::from(to_hand * (point.coords - pose.translation.vector));
     let mut points = cloud.in_cells(|centre, radius| hand.comes_near(&in_hand(centre), 0.0, radius));
-    points.all(|point| !hand.palm_meets(&in_hand(&point.position)))
+    points.all(|point| !hand.palm_collides(&in_hand(&point.position)))
 }
 
 #[cfg(test)]
@@ -247,8 +247,8 @@ mod tests {
         for candidate in &found {
             assert!(hand.lowest_point(&candidate.pose) >= TABLE);
             let mut points = cloud.points().iter().map(|p| candidate.pose.inverse_transform_point(&p.position));
-            assert!(points.clone().all(|point| !hand.finger_meets(&point) && !hand.palm_meets(&point)));
-            assert!(points.any(|point| hand.holds(&point)), "a point is between the fingers");
+            assert!(points.clone().all(|point| !hand.finger_collides(&point) && !hand.palm_collides(&point)));
+            assert!(points.any(|point| hand.contains(&point)), "a point is between the fingers");
             assert!(aperture.contains(&candidate.width));
         }
         let params = Params::above(TABLE + 0.06);
@@ -270,7 +270,7 @@ mod tests {
             params.hand.lowest_point(&pose) >= params.lowest
                 && near.iter().map(|point| pose.inverse_transform_point(point)).all(|point| {
                     point.x.abs() > params.hand.height / 2.0
-                        || !params.hand.finger_meets(&point) && !params.hand.palm_meets(&point)
+                        || !params.hand.finger_collides(&point) && !params.hand.palm_collides(&point)
                 })
         };
         let free: Vec<f64> = hand.offsets().filter(|&offset| is_free(offset, params.bite)).collect();
@@ -278,9 +278,9 @@ mod tests {
         let bites = (0..9).map(|step| params.bite + f64::from(step) * params.deepening);
         let bite = bites.take_while(|&bite| bite <= params.hand.depth + 1e-9 && is_free(offset, bite)).last()?;
         let pose = hand.pose(offset, bite);
-        let held = in_hand(pose).filter(|point| params.hand.holds(point)).map(|point| point.y);
+        let held = in_hand(pose).filter(|point| params.hand.contains(point)).map(|point| point.y);
         let width = held.clone().fold(f64::MIN, f64::max) - held.fold(f64::MAX, f64::min);
-        let is_free = in_hand(pose).all(|point| !params.hand.palm_meets(&point));
+        let is_free = in_hand(pose).all(|point| !params.hand.palm_collides(&point));
         (is_free && params.aperture.contains(&width)).then_some(Candidate { pose, width, point: hand.sample })
     }
 

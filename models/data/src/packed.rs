@@ -13,9 +13,7 @@
 //! | N³ per volume | [`quantise`]d values, `[x][y][z]` |
 //! | ⌈N³ / 8⌉ per occupancy | a bit per voxel, least significant first: whether its centre is inside an object |
 //!
-//! Up to version 3 a record has no occupancy, nor the number of them. In versions 1 and 2 a trial has 33 bytes, without
-//! share and clearance: the share is 1 for a success and 0 for a failure, and the clearance is unknown. Version 1 has no
-//! yaws either. A folder may hold files of several versions.
+//! Files of other versions are refused: `grasp-sim label` makes the scenes again from the folder's `setup.json`.
 //!
 //! All numbers are little-endian. Readers ignore an incomplete record at the end of a file. A run that continues after
 //! an interruption starts a new file, so that a file that is mapped by a reader never shrinks.
@@ -38,9 +36,10 @@ const HEADER: usize = 16;
 const PREFIX: usize = 8;
 /// Bytes of the number of the scene and the counts after it.
 const COUNTS: usize = 20;
-/// Bytes of a trial in the current version, and in versions 1 and 2.
+/// Bytes of a trial.
 const TRIAL_SIZE: usize = 41;
-const SHORT_TRIAL_SIZE: usize = 33;
+/// Largest edge of a volume, voxels: larger ones would fill the memory of every reader.
+const MAX_EDGE: usize = 256;
 
 /// Size at which the writer starts the next file, bytes.
 const FILE_SIZE: u64 = 1 << 30;
@@ -166,18 +165,8 @@ struct PackFile {
     path: PathBuf,
     map: Mmap,
     edge: usize,
-    layout: Layout,
     /// End of the last complete record.
     end: usize,
-}
-
-/// Sizes of the parts of a record, which depend on the version.
-#[derive(Clone, Copy)]
-struct Layout {
-    /// Bytes of the number of the scene and the counts.
-    counts: usize,
-    /// Bytes per trial.
-    trial_size: usize,
 }
 
 /// Location of a scene in its file. Checksum and lengths are valid.
@@ -223,9 +212,9 @@ impl Reader {
                 continue;
             }
             let map = map(&path)?;
-            let (edge, layout) = check_header(&path, &map)?;
+            let edge = check_header(&path, &map)?;
             let end = known.map_or(HEADER, |file| file.end);
-            let mut file = PackFile { path, map, edge, layout, end };
+            let mut file = PackFile { path, map, edge, end };
             // Offsets of earlier records stay valid.
             self.scenes.extend(file.read_appended(index)?);
             match self.files.get_mut(index) {
@@ -277,7 +266,7 @@ impl Reader {
         let scene = &self.scenes[index];
         let file = &self.files[scene.file];
         let size = file.edge.pow(3);
-        &file.map[scene.start + scene.trials * file.layout.trial_size + observation * size..][..size]
+        &file.map[scene.start + scene.trials * TRIAL_SIZE + observation * size..][..size]
     }
 
     /// The voxels inside the objects of scene `index`, if they are known.
@@ -286,7 +275,7 @@ impl Reader {
         let scene = &self.scenes[index];
         let file = &self.files[scene.file];
         let voxels = file.edge.pow(3);
-        let start = scene.start + scene.trials * file.layout.trial_size + scene.volumes * voxels;
+        let start = scene.start + scene.trials * TRIAL_SIZE + scene.volumes * voxels;
         let bytes = scene.has_occupancy.then(|| &file.map[start..][..Occupancy::size(voxels)])?;
         Occupancy::from_bytes(bytes, voxels)
     }
@@ -296,27 +285,20 @@ impl Reader {
     pub fn trials(&self, index: usize) -> Vec<Trial> {
         let scene = &self.scenes[index];
         let file = &self.files[scene.file];
-        let size = file.layout.trial_size;
-        file.map[scene.start..][..scene.trials * size].chunks_exact(size).map(parse_trial).collect()
+        file.map[scene.start..][..scene.trials * TRIAL_SIZE].chunks_exact(TRIAL_SIZE).map(parse_trial).collect()
     }
 }
 
-/// Parses a trial of either length.
 fn parse_trial(bytes: &[u8]) -> Trial {
     let [x, y, z, qx, qy, qz, qw, width] = std::array::from_fn(|i| f64::from(f32_at(bytes, 4 * i)));
-    let success = bytes[32] & 1 != 0;
-    let [share, clearance] = match bytes.len() {
-        SHORT_TRIAL_SIZE => [if success { 1.0 } else { 0.0 }, 0.0],
-        _ => [f32_at(bytes, 33), f32_at(bytes, 37)],
-    };
     Trial {
         position: Point3::new(x, y, z),
         rotation: UnitQuaternion::from_quaternion(Quaternion::new(qw, qx, qy, qz)),
         width,
-        success,
+        success: bytes[32] & 1 != 0,
         yaws: bytes[32] & !1,
-        share,
-        clearance,
+        share: f32_at(bytes, 33),
+        clearance: f32_at(bytes, 37),
     }
 }
 
@@ -335,14 +317,13 @@ impl PackFile {
             if crc32fast::hash(content) != checksum {
                 return Err(damaged("the checksum of a scene does not match".to_owned()));
             }
-            let Layout { counts, trial_size } = self.layout;
-            if length < counts {
+            if length < COUNTS {
                 return Err(damaged(format!("a scene of {length} bytes is too short")));
             }
-            let count = |offset: usize| if offset < counts { u32_at(content, offset) as usize } else { 0 };
-            let [trials, volumes, occupancies] = [8, 12, 16].map(count);
+            let [trials, volumes, occupancies] = [8, 12, 16].map(|offset| u32_at(content, offset) as usize);
             let voxels = self.edge.pow(3);
-            let size = counts + trials * trial_size + volumes * voxels + occupancies * Occupancy::size(voxels);
+            // Fits: the counts have 32 bits, and a volume at most 2²⁴ voxels.
+            let size = COUNTS + trials * TRIAL_SIZE + volumes * voxels + occupancies * Occupancy::size(voxels);
             if occupancies > 1 || length != size {
                 return Err(damaged(format!(
                     "a scene of {trials} trials, {volumes} volumes and {occupancies} occupancies cannot have {length} \
@@ -350,7 +331,7 @@ impl PackFile {
                 )));
             }
             let number = u64::from(u32_at(content, 0)) | u64::from(u32_at(content, 4)) << 32;
-            let (start_of_trials, has_occupancy) = (start + counts, occupancies > 0);
+            let (start_of_trials, has_occupancy) = (start + COUNTS, occupancies > 0);
             scenes.push(SceneLocation {
                 file,
                 number,
@@ -366,20 +347,23 @@ impl PackFile {
     }
 }
 
-/// Edge of the volumes of a file, and the layout of its records.
-fn check_header(path: &Path, bytes: &[u8]) -> Result<(usize, Layout), DataError> {
+/// Edge of the volumes of a file.
+fn check_header(path: &Path, bytes: &[u8]) -> Result<usize, DataError> {
     let damaged = |reason: String| DataError::Damaged { path: path.to_owned(), offset: 0, reason };
     if &bytes[..8] != MAGIC {
         return Err(damaged("the file does not begin with `graspack`".to_owned()));
     }
-    const SHORT_COUNTS: usize = 16;
-    let layout = match u32_at(bytes, 8) {
-        1 | 2 => Layout { counts: SHORT_COUNTS, trial_size: SHORT_TRIAL_SIZE },
-        3 => Layout { counts: SHORT_COUNTS, trial_size: TRIAL_SIZE },
-        VERSION => Layout { counts: COUNTS, trial_size: TRIAL_SIZE },
-        version => return Err(damaged(format!("the version is {version}, must be from 1 to {VERSION}"))),
-    };
-    Ok((u32_at(bytes, 12) as usize, layout))
+    let (version, edge) = (u32_at(bytes, 8), u32_at(bytes, 12) as usize);
+    if version != VERSION {
+        return Err(damaged(format!(
+            "the version is {version}, must be {VERSION}; make the scenes again with `grasp-sim label` and the settings in \
+             setup.json"
+        )));
+    }
+    if edge > MAX_EDGE {
+        return Err(damaged(format!("the edge of a volume is {edge} voxels, must be at most {MAX_EDGE}")));
+    }
+    Ok(edge)
 }
 
 #[expect(

@@ -98,47 +98,6 @@ fn packed_scenes_round_trip() {
     }
 }
 
-/// A file with one scene in an earlier version, whose trials end after the flags.
-fn of_version(version: u8, bytes: &[u8], trials: usize) -> Vec<u8> {
-    let (header, record) = bytes.split_at(16);
-    // Without the number of occupancies.
-    let (counts, rest) = (&record[8..24], &record[28..]);
-    let (tried, volumes) = rest.split_at(41 * trials);
-    let size = if version < 3 { 33 } else { 41 };
-    let tried: Vec<u8> = tried.chunks_exact(41).flat_map(|trial| &trial[..size]).copied().collect();
-    let content = [counts, &tried, volumes].concat();
-    let prefix = [(content.len() as u32).to_le_bytes(), crc32fast::hash(&content).to_le_bytes()].concat();
-    let mut header = header.to_vec();
-    header[8] = version;
-    [header, prefix, content].concat()
-}
-
-#[test]
-fn earlier_versions_of_the_packed_format_are_read() {
-    for (version, yaws) in [(1, 0), (2, 0b1_0010), (3, 0b1_0010)] {
-        let folder = tempfile::tempdir().unwrap();
-        let written: Vec<Trial> = trials(0).into_iter().map(|trial| Trial { yaws, ..trial }).collect();
-        packed::Writer::open(folder.path(), &setup()).unwrap().append(0, &volumes(0), &written, None).unwrap();
-        let path = folder.path().join("scenes-00000.pack");
-        let bytes = fs::read(&path).unwrap();
-        fs::write(&path, of_version(version, &bytes, 2)).unwrap();
-        // A continued run writes the current version.
-        pack(folder.path(), [0, 1]);
-        let dataset = Dataset::open(&[folder.path().to_owned()]).unwrap();
-        let share = |success| if success { 1.0 } else { 0.0 };
-        let known = |trial: &Trial| match version {
-            1 | 2 => Trial { share: share(trial.success), clearance: 0.0, ..*trial },
-            _ => *trial,
-        };
-        assert_same(&dataset.trials(0), &written.iter().map(known).collect::<Vec<_>>());
-        assert_eq!((dataset.occupancy(0), dataset.occupancy(1)), (None, Some(occupancy(1))));
-        assert_eq!(dataset.trials(0)[0].yaws, yaws, "version {version}");
-        assert_eq!(dataset.volume(0, 1), grasp_data::quantise(&volumes(0)[1]));
-        assert_same(&dataset.trials(1), &trials(1));
-        assert_eq!(dataset.volume(1, 0), grasp_data::quantise(&volumes(1)[0]));
-    }
-}
-
 #[test]
 fn a_scene_that_was_observed_again_counts_once() {
     let scene = |id: &str, trials: Vec<Trial>, seen: u64| {
@@ -220,7 +179,9 @@ fn errors_name_the_damaged_file() {
     pack(folder.path(), [0, 1]);
     let path = folder.path().join("scenes-00000.pack");
     let good = fs::read(&path).unwrap();
-    for (at, expected) in [(0, "does not begin with"), (8, "version"), (600, "checksum")] {
+    for (at, expected) in
+        [(0, "does not begin with"), (8, "make the scenes again"), (15, "at most 256"), (600, "checksum")]
+    {
         let mut bad = good.clone();
         bad[at] ^= 0x10;
         fs::write(&path, bad).unwrap();

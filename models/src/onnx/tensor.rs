@@ -88,10 +88,12 @@ impl TensorProto {
         }
     }
 
-    /// Number of values, from the shape.
+    /// Number of values, from the shape. Of a shape that no tensor can have (a dimension is negative, or there are too many
+    /// values) it is a number that no file reaches.
     #[must_use]
     pub fn elements(&self) -> usize {
-        self.dims.iter().map(|&dim| usize::try_from(dim).unwrap_or(0)).product()
+        let count = |product: usize, &dim: &i64| product.checked_mul(usize::try_from(dim).ok()?);
+        self.dims.iter().try_fold(1, count).unwrap_or(usize::MAX)
     }
 
     /// Element type; `Undefined` if the number is not an element type of ONNX.

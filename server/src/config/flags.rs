@@ -227,7 +227,7 @@ pub(super) struct Flags {
     pub max_message_bytes: NonZeroUsize,
 
     /// Maximum number of received bytes of messages that are not complete yet, on all connections together. Messages
-    /// beyond it are refused. A connection may use half of what the others leave.
+    /// beyond it are refused. A client address may use half of what the others leave.
     #[arg(long, env = "GRASPD_MAX_RECEIVING_BYTES", value_name = "N", default_value = "268435456")]
     pub max_receiving_bytes: NonZeroUsize,
 

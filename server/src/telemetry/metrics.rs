@@ -3,7 +3,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use grasp_proto::Priority;
+use grasp::Priority;
+use grasp_engine::{ModelLabels, ModelObserver, Observer, Refusal, Reload, StageTimings};
 use grasp_proto::pb::geometry_warning::Code as WarningCode;
 use prometheus::core::Collector;
 #[cfg(target_os = "linux")]
@@ -16,7 +17,6 @@ use tonic::Code;
 use tracing_appender::non_blocking::ErrorCounter;
 
 use crate::readiness::State;
-use crate::telemetry::timings::StageTimings;
 use crate::transport::connections::ConnectionLimit;
 use crate::transport::receive_budget::ReceiveBudget;
 
@@ -68,31 +68,96 @@ pub(crate) struct Metrics {
 const RETENTION: Duration = Duration::from_mins(10);
 
 /// The metrics of a model's queue.
-pub(crate) struct QueueMetrics {
+struct QueueMetrics {
     /// Queued requests.
-    pub waiting: IntGauge,
+    waiting: IntGauge,
     /// Volumes per batch.
-    pub batch: Histogram,
-    pub refused: RefusalCounters,
+    batch: Histogram,
+    /// The queue was full; the reply would have been too late; another request took their place.
+    refused: [IntCounter; 3],
     /// Accepted scenes, by [`Priority`].
-    pub queued: [IntCounter; 2],
+    queued: [IntCounter; 2],
     /// Sessions whose inference does not end.
-    pub hanging: IntGauge,
+    hanging: IntGauge,
 }
 
-/// Counters of the requests that a queue refuses.
-pub(crate) struct RefusalCounters {
-    /// The queue was full.
-    pub full: IntCounter,
-    /// The reply would have been too late.
-    pub too_late: IntCounter,
-    /// Another request took their place.
-    pub displaced: IntCounter,
+impl ModelObserver for QueueMetrics {
+    fn waiting(&self, more: i64) {
+        self.waiting.add(more);
+    }
+
+    fn accepted(&self, priority: Priority, scenes: usize) {
+        self.queued[priority as usize].inc_by(scenes as u64);
+    }
+
+    fn refused(&self, reason: Refusal) {
+        self.refused[reason as usize].inc();
+    }
+
+    fn batch(&self, scenes: usize) {
+        self.batch.observe(scenes as f64);
+    }
+
+    fn hanging(&self, more: i64) {
+        self.hanging.add(more);
+    }
 }
 
-/// The labels of `graspd_model_info`: model, provider, precision and file hash.
-#[derive(PartialEq, Eq)]
-pub(crate) struct ModelLabels(pub [String; 4]);
+impl Observer for Metrics {
+    fn model(&self, label: &str) -> Arc<dyn ModelObserver> {
+        self.retired().retain(|(retired, _)| retired != label);
+        for (stage, _) in StageTimings::default().stages() {
+            self.stages.with_label_values(&[label, stage]);
+        }
+        for code in [Code::Ok, Code::Internal, Code::ResourceExhausted, Code::DeadlineExceeded, Code::Cancelled] {
+            self.requests.with_label_values(&[label, code_name(code)]);
+        }
+        for code in 1.. {
+            let Ok(code) = WarningCode::try_from(code) else { break };
+            self.warnings.with_label_values(&[label, warning_name(code)]);
+        }
+        Arc::new(QueueMetrics {
+            // In the order of the enumerations.
+            queued: ["NORMAL", "BATCH"].map(|priority| self.queued.with_label_values(&[label, priority])),
+            refused: ["full", "deadline", "displaced"].map(|reason| self.refused.with_label_values(&[label, reason])),
+            waiting: self.waiting.with_label_values(&[label]),
+            batch: self.batches.with_label_values(&[label]),
+            hanging: self.hanging.with_label_values(&[label]),
+        })
+    }
+
+    fn replaced(&self, before: &[ModelLabels], now: &[ModelLabels]) {
+        for labels in now {
+            self.models.with_label_values(&values(labels)).set(1);
+        }
+        let mut retired = self.retired();
+        for labels in before.iter().filter(|labels| !now.contains(labels)) {
+            // Fails only if the series does not exist.
+            let _ = self.models.remove_label_values(&values(labels));
+            // A file with the same name and version continues the series.
+            if !now.iter().any(|other| other.model == labels.model) {
+                retired.push((labels.model.clone(), Instant::now()));
+            }
+        }
+    }
+
+    fn reloaded(&self, outcome: Reload) {
+        let name = match outcome {
+            Reload::Read { rejected: 0 } => "ok",
+            Reload::Read { .. } | Reload::Failed => "failed",
+            Reload::Superseded => "superseded",
+        };
+        self.reloads.with_label_values(&[name]).inc();
+        if let Reload::Read { rejected } = outcome {
+            self.rejected.set(rejected as i64);
+        }
+    }
+}
+
+/// The labels of `graspd_model_info`.
+fn values(ModelLabels { model, provider, precision, sha256 }: &ModelLabels) -> [&str; 4] {
+    [model, provider, precision, sha256]
+}
 
 impl Metrics {
     /// Content type of [`render`](Self::render).
@@ -207,50 +272,9 @@ impl Metrics {
         self.requests.with_label_values(&[model, code_name(code)]).inc();
     }
 
-    /// Number and sum, seconds, of the durations of a stage.
-    pub fn stage(&self, model: &str, stage: &str) -> (u64, f64) {
-        let durations = self.stages.with_label_values(&[model, stage]);
-        (durations.get_sample_count(), durations.get_sample_sum())
-    }
-
-    /// Number of the batches of a model, and of the volumes in them.
-    pub fn batches(&self, model: &str) -> (u64, u64) {
-        let sizes = self.batches.with_label_values(&[model]);
-        // Exact: a sum of whole numbers.
-        (sizes.get_sample_count(), sizes.get_sample_sum() as u64)
-    }
-
-    /// Number of the requests for a model that have ended without a result.
-    pub fn failures(&self, model: &str) -> u64 {
-        let families = self.requests.collect();
-        let series = families.iter().flat_map(|family| family.get_metric());
-        let has = |metric: &prometheus::proto::Metric, name: &str, value: &str| {
-            metric.get_label().iter().any(|label| label.name() == name && label.value() == value)
-        };
-        let failed = series.filter(|metric| has(metric, "model", model) && !has(metric, "code", code_name(Code::Ok)));
-        failed.map(|metric| metric.get_counter().get_value() as u64).sum()
-    }
-
     /// Counts a warning in a response.
     pub fn warned(&self, model: &str, code: WarningCode) {
         self.warnings.with_label_values(&[model, warning_name(code)]).inc();
-    }
-
-    /// Updates `graspd_model_info` after the served models have changed.
-    pub fn replaced(&self, before: &[ModelLabels], now: &[ModelLabels]) {
-        for ModelLabels(labels) in now {
-            self.models.with_label_values(labels).set(1);
-        }
-        let mut retired = self.retired();
-        for ModelLabels(labels) in before.iter().filter(|labels| !now.contains(labels)) {
-            // Fails only if the series does not exist.
-            let _ = self.models.remove_label_values(&labels.each_ref().map(String::as_str));
-            let [model, ..] = labels;
-            // A file with the same name and version continues the series.
-            if !now.iter().any(|ModelLabels([other, ..])| other == model) {
-                retired.push((model.clone(), Instant::now()));
-            }
-        }
     }
 
     /// Removes the series of the models that are no longer served for a while.
@@ -279,49 +303,6 @@ impl Metrics {
 
     fn retired(&self) -> MutexGuard<'_, Vec<(String, Instant)>> {
         self.retired.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Records a reload of the model folder: the number of files that could not be loaded, or an error if the folder
-    /// could not be read.
-    pub fn reloaded(&self, outcome: Result<usize, ()>) {
-        let name = if outcome == Ok(0) { "ok" } else { "failed" };
-        self.reloads.with_label_values(&[name]).inc();
-        if let Ok(rejected) = outcome {
-            self.rejected.set(rejected as i64);
-        }
-    }
-
-    /// Records a reload that changed nothing, because a later one had begun.
-    pub fn superseded(&self) {
-        self.reloads.with_label_values(&["superseded"]).inc();
-    }
-
-    /// The metrics of a model's queue.
-    pub fn queue(&self, model: &str) -> QueueMetrics {
-        self.retired().retain(|(retired, _)| retired != model);
-        for (stage, _) in StageTimings::default().stages() {
-            self.stages.with_label_values(&[model, stage]);
-        }
-        for code in [Code::Ok, Code::Internal, Code::ResourceExhausted, Code::DeadlineExceeded, Code::Cancelled] {
-            self.requests.with_label_values(&[model, code_name(code)]);
-        }
-        for code in 1.. {
-            let Ok(code) = WarningCode::try_from(code) else { break };
-            self.warnings.with_label_values(&[model, warning_name(code)]);
-        }
-        let refused = |reason| self.refused.with_label_values(&[model, reason]);
-        QueueMetrics {
-            queued: [Priority::Normal, Priority::Batch]
-                .map(|priority| self.queued.with_label_values(&[model, priority_name(priority)])),
-            refused: RefusalCounters {
-                full: refused("full"),
-                too_late: refused("deadline"),
-                displaced: refused("displaced"),
-            },
-            waiting: self.waiting.with_label_values(&[model]),
-            batch: self.batches.with_label_values(&[model]),
-            hanging: self.hanging.with_label_values(&[model]),
-        }
     }
 
     /// A limit on the open connections of a listener (`grpc`, `http` or `rest`), with its metrics.
@@ -387,11 +368,6 @@ fn remove(metric: &dyn Collector, model: &str, series: impl Fn(&HashMap<&str, &s
     }
 }
 
-/// The name of a priority without its prefix: `NORMAL` or `BATCH`.
-fn priority_name(priority: Priority) -> &'static str {
-    priority.as_str_name().trim_start_matches("PRIORITY_")
-}
-
 /// The name of a warning's code without its prefix, for example `TABLE_TILTED`.
 fn warning_name(code: WarningCode) -> &'static str {
     code.as_str_name().trim_start_matches("CODE_")
@@ -430,10 +406,13 @@ mod tests {
     #[test]
     fn the_series_of_a_model_that_is_no_longer_served_are_removed_after_a_while() {
         let metrics = metrics();
-        let labels = |model: &str| ModelLabels([model, "cpu", "fp32", "0"].map(str::to_owned));
+        let labels = |model: &str| {
+            let [provider, precision, sha256] = ["cpu", "fp32", "0"].map(str::to_owned);
+            ModelLabels { model: model.to_owned(), provider, precision, sha256 }
+        };
         let served = [labels("a 1"), labels("b 1")];
-        for ModelLabels([model, ..]) in &served {
-            metrics.queue(model);
+        for ModelLabels { model, .. } in &served {
+            metrics.model(model);
             metrics.succeeded(model, &StageTimings::default(), 3);
         }
         metrics.replaced(&[], &served);
@@ -451,7 +430,7 @@ mod tests {
 
         // A model that returns in time keeps its series.
         metrics.replaced(&served[1..], &[]);
-        metrics.queue("b 1");
+        metrics.model("b 1");
         metrics.remove_retired(soon + RETENTION);
         assert_eq!(mentions("b 1"), b - 1);
     }

@@ -3,14 +3,13 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use grasp::{Fusion, Volume};
+use grasp_engine::{Detected, StageTimings};
 use nalgebra::{Isometry3, Translation3, Vector3};
 use serde_json::{Value, json};
 use tokio::sync::watch;
 use tonic::Code;
 
-use crate::serving::detection::Detected;
 use crate::telemetry::metrics::code_name;
-use crate::telemetry::timings::StageTimings;
 
 /// The latest requests, for the web page.
 pub(crate) struct RecentRequests {
@@ -58,6 +57,22 @@ pub(crate) struct Shown {
     finger_depth: f64,
     /// Signs that the geometry of the request is wrong.
     warnings: Vec<String>,
+}
+
+impl Outcome {
+    /// The timings of a success.
+    pub fn timings(&self) -> Option<StageTimings> {
+        match self {
+            Self::Detected(shown) => Some(shown.timings),
+            Self::Scored(timings) | Self::Inferred(timings) => Some(*timings),
+            Self::Refused { .. } => None,
+        }
+    }
+
+    /// Number of detected grasps.
+    pub fn grasps(&self) -> usize {
+        if let Self::Detected(shown) = self { shown.grasps.len() } else { 0 }
+    }
 }
 
 impl Shown {

@@ -11,15 +11,15 @@ use std::thread::{self, JoinHandle};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::Context;
+use grasp::{Code, RequestError};
 use grasp_proto::pb;
 use grasp_proto::pb::recording::{Answer, Request};
 use prometheus::IntCounterVec;
 use prost::Message;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
-use tonic::Code;
 use tracing::warn;
 
-use crate::serving::refusal::Refusal;
+use crate::api::status::message;
 
 /// Recordings that wait to be written, and their bytes. Further ones are dropped and counted, so that a slow disk delays
 /// no reply and fills no memory.
@@ -47,7 +47,13 @@ struct Writer {
 type Waiting = (pb::Recording, OwnedSemaphorePermit);
 
 /// A request that will be recorded with its answer.
-pub(crate) struct Pending(Option<(Arc<Writer>, pb::Recording)>);
+pub(crate) struct Recording<T>(Option<Pending<T>>);
+
+struct Pending<T> {
+    writer: Arc<Writer>,
+    recording: pb::Recording,
+    answer: fn(&T) -> Answer,
+}
 
 impl Recorder {
     /// Records nothing.
@@ -73,34 +79,36 @@ impl Recorder {
         Ok((Self(Some(Arc::new(Writer { recordings, bytes, outcomes }))), thread))
     }
 
-    /// A request, which is copied only if it will be recorded. The copy shares the data of images and volumes.
-    pub fn request(&self, request: impl FnOnce() -> Request) -> Pending {
-        Pending(self.0.as_ref().map(|writer| {
+    /// A request, which is copied only if it will be recorded. The copy shares the data of images and volumes. `answer`
+    /// makes the recorded answer from a response.
+    pub fn request<T>(&self, request: impl FnOnce() -> Request, answer: fn(&T) -> Answer) -> Recording<T> {
+        Recording(self.0.as_ref().map(|writer| {
             let received = Some(SystemTime::now().into());
-            (Arc::clone(writer), pb::Recording { received, request: Some(request()), answer: None })
+            let recording = pb::Recording { received, request: Some(request()), answer: None };
+            Pending { writer: Arc::clone(writer), recording, answer }
         }))
     }
 }
 
-impl Pending {
+impl<T> Recording<T> {
     /// Is not recorded.
     pub fn none() -> Self {
         Self(None)
     }
 
     /// Records the request with its answer.
-    pub fn answered<T>(self, outcome: &Result<T, Refusal>, answer: impl FnOnce(&T) -> Answer) {
-        let Self(Some((writer, mut recording))) = self else { return };
-        // They depend on the load, not on the request, and would displace those that depend on it.
-        let is_overload = |refusal: &Refusal| {
-            matches!(refusal.code(), Code::ResourceExhausted | Code::Unavailable | Code::DeadlineExceeded)
+    pub fn answered(self, outcome: &Result<T, RequestError>) {
+        let Self(Some(Pending { writer, mut recording, answer })) = self else { return };
+        // Refusals of an overloaded server do not depend on the request, and would displace recordings that do.
+        let is_overload = |error: &RequestError| {
+            matches!(error.code, Code::ResourceExhausted | Code::Unavailable | Code::DeadlineExceeded)
         };
         if outcome.as_ref().is_err_and(is_overload) {
             return;
         }
         recording.answer = Some(match outcome {
             Ok(response) => answer(response),
-            Err(refusal) => Answer::Error(refusal.into()),
+            Err(error) => Answer::Error(message(error)),
         });
         let bytes = recording.encoded_len().min(WAITING_BYTES);
         let permit = u32::try_from(bytes).ok();
@@ -177,7 +185,7 @@ impl Files {
         while self.bytes > self.capacity
             && let Some((oldest, bytes)) = self.known.pop_front()
         {
-            // Also if it cannot be removed: the next one is then removed instead.
+            // Subtracted although the removal may fail: then the next one is removed instead.
             self.bytes -= bytes;
             match fs::remove_file(oldest) {
                 // It was removed before.

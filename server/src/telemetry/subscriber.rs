@@ -22,7 +22,7 @@ use tracing_subscriber::{EnvFilter, Layer};
 
 use crate::config::{Config, LogFormat};
 use crate::telemetry::log_rate::LogRate;
-use crate::telemetry::timings::StageTimings;
+use grasp_engine::StageTimings;
 
 /// Service name in traces.
 const NAME: &str = env!("CARGO_PKG_NAME");

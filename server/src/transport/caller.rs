@@ -2,42 +2,30 @@
 
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 
+use grasp_engine::Caller;
 use http::Extensions;
 
 use crate::transport::connections::Peer;
 
-/// The sender of a request: callers share the server fairly.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Caller {
-    /// SHA-256 of the access token.
-    Token([u8; 32]),
-    /// The address of the client; of IPv6 the network of 64 bits, because a client can use all of its addresses.
-    Address(IpAddr),
-    Unknown,
+/// The caller of a request: by its token if the server checks tokens, otherwise by its address.
+pub(crate) fn of(extensions: &Extensions) -> Caller {
+    let by_address = || Peer::of(extensions).and_then(|peer| peer.address).map_or(Caller::Unknown, at);
+    extensions.get().copied().unwrap_or_else(by_address)
 }
 
-impl Caller {
-    /// The caller of a request: by its token if the server checks tokens, otherwise by its address.
-    pub fn of(extensions: &Extensions) -> Self {
-        let by_address = || Peer::of(extensions).and_then(|peer| peer.address).map_or(Self::Unknown, Self::at);
-        extensions.get().copied().unwrap_or_else(by_address)
-    }
-
-    fn at(address: SocketAddr) -> Self {
-        Self::Address(match address.ip().to_canonical() {
-            IpAddr::V6(address) => IpAddr::V6(Ipv6Addr::from_bits(address.to_bits() >> 64 << 64)),
-            address => address,
-        })
-    }
+fn at(address: SocketAddr) -> Caller {
+    Caller::Address(match address.ip().to_canonical() {
+        IpAddr::V6(address) => IpAddr::V6(Ipv6Addr::from_bits(address.to_bits() >> 64 << 64)),
+        address => address,
+    })
 }
 
 #[cfg(test)]
 mod tests {
-    use super::*;
 
     #[test]
     fn a_caller_by_address_is_an_ipv4_address_or_an_ipv6_network() {
-        let at = |address: &str| Caller::at(address.parse().unwrap());
+        let at = |address: &str| super::at(address.parse().unwrap());
         assert_eq!(at("10.0.0.1:1000"), at("10.0.0.1:2000"));
         assert_eq!(at("10.0.0.1:1000"), at("[::ffff:10.0.0.1]:1000"));
         assert_ne!(at("10.0.0.1:1000"), at("10.0.0.2:1000"));

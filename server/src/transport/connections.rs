@@ -16,7 +16,7 @@ use tonic::transport::server::Connected;
 use tracing::warn;
 
 use crate::transport::address::{Listener, Socket, peer};
-use crate::transport::receive_budget::{ConnectionShare, ReceiveBudget};
+use crate::transport::receive_budget::{PeerShare, ReceiveBudget};
 
 /// The limit on the open connections of a listener, with its metrics.
 #[derive(Clone)]
@@ -109,7 +109,7 @@ impl<T: AsyncRead + AsyncWrite + Unpin> Bytes for T {}
 pub(crate) struct Peer {
     /// None for UNIX sockets, or if the connection has ended already.
     pub address: Option<SocketAddr>,
-    pub share: ConnectionShare,
+    pub share: PeerShare,
 }
 
 impl Peer {
@@ -127,7 +127,8 @@ impl Connection {
         counted: Counted,
         budget: &Arc<ReceiveBudget>,
     ) -> Self {
-        let peer = Peer { address: peer(&stream), share: budget.connection() };
+        let address = peer(&stream);
+        let peer = Peer { address, share: budget.of_peer(address.map(|address| address.ip().to_canonical())) };
         let stream = match tls {
             None => Stage::Plain(stream),
             Some(tls) => Stage::Handshake(Box::new(tls.accept(stream))),

@@ -97,7 +97,8 @@ async fn serve_connection(
     _counted: Counted,
     state: watch::Receiver<State>,
 ) {
-    let peer = Peer { address: stream.peer_addr().ok(), share: budget.connection() };
+    let address = stream.peer_addr().ok();
+    let peer = Peer { address, share: budget.of_peer(address.map(|address| address.ip().to_canonical())) };
     // Without it, a response of several packets waits for the client's acknowledgement of the first.
     let _ = stream.set_nodelay(true);
     let mut stream = TimeoutStream::new(stream);

@@ -12,9 +12,9 @@ use tonic::transport::Server;
 use tonic_health::pb::health_server::HealthServer;
 use tower::util::{MapRequestLayer, MapResponseLayer};
 
+use crate::api::grasp::GraspApi;
+use crate::api::inference::InferenceApi;
 use crate::readiness::{Health, State, draining};
-use crate::rpc::grasp_service::GraspRpc;
-use crate::rpc::inference_service::InferenceRpc;
 use crate::telemetry::metrics::Metrics;
 use crate::transport::address::Listener;
 use crate::transport::connections::Peer;
@@ -26,10 +26,12 @@ use crate::transport::tokens::Tokens;
 use crate::transport::{connections, deadline, request_body, tokens};
 
 /// HTTP/2's default of 64 KiB is a quarter of a 40³ volume: the client would wait for a window update four times per
-/// request.
-const STREAM_WINDOW: u32 = 4 << 20;
+/// request. Only what the server does not read stays in a window: requests without a stream are read at once, within the
+/// [`ReceiveBudget`]; streams are not read while their replies are unread, so their number and that time are limited
+/// ([`OpenStreams`](crate::open_streams::OpenStreams)).
+const STREAM_WINDOW: u32 = 1 << 20;
 /// Several volumes in flight on one connection.
-const CONNECTION_WINDOW: u32 = 16 << 20;
+const CONNECTION_WINDOW: u32 = 4 << 20;
 /// One frame per 40³ volume instead of sixteen.
 const MAX_FRAME: u32 = 1 << 20;
 /// Interval of keep-alive pings, which detect clients that disappeared without closing the connection.
@@ -57,8 +59,8 @@ pub(crate) struct GrpcConfig {
 pub(crate) async fn serve(
     listener: Listener,
     config: GrpcConfig,
-    service: GraspRpc,
-    inference: InferenceRpc,
+    service: GraspApi,
+    inference: InferenceApi,
     metrics: Arc<Metrics>,
     state: watch::Receiver<State>,
 ) -> anyhow::Result<()> {
@@ -86,7 +88,7 @@ pub(crate) async fn serve(
             parts.extensions.insert(deadline);
         }
         // Every request belongs to a connection.
-        let share = Peer::of(&parts.extensions).map_or_else(|| budget.connection(), |peer| peer.share.clone());
+        let share = Peer::of(&parts.extensions).map_or_else(|| budget.of_peer(None), |peer| peer.share.clone());
         let body =
             RequestBody::new(parts.uri.path(), body, deadline, limits, share, Arc::clone(&metrics), drain.clone());
         http::Request::from_parts(parts, Body::new(body))

@@ -1,7 +1,9 @@
 //! A limit on the memory of messages that are being received.
 
-use std::sync::Arc;
+use std::collections::HashMap;
+use std::net::IpAddr;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::Duration;
 
 use prometheus::IntGauge;
@@ -17,35 +19,44 @@ pub(crate) struct ReceiveBudget {
     used: AtomicUsize,
     /// Shows `used`.
     gauge: IntGauge,
+    /// What the peers with connections use.
+    peers: Mutex<HashMap<Option<IpAddr>, Weak<AtomicUsize>>>,
 }
 
-/// The budget from the view of one connection. It may use at most as much as all connections leave free, so half of
-/// the capacity if it is the only one; thus clients that never complete their messages leave memory for others.
+/// The part of the budget that a peer may use with all of its connections: at most as much as the other peers leave free,
+/// so half of the capacity if it is the only one. Thus clients that never complete their messages leave memory for others.
 #[derive(Clone)]
-pub(crate) struct ConnectionShare {
+pub(crate) struct PeerShare {
     budget: Arc<ReceiveBudget>,
     used: Arc<AtomicUsize>,
 }
 
 /// The received part of a message. Dropping it returns the memory.
 pub(crate) struct Received {
-    share: ConnectionShare,
+    share: PeerShare,
     bytes: usize,
 }
 
 impl ReceiveBudget {
     /// A budget of `capacity` bytes whose use `gauge` shows.
     pub fn new(capacity: usize, gauge: IntGauge) -> Arc<Self> {
-        Arc::new(Self { capacity, used: AtomicUsize::new(0), gauge })
+        Arc::new(Self { capacity, used: AtomicUsize::new(0), gauge, peers: Mutex::default() })
     }
 
-    /// The share of a new connection.
-    pub fn connection(self: &Arc<Self>) -> ConnectionShare {
-        ConnectionShare { budget: Arc::clone(self), used: Arc::default() }
+    /// The share of a new connection of a peer; `None` is the machine itself, over a UNIX socket.
+    pub fn of_peer(self: &Arc<Self>, peer: Option<IpAddr>) -> PeerShare {
+        let mut peers = self.peers.lock().unwrap_or_else(PoisonError::into_inner);
+        let used = peers.get(&peer).and_then(Weak::upgrade).unwrap_or_else(|| {
+            peers.retain(|_, used| used.strong_count() > 0);
+            let used = Arc::default();
+            peers.insert(peer, Arc::downgrade(&used));
+            used
+        });
+        PeerShare { budget: Arc::clone(self), used }
     }
 }
 
-impl ConnectionShare {
+impl PeerShare {
     /// A message of which nothing has been received yet.
     pub fn message(self) -> Received {
         Received { share: self, bytes: 0 }
@@ -55,20 +66,20 @@ impl ConnectionShare {
 impl Received {
     /// Adds received data. The error is the status of the request.
     pub fn add(&mut self, bytes: usize) -> Result<(), Status> {
-        let ConnectionShare { budget, used } = &self.share;
+        let PeerShare { budget, used } = &self.share;
         let total = budget.used.fetch_add(bytes, Ordering::Relaxed) + bytes;
-        let of_connection = used.fetch_add(bytes, Ordering::Relaxed) + bytes;
+        let of_peer = used.fetch_add(bytes, Ordering::Relaxed) + bytes;
         self.bytes += bytes;
         budget.gauge.add(bytes as i64);
         // Another thread may have changed the second sum after the first was read.
-        let of_others = total.saturating_sub(of_connection);
-        if of_connection <= budget.capacity.saturating_sub(of_others) / 2 {
+        let of_others = total.saturating_sub(of_peer);
+        if of_peer <= budget.capacity.saturating_sub(of_others) / 2 {
             return Ok(());
         }
         self.clear();
         let message = format!(
-            "{total} bytes of messages are being received, {of_connection} of them on this connection, and a connection \
-             may use half of what the others leave of {} (--max-receiving-bytes); retry after {RETRY_AFTER:?}",
+            "{total} bytes of messages are being received, {of_peer} of them from this address, and an address may use \
+             half of what the others leave of {} (--max-receiving-bytes); retry after {RETRY_AFTER:?}",
             self.share.budget.capacity
         );
         let details = ErrorDetails::with_retry_info(Some(RETRY_AFTER));
@@ -77,7 +88,7 @@ impl Received {
 
     /// Returns the memory: the message is complete or refused.
     pub fn clear(&mut self) {
-        let ConnectionShare { budget, used } = &self.share;
+        let PeerShare { budget, used } = &self.share;
         used.fetch_sub(self.bytes, Ordering::Relaxed);
         budget.used.fetch_sub(self.bytes, Ordering::Relaxed);
         budget.gauge.sub(self.bytes as i64);
@@ -96,13 +107,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_connection_may_use_half_of_what_the_others_leave() {
+    fn an_address_may_use_half_of_what_the_others_leave() {
         let gauge = IntGauge::new("receiving", "Bytes.").unwrap();
         let budget = ReceiveBudget::new(1000, gauge.clone());
-        let first = budget.connection();
+        let [one, other] = [1, 2].map(|last| Some(IpAddr::from([10, 0, 0, last])));
+        let first = budget.of_peer(one);
         let mut messages: Vec<Received> = (0..5).map(|_| first.clone().message()).collect();
         assert!(messages.iter_mut().all(|message| message.add(100).is_ok()));
-        let mut sixth = first.message();
+        // With another connection it has no more.
+        let mut sixth = budget.of_peer(one).message();
         let status = sixth.add(1).unwrap_err();
         assert_eq!(status.code(), Code::ResourceExhausted);
         assert!(status.get_details_retry_info().is_some());
@@ -110,7 +123,7 @@ mod tests {
             assert!(status.message().contains(figure), "{status}");
         }
 
-        let mut second = budget.connection().message();
+        let mut second = budget.of_peer(other).message();
         assert!(second.add(250).is_ok() && second.add(1).is_err());
         assert_eq!(gauge.get(), 500, "a refused message returns its memory");
         drop(messages);
@@ -121,10 +134,10 @@ mod tests {
     }
 
     #[test]
-    fn messages_of_a_connection_on_several_threads_are_all_counted() {
+    fn messages_of_a_peer_on_several_threads_are_all_counted() {
         let gauge = IntGauge::new("receiving", "Bytes.").unwrap();
         let budget = ReceiveBudget::new(1 << 20, gauge.clone());
-        let connection = budget.connection();
+        let connection = budget.of_peer(None);
         std::thread::scope(|scope| {
             for _ in 0..4 {
                 let connection = connection.clone();

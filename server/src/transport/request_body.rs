@@ -16,7 +16,7 @@ use tonic::{Code, Status};
 use crate::readiness::{self, draining};
 use crate::telemetry::metrics::Metrics;
 use crate::transport::deadline::Deadline;
-use crate::transport::receive_budget::{ConnectionShare, Received};
+use crate::transport::receive_budget::{PeerShare, Received};
 
 /// Length of a gRPC message's prefix: the compression flag, then the message's length as a big-endian u32.
 const PREFIX: usize = 5;
@@ -28,7 +28,7 @@ const STREAMS: [&str; 3] = ["Stream", "TrackGrasps", REFLECTION];
 const REFLECTION: &str = "ServerReflectionInfo";
 
 /// Minimum rate of a message, bytes per second. It refuses clients that send single bytes and so never stall.
-const MIN_RATE: f64 = 65_536.0;
+const MIN_RATE: f64 = 262_144.0;
 
 /// Completes when the server drains.
 type Draining = Pin<Box<dyn Future<Output = ()> + Send>>;
@@ -106,7 +106,7 @@ impl RequestBody {
         body: Body,
         deadline: Option<Deadline>,
         limits: Limits,
-        share: ConnectionShare,
+        share: PeerShare,
         metrics: Arc<Metrics>,
         state: watch::Receiver<readiness::State>,
     ) -> Self {
@@ -377,7 +377,7 @@ mod tests {
         let suppressed = prometheus::IntCounter::new("suppressed", "Lines.").unwrap();
         let metrics = Arc::new(Metrics::new(log.error_counter(), suppressed));
         let limits = Limits { message_bytes: 1 << 20, stall: STALL };
-        let share = metrics.receiving(4 << 20).connection();
+        let share = metrics.receiving(4 << 20).of_peer(None);
         let state = readiness.subscribe();
         (RequestBody::new(path, Body::new(Sent(data)), None, limits, share, metrics, state), sender, readiness)
     }
@@ -421,9 +421,9 @@ mod tests {
         });
         let (refusal, seconds) = read(body).await;
         let refusal = refusal.unwrap();
-        // Two stalls, and one second for 65,536 bytes at the minimum rate.
+        // Two stalls, and one second for 262,144 bytes at the minimum rate.
         assert_eq!((refusal.code(), seconds), (Code::DeadlineExceeded, 21));
-        assert!(refusal.message().contains("slower than 65536 bytes per second"), "{refusal}");
+        assert!(refusal.message().contains("slower than 262144 bytes per second"), "{refusal}");
     }
 
     #[tokio::test(start_paused = true)]

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, PoisonError, RwLock};
 
 use anyhow::{Context, ensure};
+use grasp_engine::Caller;
 use sha2::{Digest, Sha256};
 use subtle::{Choice, ConstantTimeEq};
 use tokio::signal::unix::Signal;
@@ -14,7 +15,6 @@ use tonic::{Code, Request, Status};
 use tracing::{error, info};
 
 use crate::telemetry::metrics::Metrics;
-use crate::transport::caller::Caller;
 
 /// Scheme of the header `authorization` (RFC 6750, section 2.1), case-insensitive.
 const SCHEME: &str = "bearer ";

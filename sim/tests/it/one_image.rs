@@ -3,10 +3,11 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use grasp::{DepthImage, Fusion, Intrinsics, ObjectMap, RESOLUTION, Tabletop, WORKSPACE_SIZE};
+use grasp::{DepthImage, Fusion, Intrinsics, ObjectMap, RESOLUTION, WORKSPACE_SIZE};
 use grasp_models::{Network, Options};
+use grasp_perception::{Scene, Tabletop};
 use grasp_picture::{Instance, render};
-use grasp_planner::{Evaluator, NetworkPlanner, PlanParams, Planner, Scene};
+use grasp_planner::{Evaluator, NetworkPlanner, PlanParams, Planner};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
 use grasp_sim::camera::{DepthNoise, View, Views, add_stereo_noise};
@@ -58,7 +59,7 @@ fn most_objects_have_a_probable_grasp() {
             Some((camera_from_task.inverse() * image.point(pixel % width, pixel / width)?, label))
         });
         let map = ObjectMap::new(points, &Isometry3::identity(), BTreeSet::new());
-        let scene = Scene { volume: fusion.volume(Isometry3::identity()).unwrap(), points: None };
+        let scene = Scene::from(fusion.volume(Isometry3::identity()).unwrap());
         let grasps = planner.plan(&scene, &params, &|| true).unwrap().grasps;
 
         let hand = grasp::Hand::PANDA;

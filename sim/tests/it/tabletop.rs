@@ -1,6 +1,7 @@
 //! The table in depth images of simulated scenes, from cameras in random poses.
 
-use grasp::{DepthImage, Intrinsics, NoTabletop, Tabletop, WORKSPACE_SIZE, overview};
+use grasp::{DepthImage, Intrinsics, WORKSPACE_SIZE};
+use grasp_perception::{NoTabletop, Tabletop, overview};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
 use grasp_sim::camera::{DepthNoise, View, Views, add_stereo_noise, look};
@@ -111,8 +112,7 @@ fn the_table_is_found_in_point_clouds() {
             let cloud_from_camera = task_from_cloud.inverse() * task_from_camera;
             let points: Vec<_> = of_camera.iter().map(|point| cloud_from_camera * point).collect();
             let seen = overview(&points, &(cloud_from_camera * Point3::origin())).unwrap();
-            let rendered = DepthImage::new(seen.intrinsics, &seen.depth).unwrap();
-            let found = Tabletop::find(&rendered, None, TABLE_HEIGHT).unwrap();
+            let found = Tabletop::find(&seen.image, None, TABLE_HEIGHT).unwrap();
             assert!(found.share <= 1.0, "{}", found.share);
             let true_from_found = task_from_cloud * seen.camera_from_task.inverse() * found.camera_from_task;
             let middle = true_from_found * Point3::new(WORKSPACE_SIZE / 2.0, WORKSPACE_SIZE / 2.0, TABLE_HEIGHT);

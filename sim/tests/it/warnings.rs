@@ -1,7 +1,8 @@
 //! Warnings about the geometry of an observation: none for correct views of the benchmark's scenes, and one for each
 //! mistake that the volume shows.
 
-use grasp::{DepthImage, Fusion, Intrinsics, RESOLUTION, WORKSPACE_SIZE, Warning};
+use grasp::{DepthImage, Fusion, Intrinsics, RESOLUTION, WORKSPACE_SIZE};
+use grasp_perception::Warning;
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::Benchmark;
 use grasp_sim::camera::{DepthNoise, View, Views, observe};
@@ -30,7 +31,8 @@ fn warnings(views: &[(View, Intrinsics)]) -> Vec<Warning> {
     let mut warnings = Vec::new();
     for (index, (view, intrinsics)) in views.iter().enumerate() {
         let image = DepthImage::new(*intrinsics, &view.depth).unwrap();
-        warnings.extend(Warning::of_camera(index, &view.camera_from_task, WORKSPACE_SIZE));
+        let eye = view.camera_from_task.inverse().translation.vector.into();
+        warnings.extend(Warning::of_camera(index, &eye, [WORKSPACE_SIZE / 2.0; 2]));
         warnings.extend(Warning::of_view(index, &fusion, &image, &view.camera_from_task));
         assert!(fusion.integrate(&image, &view.camera_from_task) > 0, "the camera sees the workspace");
     }

@@ -2,8 +2,9 @@
 
 #![no_main]
 
-use grasp::{DepthImage, Fusion, Tabletop, Warning, seen_from};
-use grasp_proto::{DetectParams, Workspace, cloud_view, depth_view, pb};
+use grasp::{DetectParams, Fusion};
+use grasp_perception::{Frames, Tabletop, View, Warning, Workspace, seen_from};
+use grasp_proto::pb;
 use libfuzzer_sys::fuzz_target;
 use nalgebra::Isometry3;
 use prost::Message;
@@ -41,36 +42,38 @@ fn candidates(bytes: &[u8]) {
                 assert!(pose.translation.vector.iter().all(|c| c.is_finite()), "{pose}");
             }
         }
-        Err(error) => assert!(error.message.starts_with(&*error.field), "{error:?}"),
+        Err(error) => assert!(error.message.starts_with(error.field()), "{error:?}"),
     }
 }
 
 fn depth(bytes: &[u8]) {
     let Ok(request) = pb::DetectGraspsFromDepthRequest::decode(bytes) else { return };
     let Ok(mut workspace) = Workspace::try_from(request.workspace.unwrap_or_default()) else { return };
-    let mut views = request.views;
-    if let Err(error) = workspace.find_table(&mut views, 0.05, 0.3) {
-        assert!(error.message.starts_with(&*error.field), "{error:?}");
+    match grasp_proto::frames(&request.views) {
+        Err(error) => assert!(error.message.starts_with(error.field()), "{error:?}"),
+        Ok(frames) => {
+            let mut frames = Frames::Depth(frames);
+            if let Err(error) = workspace.find_table(&mut frames, 0.05, 0.3) {
+                assert!(error.message.starts_with(error.field()), "{error:?}");
+            }
+        }
     }
-    for (index, view) in views.iter().enumerate() {
-        check(view, index, &workspace.frame_from_task);
-    }
+    request.views.iter().for_each(|view| check(view, &workspace.frame_from_task));
 }
 
 fn cloud(bytes: &[u8]) {
     let Ok(request) = pb::DetectGraspsFromCloudRequest::decode(bytes) else { return };
-    if let Ok(mut workspace) = Workspace::try_from(request.workspace.unwrap_or_default())
-        && let Err(error) = workspace.find_table_in_clouds(&request.views, 0.05, 0.3)
-    {
-        assert!(error.message.starts_with(&*error.field), "{error:?}");
-    }
-    for (index, view) in request.views.iter().enumerate() {
-        if let Ok(points) = cloud_view(view, index, &Isometry3::identity())
-            && let Some(view) = seen_from(&points.points, &points.eye, 0.3)
-        {
-            assert!(view.depth.iter().all(|depth| depth.is_finite() && *depth >= 0.0));
+    let Ok(clouds) = grasp_proto::clouds(&request.views) else { return };
+    for cloud in &clouds {
+        if let Some(view) = seen_from(&cloud.points, &cloud.eye, 0.3) {
+            assert!(view.image.depth().iter().all(|depth| depth.is_finite() && *depth >= 0.0));
             integrate(&view);
         }
+    }
+    if let Ok(mut workspace) = Workspace::try_from(request.workspace.unwrap_or_default())
+        && let Err(error) = workspace.find_table(&mut Frames::Clouds(clouds), 0.05, 0.3)
+    {
+        assert!(error.message.starts_with(error.field()), "{error:?}");
     }
 }
 
@@ -93,26 +96,26 @@ fn fitting(mut bytes: &[u8]) {
         extrinsics: Some(pb::depth_view::Extrinsics::CameraFromTask(pose)),
         labels: Some(pb::Labels { data: vec![3; 12 * 9].into(), r#type: pb::LabelType::U8.into() }),
     };
-    check(&view, 0, &Isometry3::identity());
+    check(&view, &Isometry3::identity());
 }
 
-fn check(view: &pb::DepthView, index: usize, frame_from_task: &Isometry3<f64>) {
-    match depth_view(view, index, frame_from_task) {
+fn check(view: &pb::DepthView, frame_from_task: &Isometry3<f64>) {
+    match grasp_proto::frame(view).and_then(|frame| frame.in_task(frame_from_task)) {
         Ok(view) => integrate(&view),
-        Err(error) => assert!(error.message.starts_with(&*error.field), "{error:?}"),
+        Err(error) => assert!(error.message.starts_with(error.field()), "{error:?}"),
     }
 }
 
 /// Every valid view gives a valid volume, or a reason why nothing was measured.
-fn integrate(view: &grasp::View) {
-    let image = DepthImage::new(view.intrinsics, &view.depth).expect("the image was checked");
-    if let Ok(table) = Tabletop::find(&image, None, 0.05) {
+fn integrate(view: &View) {
+    let image = &view.image;
+    if let Ok(table) = Tabletop::find(image, None, 0.05) {
         assert!(table.camera_from_task.translation.vector.iter().all(|c| c.is_finite()), "{table:?}");
     }
     let mut fusion = Fusion::new(8, 0.3).forgetting(3.0);
-    let _ = fusion.contradicted(&image, &view.camera_from_task);
-    if fusion.integrate(&image, &view.camera_from_task) == 0 {
-        assert!(!fusion.blind(&image, &view.camera_from_task).to_string().is_empty());
+    let _ = fusion.contradicted(image, &view.camera_from_task);
+    if fusion.integrate(image, &view.camera_from_task) == 0 {
+        assert!(!fusion.no_measurement(image, &view.camera_from_task).to_string().is_empty());
     }
     if let Ok(volume) = fusion.volume(Isometry3::identity()) {
         let _ = Warning::of_table(&volume, 0.05);

@@ -74,6 +74,19 @@ async fn models_are_loaded_and_unloaded_where_it_is_allowed() {
     assert!(index(&mut client, true).await.contains(&"b 2 READY".to_owned()));
     std::fs::remove_file(server.models().join("b-2.onnx")).unwrap();
     assert_eq!(load(&mut client, "missing").await.unwrap_err().code(), Code::NotFound);
+    // A load that fails does not undo an unloading.
+    let good = std::fs::read(server.models().join("b-1.onnx")).unwrap();
+    unload(&mut client, "b").await.unwrap();
+    for file in ["b-1.onnx", "b-2.onnx"] {
+        let _ = std::fs::write(server.models().join(file), "text");
+    }
+    assert_eq!(load(&mut client, "b").await.unwrap_err().code(), Code::NotFound);
+    std::fs::remove_file(server.models().join("b-2.onnx")).unwrap();
+    std::fs::write(server.models().join("b-1.onnx"), good).unwrap();
+    load(&mut client, "a").await.unwrap();
+    assert_eq!(index(&mut client, true).await, ["a 1 READY"]);
+    load(&mut client, "b").await.unwrap();
+
     assert_eq!(unload(&mut client, "missing").await.unwrap_err().code(), Code::NotFound);
     unload(&mut client, "a").await.unwrap();
     let error = unload(&mut client, "b").await.unwrap_err();

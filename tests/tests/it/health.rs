@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use grasp_client::{Client, Error, Health, Options};
+use grasp_client::{Client, DetectOptions, Error, Health, Options};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs};
 use nalgebra::Isometry3;
 use tokio::task::JoinSet;
@@ -98,4 +98,22 @@ async fn the_server_is_not_ready_during_the_drain() {
     assert_eq!(server.get("/readyz"), (503, "draining\n".to_owned()));
     assert!(calls.join_all().await.iter().all(Result::is_ok));
     assert_eq!(server.wait().unwrap().code(), Some(0));
+}
+
+#[tokio::test]
+async fn a_model_whose_outputs_are_invalid_makes_the_server_unhealthy() {
+    let server = Server::run(&[TestModel::new("mirror"), TestModel::new("invalid").breaks_at(0.9)], &[]);
+    let client = server.client().await;
+    let volume = blobs(RESOLUTION, Isometry3::identity(), &[[5, 5, 5]]);
+    let options = |model: &str| {
+        let detect = DetectOptions { model: model.to_owned(), threshold: Some(0.1), ..DetectOptions::default() };
+        Options { detect, ..Options::default() }
+    };
+    for _ in 0..10 {
+        let error = client.detect(&volume, options("invalid")).await.unwrap_err();
+        assert_eq!(error.code(), Some(Code::Internal), "{error}");
+    }
+    server.wait_for("graspd_ready", 0.0).await;
+    // The other model is still served.
+    client.detect(&volume, options("mirror")).await.unwrap();
 }

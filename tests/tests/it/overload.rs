@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use grasp::Volume;
 use grasp_client::{Access, Client, DetectOptions, Error, Options, Retry, Workspace};
-use grasp_proto::Priority;
+use grasp_proto::pb::Priority;
 use grasp_proto::pb::grasp_service_client::GraspServiceClient;
 use grasp_proto::pb::{CollisionCheck, DetectGraspsFromDepthRequest, DetectGraspsRequest, collision_check};
 use grasp_tests::scene::{camera, view};
@@ -172,7 +172,7 @@ async fn a_request_that_cannot_be_answered_in_its_time_is_refused_at_once() {
     server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 7.0).await;
     let status = detect_within(&server, Duration::from_millis(100)).await.unwrap_err();
     assert_eq!(status.code(), Code::ResourceExhausted, "{status}");
-    assert!(status.message().starts_with("the deadline is earlier than the reply: 7 requests wait"), "{status}");
+    assert!(status.message().starts_with("deadline too short: expected wait "), "{status}");
     assert!(status.get_details_retry_info().is_some());
     assert_eq!(server.metric("graspd_refusals_total{model=\"slow 1\",reason=\"deadline\"}"), 1.0);
     // With enough time it is accepted.
@@ -331,7 +331,7 @@ async fn batch_requests_wait_for_normal_ones() {
     let outcomes = batch.join_all().await;
     let refused: Vec<_> = outcomes.iter().filter_map(|outcome| outcome.as_ref().err()).collect();
     assert_eq!(refused.len(), 1, "the normal request took the place of one: {refused:?}");
-    assert!(refused[0].to_string().contains("has taken this one's place"), "{refused:?}");
+    assert!(refused[0].to_string().contains("was displaced by one with a higher priority"), "{refused:?}");
     for (priority, count) in [("NORMAL", 1.0), ("BATCH", 9.0)] {
         let queued = format!("graspd_queued_total{{model=\"slow 1\",priority=\"{priority}\"}}");
         assert_eq!(server.metric(&queued), count, "{priority}");

@@ -34,7 +34,7 @@ fn models() -> TempDir {
 
 #[test]
 fn a_generated_python_client_works() {
-    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let server = Server::run(&[TestModel::new("mirror")], &["--max-tracked", "4"]);
     let address = server.grpc().to_string();
     let proto = Path::new(env!("CARGO_MANIFEST_DIR")).join("../proto/proto");
     let environment = [("GRASPD_SERVER", address.as_ref()), ("GRASPD_PROTO", proto.as_os_str())];

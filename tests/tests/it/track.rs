@@ -64,15 +64,23 @@ async fn an_invalid_view_ends_neither_the_stream_nor_the_volume() {
 
     let mut tracking = client.track(Workspace::default()).await.unwrap();
     let first = tracking.add(std::slice::from_ref(&good), low()).await.unwrap();
-    let (status, message) = code(tracking.add(&[bad], low()).await);
+    let (status, message) = code(tracking.add(std::slice::from_ref(&bad), low()).await);
     assert!(status == Code::InvalidArgument && message.starts_with("views[0]: camera at"), "{message}");
     let again = tracking.add(&[], low()).await.unwrap();
     assert_eq!(again.grasps, first.grasps);
+    // All views of a request are added, or none: the good one is not in the volume, and may be sent again.
+    let opposite = view(&camera(40.0, 90.0));
+    let error = tracking.add(&[opposite.clone(), bad], low()).await.unwrap_err();
+    assert!(!error.views_added() && error.to_string().contains("views[1]: camera at"), "{error}");
+    assert_eq!(tracking.add(&[], low()).await.unwrap().grasps, first.grasps);
+    let both = tracking.add(&[opposite.clone()], low()).await.unwrap();
+    let expected = client.detect_from_depth(&[good.clone(), opposite], &Workspace::default(), low()).await.unwrap();
+    assert_eq!(both.grasps, expected.grasps);
     let other = DetectOptions { model: "other".to_owned(), ..low().detect };
     let (status, message) = code(tracking.add(&[], Options { detect: other, ..Options::default() }).await);
     assert_eq!(status, Code::InvalidArgument);
     assert!(message.starts_with("options.model is `other`, which requires a different grid"), "{message}");
-    assert_eq!(tracking.add(&[], low()).await.unwrap().grasps, first.grasps);
+    assert_eq!(tracking.add(&[], low()).await.unwrap().grasps, both.grasps);
 
     // With the generated client, because the client library always sends a workspace first.
     let request = pb::TrackGraspsRequest { views: vec![(&good).into()], ..Default::default() };

@@ -2,12 +2,12 @@ use std::path::PathBuf;
 
 use anyhow::{Context, bail, ensure};
 use clap::Args;
-use grasp::{DepthImage, Fusion, RESOLUTION, View, Volume, WORKSPACE_SIZE, overview, seen_from};
+use grasp::{Fusion, RESOLUTION, Volume, WORKSPACE_SIZE};
 use grasp_client::{
     Candidate, Client, CloudView, Depth, DepthView, Detection, Error, Extrinsics, FindTable, Observation, Options,
     Scores, Workspace,
 };
-use grasp_proto::Points;
+use grasp_perception::{View, overview, seen_from};
 use nalgebra::Isometry3;
 
 use crate::numbers::Numbers;
@@ -249,8 +249,7 @@ impl Scene {
                 let workspace = found(workspace, detection)?;
                 let views = views.iter().enumerate().map(|(index, view)| {
                     let mut view = depth_view(view, index, &workspace)?;
-                    let factor = depth_factor(detection, index) as f32;
-                    view.depth.iter_mut().for_each(|depth| *depth *= factor);
+                    view.image.scale(depth_factor(detection, index));
                     anyhow::Ok(view)
                 });
                 (views.collect::<anyhow::Result<Vec<_>>>()?, workspace)
@@ -269,7 +268,7 @@ impl Scene {
         let resolution = (size / WORKSPACE_SIZE * RESOLUTION as f64).ceil() as usize;
         let mut fusion = Fusion::new(resolution.min(Volume::MAX_RESOLUTION), size);
         for view in views {
-            fusion.integrate(&DepthImage::new(view.intrinsics, &view.depth)?, &view.camera_from_task);
+            fusion.integrate(&view.image, &view.camera_from_task);
         }
         Ok(fusion.volume(workspace.pose)?)
     }
@@ -289,19 +288,21 @@ fn depth_factor(detection: &Detection, index: usize) -> f64 {
 
 /// Depth view `index` as the server reads it, with the same checks and errors.
 pub(crate) fn depth_view(view: &DepthView, index: usize, workspace: &Workspace) -> anyhow::Result<View> {
-    Ok(grasp_proto::depth_view(&view.into(), index, &workspace.pose)?)
+    let frame = grasp_proto::frame(&view.into()).and_then(|frame| frame.in_task(&workspace.pose));
+    Ok(frame.map_err(|error| error.inside(format_args!("views[{index}]")))?)
 }
 
 /// Renders cloud `index`, whose distances from its camera are multiplied by `factor`, to a depth image.
 fn rendered_view(view: &CloudView, index: usize, workspace: &Workspace, factor: f64) -> anyhow::Result<View> {
-    let Points { mut points, eye, .. } = grasp_proto::cloud_view(&view.into(), index, &workspace.pose)?;
-    points.iter_mut().for_each(|point| *point = eye + factor * (*point - eye));
+    let cloud = grasp_proto::cloud(&view.into()).map_err(|error| error.inside(format_args!("views[{index}]")))?;
+    let mut cloud = cloud.in_task(&workspace.pose);
+    cloud.scale(factor);
     let seen = match workspace.extent {
         // As the server does.
-        None => seen_from(&points, &eye, WORKSPACE_SIZE),
+        None => seen_from(&cloud.points, &cloud.eye, WORKSPACE_SIZE),
         // The server renders each of its cubes. The bounding sphere of all of them may contain the camera, and
         // `seen_from` then has no image.
-        Some(_) => overview(&points, &eye),
+        Some(_) => overview(&cloud.points, &cloud.eye),
     };
     seen.context("a camera sees no point of its cloud; check --camera-position and the poses")
 }

@@ -5,16 +5,15 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use clap::Args;
-use grasp::{DepthImage, Tabletop, View, overview};
-use grasp_client::{DepthView, Extrinsics, Workspace};
-use grasp_proto::TABLE_HEIGHT;
+use grasp::{TABLE_HEIGHT, WORKSPACE_SIZE};
+use grasp_client::{DepthView, Extrinsics};
+use grasp_perception::{Cloud, FoundTable, Frame, Tabletop, View, Workspace, overview};
 use nalgebra::{Isometry3, Point3, Unit, Vector3};
 use serde_json::{Value, json};
 
 use crate::files::in_file;
 use crate::numbers::Numbers;
 use crate::overlay::Overlay;
-use crate::scene::depth_view;
 use crate::{cloud, image, pose, show};
 
 #[derive(Args)]
@@ -61,47 +60,45 @@ impl Table {
             Unit::try_new(Vector3::from(gravity), 1e-9).context("--gravity is 0,0,0; it must be a direction")
         });
         let gravity = gravity.transpose()?;
-        let view = self.view()?;
-        let frame_from_camera = view.camera_from_task.inverse();
-        let found = in_file(&self.file, |_| {
-            let image = DepthImage::new(view.intrinsics, &view.depth)?;
-            let gravity = gravity.map(|gravity| view.camera_from_task.rotation * gravity);
-            Ok(Tabletop::find(&image, gravity, self.table_height)?)
-        })?;
-        let frame_from_task = frame_from_camera * found.camera_from_task;
+        let mut place = Workspace { find_table: true, gravity, ..Workspace::default() };
+        let (found, view) = in_file(&self.file, |_| self.find(&mut place))?;
+        let FoundTable { frame_from_task, tabletop } = found;
         let workspace = pose_json(&frame_from_task);
         if let Some(path) = &self.out {
             fs::write(path, format!("{workspace:#}\n")).with_context(|| path.display().to_string())?;
         }
         if let Some(path) = &self.picture {
-            let mut overlay = Overlay::of_depth(&view.depth, view.intrinsics, found.camera_from_task);
+            let mut overlay = Overlay::of_depth(view.image.depth(), view.intrinsics(), tabletop.camera_from_task);
             overlay.workspace(self.table_height).save(path)?;
         }
         let frame = if self.camera_position.is_some() { "points" } else { "camera" };
         show::print(&if as_json {
-            format!("{:#}", json(&found, workspace))
+            format!("{:#}", json(&tabletop, workspace))
         } else {
-            text(&found, &frame_from_task, frame)
+            text(&tabletop, &frame_from_task, frame)
         })?;
         Ok(())
     }
 
-    /// The image in which the table is searched, with the pose of the frame in which it is reported: that of the camera,
-    /// or of the points.
-    fn view(&self) -> anyhow::Result<View> {
+    /// The table in the file, and the image in which it was searched. The caller's frame is that of the camera, or of the
+    /// points.
+    fn find(&self, workspace: &mut Workspace) -> anyhow::Result<(FoundTable, View)> {
+        let (height, edge) = (self.table_height, WORKSPACE_SIZE);
         if let Some(Numbers(eye)) = self.camera_position {
             let points = cloud::read(&self.file)?.into_iter().map(|point| Point3::from(point).cast::<f64>());
-            let points: Vec<Point3<f64>> = points.filter(|point| point.iter().all(|c| c.is_finite())).collect();
-            return in_file(&self.file, |_| {
-                let seen = overview(&points, &Point3::from(eye));
-                seen.context("--camera-position must be the position from which the points were seen")
-            });
+            let points = points.filter(|point| point.iter().all(|c| c.is_finite())).collect();
+            let cloud = Cloud { points, eye: Point3::from(eye), labels: None };
+            let seen = overview(&cloud.points, &cloud.eye);
+            let seen = seen.context("--camera-position must be the position from which the points were seen")?;
+            return Ok((workspace.find_table_in_cloud(&cloud, height, edge)?, seen));
         }
         let k = pose::intrinsics(self.intrinsics.as_deref().unwrap_or_default())?;
-        let (depth, width, height) = image::read(&self.file, self.depth_scale)?;
+        let (depth, width, height_pixels) = image::read(&self.file, self.depth_scale)?;
         let extrinsics = Extrinsics::FrameFromCamera(Isometry3::identity());
-        let view = DepthView { depth, width, height, k, extrinsics, labels: None };
-        in_file(&self.file, |_| depth_view(&view, 0, &Workspace::default()))
+        let view = DepthView { depth, width, height: height_pixels, k, extrinsics, labels: None };
+        let mut frame: Frame = grasp_proto::frame(&(&view).into())?;
+        let found = workspace.find_table_in_frame(&mut frame, true, height, edge)?;
+        Ok((found, frame.in_task(&Isometry3::identity())?))
     }
 }
 

@@ -2,10 +2,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{bail, ensure};
 use clap::Args;
-use grasp::{FINGER_DEPTH, Fusion, SurfaceMesh, SurfacePoint, Volume};
+use grasp::{FINGER_DEPTH, Fusion, SurfaceMesh, SurfacePoint, TABLE_HEIGHT, Volume};
 use grasp_client::Detection;
 use grasp_picture::{Color, Mesh, Picture, quality_color};
-use grasp_proto::TABLE_HEIGHT;
 use nalgebra::{Isometry3, Point3, Translation3};
 
 use crate::overlay::Overlay;
@@ -61,7 +60,7 @@ impl ViewArgs {
     ) -> anyhow::Result<Option<&Path>> {
         let Some(color) = &self.color else { return Ok(None) };
         let (view, pose) = scene.first_view(detection)?;
-        let mut overlay = Overlay::of_color(color, view.intrinsics, view.camera_from_task)?;
+        let mut overlay = Overlay::of_color(color, view.intrinsics(), view.camera_from_task)?;
         overlay.grasps(detection, &pose, depth.unwrap_or(FINGER_DEPTH)).save(&self.out)?;
         Ok(Some(&self.out))
     }

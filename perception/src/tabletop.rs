@@ -1,0 +1,267 @@
+//! The table in a depth image of which only the intrinsics are known.
+
+use grasp::{DEPTH_MAX, DepthImage, WORKSPACE_SIZE};
+use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, SymmetricEigen, Translation3, Unit, UnitQuaternion, Vector3};
+use thiserror::Error;
+
+/// A table in a depth image, and a workspace on it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Tabletop {
+    /// `T_camera_task`: the workspace, a cube of [`WORKSPACE_SIZE`], holds what stands on the table near the middle of
+    /// the image. Its z axis is the normal of the table, its x axis points to the right in the image, and the table is
+    /// at the height that [`find`](Self::find) was given.
+    pub camera_from_task: Isometry3<f64>,
+    /// Distance of the camera from the plane of the table, metres.
+    pub distance: f64,
+    /// Angle between the optical axis and the normal of the table, radians: 0 if the camera looks straight down.
+    pub angle: f64,
+    /// Share of the image's pixels that lie on the table. Pixels count less the farther they are from its middle.
+    pub share: f64,
+    /// Root mean square distance of these pixels from the plane, metres.
+    pub deviation: f64,
+    /// Angle between the normal of the table and the vertical, radians; `None` if gravity is unknown.
+    pub tilt: Option<f64>,
+}
+
+/// Why no table was found.
+#[derive(Clone, Copy, Debug, Error, PartialEq)]
+pub enum NoTabletop {
+    /// The image has too few pixels with depth.
+    #[error("only {:.0} % of the image has a depth of at most {DEPTH_MAX} m; a table needs {:.0} %", share * 100.0, FEWEST * 100.0)]
+    FewReadings {
+        /// Share of the pixels with a depth.
+        share: f64,
+    },
+    /// No plane is large enough.
+    #[error(
+        "the largest {}plane near the middle of the image covers {:.0} % of it; a table needs {:.0} %. Point the camera at \
+         the table{}",
+        if *with_gravity { "level " } else { "" },
+        share * 100.0,
+        SMALLEST * 100.0,
+        if *with_gravity { ", and check the direction of gravity" } else { "" }
+    )]
+    NoPlane {
+        /// Its share of the pixels.
+        share: f64,
+        /// Whether planes that are not level were left out.
+        with_gravity: bool,
+    },
+}
+
+/// Smallest share of the pixels with a depth.
+const FEWEST: f64 = 0.05;
+
+/// Smallest share of the pixels on the table.
+const SMALLEST: f64 = 0.12;
+
+/// Points are sampled from about this many pixels.
+const POINTS: f64 = 3000.0;
+
+/// Planes are proposed at about this many pixels.
+const PROPOSALS: f64 = 400.0;
+
+/// Distance between the pixels that propose a plane, as a fraction of the image's width. Several are tried: short ones
+/// find small planes, long ones are accurate.
+const BASELINES: [f64; 2] = [0.03, 0.08];
+
+/// Standard deviation of the weight of pixels around the middle, as a fraction of half of the diagonal.
+const MIDDLE: f64 = 0.45;
+
+/// Largest angle between the table's normal and the vertical, radians.
+const LEVEL: f64 = 12.0 * std::f64::consts::PI / 180.0;
+
+/// A plane below the largest one is the table, if it is parallel, not farther than this, metres, and at least this
+/// large in comparison: the top of a large object covers the middle of the image. What is farther below is the floor
+/// around a bin or a table.
+const BELOW: std::ops::Range<f64> = 0.02..0.2;
+const LARGE: f64 = 0.35;
+
+/// Largest angle between parallel planes, radians.
+const PARALLEL: f64 = 5.0 * std::f64::consts::PI / 180.0;
+
+/// Heights above the table at which points belong to objects, metres.
+const OBJECTS: std::ops::Range<f64> = 0.01..0.3;
+
+/// A sampled pixel.
+struct Sample {
+    /// In the camera frame, metres.
+    point: Point3<f64>,
+    weight: f64,
+}
+
+/// Points with `normal · point = offset`. The normal points to the camera.
+#[derive(Clone, Copy, Debug)]
+struct Plane {
+    normal: Unit<Vector3<f64>>,
+    offset: f64,
+}
+
+impl Tabletop {
+    /// Finds the largest plane near the middle of the image. `gravity` is the direction of gravity in the camera frame; an
+    /// accelerometer at rest measures the opposite. With it only level planes are considered, else a wall that fills the
+    /// image is taken for a table. `height` is the height of the table in the workspace, metres.
+    ///
+    /// # Errors
+    /// [`NoTabletop`] if there is no plane large enough.
+    pub fn find(image: &DepthImage, gravity: Option<Unit<Vector3<f64>>>, height: f64) -> Result<Self, NoTabletop> {
+        let samples = samples(image);
+        let (camera, step) = (image.intrinsics(), stride(image, POINTS));
+        let pixels = (camera.width.div_ceil(step) * camera.height.div_ceil(step)) as f64;
+        let share = samples.len() as f64 / pixels;
+        if share < FEWEST {
+            return Err(NoTabletop::FewReadings { share });
+        }
+        let is_level = |plane: &Plane| gravity.is_none_or(|down| plane.normal.angle(&-down.into_inner()) <= LEVEL);
+        let mut scored: Vec<(f64, Plane)> = proposals(image)
+            .filter(is_level)
+            .map(|plane| (samples.iter().filter(|sample| plane.has(sample)).map(|sample| sample.weight).sum(), plane))
+            .collect();
+        scored.sort_by(|(a, _), (b, _)| b.total_cmp(a));
+        let all: f64 = samples.iter().map(|sample| sample.weight).sum();
+        let none = |share| NoTabletop::NoPlane { share, with_gravity: gravity.is_some() };
+        let &(largest_score, largest) = scored.first().ok_or_else(|| none(0.0))?;
+        let below = scored.iter().find(|(score, plane)| {
+            *score >= LARGE * largest_score
+                && plane.normal.angle(&largest.normal) < PARALLEL
+                && BELOW.contains(&plane.depth_below(&largest, &samples))
+        });
+        let plane = below.map_or(largest, |&(_, plane)| plane).refined(&samples);
+        let on_plane = || samples.iter().filter(|sample| plane.has(sample));
+        let weight: f64 = on_plane().map(|sample| sample.weight).sum();
+        // Pixels without depth count as pixels that are not on the table.
+        let share = weight / all * share;
+        if share < SMALLEST || !is_level(&plane) {
+            return Err(none(share));
+        }
+        let squares: f64 = on_plane().map(|sample| plane.height(&sample.point).powi(2) * sample.weight).sum();
+        Ok(Self {
+            camera_from_task: plane.workspace(&samples, height),
+            distance: -plane.offset,
+            angle: plane.normal.angle(&-Vector3::z()),
+            share,
+            deviation: (squares / weight).sqrt(),
+            tilt: gravity.map(|down| plane.normal.angle(&-down.into_inner())),
+        })
+    }
+}
+
+/// Step along both axes of the image with which about `count` pixels are visited.
+fn stride(image: &DepthImage, count: f64) -> usize {
+    ((image.depth().len() as f64 / count).sqrt() as usize).max(1)
+}
+
+fn samples(image: &DepthImage) -> Vec<Sample> {
+    let camera = image.intrinsics();
+    let (step, half) = (stride(image, POINTS), [camera.width, camera.height].map(|edge| edge as f64 / 2.0));
+    let radius = MIDDLE * half[0].hypot(half[1]);
+    let pixels = (0..camera.height).step_by(step).flat_map(|v| (0..camera.width).step_by(step).map(move |u| (u, v)));
+    let sample = |(u, v)| {
+        let from_middle = (u as f64 - half[0]).hypot(v as f64 - half[1]) / radius;
+        Some(Sample { point: image.point(u, v)?, weight: (-0.5 * from_middle * from_middle).exp() })
+    };
+    pixels.filter_map(sample).collect()
+}
+
+/// Planes through a pixel and its neighbours.
+fn proposals(image: &DepthImage) -> impl Iterator<Item = Plane> {
+    let camera = image.intrinsics();
+    let step = stride(image, PROPOSALS);
+    let pixels =
+        (0..camera.height).step_by(step).flat_map(move |v| (0..camera.width).step_by(step).map(move |u| (u, v)));
+    let baselines = BASELINES.map(|share| (share * camera.width as f64) as usize);
+    pixels.flat_map(move |pixel| baselines.map(|baseline| (pixel, baseline))).filter_map(move |((u, v), baseline)| {
+        let corner = image.point(u, v)?;
+        let (right, below) = (image.point(u + baseline, v)?, image.point(u, v + baseline)?);
+        Plane::of(&corner, (right - corner).cross(&(below - corner)))
+    })
+}
+
+impl Plane {
+    fn of(point: &Point3<f64>, normal: Vector3<f64>) -> Option<Self> {
+        let normal = Unit::try_new(normal, 1e-12)?;
+        // The camera is at the origin.
+        let normal = if normal.dot(&point.coords) < 0.0 { normal } else { -normal };
+        Some(Self { normal, offset: normal.dot(&point.coords) })
+    }
+
+    fn height(&self, point: &Point3<f64>) -> f64 {
+        self.normal.dot(&point.coords) - self.offset
+    }
+
+    /// Whether a point is on the plane. The noise of depth cameras grows with the square of the depth.
+    fn has(&self, sample: &Sample) -> bool {
+        self.is_near(sample, 1.0)
+    }
+
+    fn is_near(&self, sample: &Sample, tolerance: f64) -> bool {
+        self.height(&sample.point).abs() <= tolerance * (0.004 + 0.006 * sample.point.z * sample.point.z)
+    }
+
+    /// Mean distance of the points on this plane below another one, metres.
+    fn depth_below(&self, other: &Plane, samples: &[Sample]) -> f64 {
+        let depths = samples.iter().filter(|sample| self.has(sample)).map(|sample| -other.height(&sample.point));
+        let (count, sum) = depths.fold((0.0, 0.0), |(count, sum), depth| (count + 1.0, sum + depth));
+        sum / count
+    }
+
+    /// The plane of least squares of the points on this one, repeated. The tolerance shrinks, so that the lower edges of
+    /// objects and walls do not tilt it.
+    fn refined(self, samples: &[Sample]) -> Self {
+        const TOLERANCES: [f64; 5] = [1.0, 0.8, 0.6, 0.5, 0.5];
+        TOLERANCES.into_iter().fold(self, |plane, tolerance| {
+            let on_plane = || samples.iter().filter(|sample| plane.is_near(sample, tolerance));
+            let weight: f64 = on_plane().map(|sample| sample.weight).sum();
+            let mean = on_plane().map(|sample| sample.point.coords * sample.weight).sum::<Vector3<f64>>() / weight;
+            let spread = on_plane().map(|sample| (sample.point.coords - mean, sample.weight));
+            let covariance: Matrix3<f64> = spread.map(|(d, weight)| d * d.transpose() * weight).sum();
+            let eigen = SymmetricEigen::new(covariance);
+            let normal = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
+            Self::of(&mean.into(), normal).unwrap_or(plane)
+        })
+    }
+
+    /// `T_camera_task` of the workspace over what stands on the plane.
+    fn workspace(&self, samples: &[Sample], height: f64) -> Isometry3<f64> {
+        let z = self.normal.into_inner();
+        // The right of the image along the plane; for a camera that is rotated to the side, its bottom.
+        let x = [Vector3::x(), Vector3::y()].map(|axis| axis - z * axis.dot(&z));
+        let x = (if x[0].norm() > 0.1 { x[0] } else { x[1] }).normalize();
+        let rotation = Rotation3::from_basis_unchecked(&[x, z.cross(&x), z]);
+        let rotation = UnitQuaternion::from_rotation_matrix(&rotation);
+        let origin = z * self.offset;
+        let on_table = |point: &Point3<f64>| rotation.inverse() * (point.coords - origin);
+        let objects: Vec<(Vector3<f64>, f64)> = samples
+            .iter()
+            .map(|sample| (on_table(&sample.point), sample.weight))
+            .filter(|(at, _)| OBJECTS.contains(&at.z))
+            .collect();
+        let centre = densest(&objects).or_else(|| {
+            // Nothing stands on the table: where the optical axis meets it.
+            (z.z < -0.1).then(|| on_table(&Point3::new(0.0, 0.0, self.offset / z.z)))
+        });
+        let [x, y, _]: [f64; 3] = centre.unwrap_or_default().into();
+        let half = WORKSPACE_SIZE / 2.0;
+        Isometry3::from_parts(Translation3::from(origin), rotation) * Translation3::new(x - half, y - half, -height)
+    }
+}
+
+/// The middle of the square with the edge of the workspace, less a margin, that holds most of the weight: the mean of
+/// the points in it. `None` if there are only a few points, which may be noise.
+fn densest(points: &[(Vector3<f64>, f64)]) -> Option<Vector3<f64>> {
+    const FEWEST: usize = 15;
+    const EDGE: f64 = 0.8 * WORKSPACE_SIZE;
+    let near = |centre: Vector3<f64>| {
+        points.iter().filter(move |(at, _)| (at - centre).xy().amax() <= EDGE / 2.0).map(|(at, weight)| (*at, *weight))
+    };
+    if points.len() < FEWEST {
+        return None;
+    }
+    let step = points.len().div_ceil(200);
+    let candidates = points.iter().step_by(step).map(|(at, _)| *at);
+    let weight = |centre: &Vector3<f64>| near(*centre).map(|(_, weight)| weight).sum::<f64>();
+    let best = candidates.max_by(|a, b| weight(a).total_cmp(&weight(b)))?;
+    // The middle of the bounds, not the mean: the sides that face the camera have more points than those behind.
+    let bounds = near(best).fold([best; 2], |[low, high], (at, _)| [low.inf(&at), high.sup(&at)]);
+    Some((bounds[0] + bounds[1]) / 2.0)
+}

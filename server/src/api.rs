@@ -1,0 +1,8 @@
+//! The protocols: `grasp.v1` and the Open Inference Protocol over gRPC, and the latter over HTTP.
+
+mod blocking;
+pub(crate) mod call;
+pub(crate) mod grasp;
+pub(crate) mod inference;
+pub(crate) mod rest;
+pub(crate) mod status;
