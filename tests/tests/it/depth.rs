@@ -26,7 +26,7 @@ fn with_options(detect: DetectOptions) -> Options {
 fn fused(cameras: &[Isometry3<f64>], resolution: usize, pose: Isometry3<f64>) -> Volume {
     let mut fusion = Fusion::new(resolution, WORKSPACE_SIZE);
     for camera in cameras {
-        fusion.integrate(&DepthImage::new(CAMERA, &depth(camera)).unwrap(), camera);
+        fusion.integrate(&DepthImage::new(CAMERA, depth(camera)).unwrap(), camera);
     }
     fusion.volume(pose).unwrap()
 }

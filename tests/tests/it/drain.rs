@@ -1,4 +1,6 @@
 //! Shutdown of the server, and errors at its start.
+//!
+//! Several threads, so that clients read what the server sends while a test waits for its exit.
 
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -24,7 +26,7 @@ fn slow() -> TestModel {
     TestModel::new("slow").convolutions(60)
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn an_idle_server_exits_with_code_0() {
     for workers in ["1", "3"] {
         let server = Server::run(&[TestModel::new("mirror")], &["--workers", workers]);
@@ -36,7 +38,7 @@ async fn an_idle_server_exits_with_code_0() {
     }
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn accepted_requests_are_answered_before_the_exit() {
     let mut server = Server::run(&[slow()], &["--queue", "8"]);
     let client = server.client().await;
@@ -54,7 +56,7 @@ async fn accepted_requests_are_answered_before_the_exit() {
     assert_eq!(server.wait().unwrap().code(), Some(0));
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn an_open_stream_is_ended_with_unavailable() {
     let mut server = Server::run(&[TestModel::new("mirror")], &[]);
     let (send, requests) = mpsc::channel(1);
@@ -70,7 +72,7 @@ async fn an_open_stream_is_ended_with_unavailable() {
     drop(send);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn an_open_reflection_stream_does_not_delay_the_exit() {
     let mut server = Server::run(&[TestModel::new("mirror")], &["--drain-timeout", "3600"]);
     let channel = Endpoint::from_shared(format!("http://{}", server.grpc())).unwrap().connect().await.unwrap();
@@ -87,7 +89,7 @@ async fn an_open_reflection_stream_does_not_delay_the_exit() {
     drop(send);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn after_the_drain_timeout_requests_are_refused_and_the_exit_code_is_0() {
     let mut server = Server::run(&[slow()], &["--queue", "8", "--drain-timeout", "0"]);
     let client = server.client().await;
@@ -104,7 +106,7 @@ async fn after_the_drain_timeout_requests_are_refused_and_the_exit_code_is_0() {
     assert_eq!(server.wait().unwrap().code(), Some(0));
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn a_server_that_is_warming_up_exits_with_code_0() {
     let server = Server::start(&[slow()], &[]);
     assert_eq!(stop(server).await, Some(0));

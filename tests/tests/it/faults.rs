@@ -79,7 +79,7 @@ fn log_to(level: &str, redirection: &str) -> (LocalServer, TempDir) {
     (LocalServer::spawn(&script, args).unwrap(), folder)
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn requests_succeed_when_the_log_cannot_be_written() {
     // Every write to /dev/full fails, as on a full disk.
     let (mut server, _folder) = log_to("trace", "2> /dev/full");
@@ -91,7 +91,7 @@ async fn requests_succeed_when_the_log_cannot_be_written() {
     assert_eq!(server.wait().unwrap().code(), Some(0));
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn requests_succeed_when_the_log_blocks_and_dropped_lines_are_counted() {
     let pipes = tempfile::tempdir().unwrap();
     let pipe = pipes.path().join("pipe");
@@ -144,7 +144,7 @@ async fn a_client_that_does_not_read_blocks_no_others_and_loses_no_replies() {
     assert!(replies.next().await.is_none());
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn incomplete_messages_are_refused_after_the_stall_timeout() {
     let mut server = Server::run(&[TestModel::new("mirror")], &["--stall-timeout", "0.3"]);
     let message = pb::DetectGraspsRequest { volume: Some(encode(&volume(), DataType::F32, "")), ..Default::default() };
@@ -335,7 +335,7 @@ async fn calls_that_are_reset_before_or_within_their_message_count_as_cancelled(
     assert_eq!(server.metric("graspd_requests_total{code=\"INVALID_ARGUMENT\",model=\"\"}"), 0.0);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn a_flood_of_refusals_does_not_flood_the_log() {
     let logs = tempfile::tempdir().unwrap();
     let log = logs.path().join("log");

@@ -28,7 +28,7 @@ async fn detect(client: &Client, volume: &Volume, model: &str) -> Result<(), (Co
     detected.map(|_| ()).map_err(|error| (error.code().unwrap_or(Code::Ok), error.to_string()))
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn an_inference_that_does_not_end_loses_its_session_and_the_others_serve_on() {
     let mut server = Server::run(&models(), &["--workers", "2", "--inference-timeout", "0.5", "--queue", "8"]);
     let client = server.client().await;

@@ -54,7 +54,7 @@ async fn the_server_is_ready_after_the_warm_up_and_not_before() {
     assert_eq!(client.detect(&volume, Options::default()).await.unwrap().grasps.len(), 1);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn health_watches_report_the_drain_and_do_not_delay_it() {
     let mut server = Server::run(&[TestModel::new("mirror")], &[]);
     let mut health = HealthClient::new(server.channel().await);
@@ -80,7 +80,7 @@ async fn the_health_of_an_unknown_service_is_not_found() {
     assert_eq!(watch.next().await.unwrap().unwrap().status(), ServingStatus::ServiceUnknown);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn the_server_is_not_ready_during_the_drain() {
     let mut server = Server::run(&[TestModel::new("slow").convolutions(200)], &[]);
     let client = server.client().await;

@@ -7,7 +7,7 @@ use grasp_client::{Client, Options};
 use grasp_tests::{RESOLUTION, TestModel, blobs, grasp, graspd};
 use nalgebra::Isometry3;
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn requests_are_answered_on_a_unix_socket_whose_file_is_removed_at_the_end() {
     let folder = tempfile::tempdir().unwrap();
     TestModel::new("mirror").write(folder.path());

@@ -163,7 +163,7 @@ impl Target {
 fn random_requests_are_answered_or_refused() {
     let target = Target::new();
     let (answered, refused) = (Cell::new(0), Cell::new(0));
-    let mut runner = TestRunner::new(Config { cases: 4000, failure_persistence: None, ..Config::default() });
+    let mut runner = TestRunner::new(Config { cases: 800, failure_persistence: None, ..Config::default() });
     let outcome = runner.run(&request().no_shrink(), |request| {
         let mut client = GraspServiceClient::new(target.channel.clone());
         match target.runtime.block_on(client.detect_grasps(request.clone())) {
@@ -227,7 +227,7 @@ fn score_request() -> impl Strategy<Value = pb::ScoreGraspsRequest> {
 fn random_candidates_are_scored_or_refused() {
     let target = Target::new();
     let (answered, refused) = (Cell::new(0), Cell::new(0));
-    let mut runner = TestRunner::new(Config { cases: 600, failure_persistence: None, ..Config::default() });
+    let mut runner = TestRunner::new(Config { cases: 200, failure_persistence: None, ..Config::default() });
     let outcome = runner.run(&score_request().no_shrink(), |request| {
         let mut client = GraspServiceClient::new(target.channel.clone());
         let count = request.candidates.len();
@@ -270,7 +270,7 @@ fn malformed_messages_are_refused() {
         bytes
     });
     let bytes = prop_oneof![damaged, vec(any::<u8>(), 0..200)];
-    let mut runner = TestRunner::new(Config { cases: 2000, failure_persistence: None, ..Config::default() });
+    let mut runner = TestRunner::new(Config { cases: 400, failure_persistence: None, ..Config::default() });
     let outcome = runner.run(&bytes.no_shrink(), |bytes| {
         if let Err(status) = target.runtime.block_on(send(target.channel.clone(), bytes)) {
             let codes = [Code::InvalidArgument, Code::NotFound];

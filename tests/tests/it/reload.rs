@@ -117,7 +117,7 @@ async fn invalid_files_change_nothing_and_are_counted() {
     assert_eq!(server.metric("graspd_rejected_files"), 0.0);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn only_regular_files_of_limited_size_with_short_names_are_loaded() {
     let server = Server::run(&[TestModel::new("mirror")], &["--watch", "0", "--max-model-bytes", "1000000"]);
     let client = server.client().await;

@@ -95,7 +95,7 @@ async fn incomplete_bodies_share_the_memory_of_incomplete_messages() {
     server.wait_for("graspd_receiving_bytes", 0.0).await;
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn accepted_requests_are_answered_before_the_exit() {
     let mut server = Server::run(&[TestModel::new("mirror").convolutions(60)], &["--rest", "127.0.0.1:0"]);
     let calls = [open(&server, INFER, infer().len(), infer().as_bytes()).await].map(response);

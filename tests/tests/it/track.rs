@@ -73,7 +73,7 @@ async fn an_invalid_view_ends_neither_the_stream_nor_the_volume() {
     let error = tracking.add(&[opposite.clone(), bad], low()).await.unwrap_err();
     assert!(!error.views_added() && error.to_string().contains("views[1]: camera at"), "{error}");
     assert_eq!(tracking.add(&[], low()).await.unwrap().grasps, first.grasps);
-    let both = tracking.add(&[opposite.clone()], low()).await.unwrap();
+    let both = tracking.add(std::slice::from_ref(&opposite), low()).await.unwrap();
     let expected = client.detect_from_depth(&[good.clone(), opposite], &Workspace::default(), low()).await.unwrap();
     assert_eq!(both.grasps, expected.grasps);
     let other = DetectOptions { model: "other".to_owned(), ..low().detect };
