@@ -9,11 +9,13 @@ The last line counts the tests. Variables that replace downloads are described i
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Dict, List, NamedTuple, Optional
 
@@ -149,13 +151,23 @@ def test_programs(environment: Dict[str, str]) -> List[TestProgram]:
 
 
 def run_tests(programs: List[TestProgram], name: Optional[str], environment: Dict[str, str]) -> Outcome:
-    outcomes = [run_program(program, name, environment) for program in programs]
+    """The end-to-end tests wait for processes much of the time, so the others, which compute, run beside them with a lower
+    priority."""
+    end_to_end = [program for program in programs if program.folder == str(ROOT / "tests")]
+    others = [program for program in programs if program not in end_to_end]
+    lower = ["nice"] if shutil.which("nice") else []
+    with ThreadPoolExecutor() as lanes:
+        beside = lanes.submit(lambda: [run_program(program, name, environment, lower) for program in others])
+        outcomes = [run_program(program, name, environment, []) for program in end_to_end]
+        outcomes += beside.result()
     outcomes.append(run_doctests(name, environment))
     return Outcome(*map(sum, zip(*outcomes)))
 
 
-def run_program(program: TestProgram, name: Optional[str], environment: Dict[str, str]) -> Outcome:
-    command = [program.executable, *([name] if name else [])]
+def run_program(
+    program: TestProgram, name: Optional[str], environment: Dict[str, str], prefix: List[str]
+) -> Outcome:
+    command = [*prefix, program.executable, *([name] if name else [])]
     return counted(program.title, command, program.folder, environment)
 
 

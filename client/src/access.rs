@@ -31,7 +31,7 @@ pub struct Access {
 #[derive(Clone)]
 pub struct Token(MetadataValue<Ascii>);
 
-/// When a call is retried. Only failures that can pass are retried: the server is unreachable, the connection breaks,
+/// When a call is retried. Only transient failures are retried: the server is unreachable, the connection breaks,
 /// or the server is busy. Detection is idempotent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Retry {

@@ -159,7 +159,7 @@ pub struct Detection {
     pub warnings: Vec<pb::GeometryWarning>,
     /// The table that was found, with [`Workspace::find_table`].
     pub table: Option<pb::FoundTable>,
-    /// By which the depths of each view were multiplied, with [`Workspace::correct_depth_scale`].
+    /// Factors by which the depths of the views were multiplied, with [`Workspace::correct_depth_scale`].
     pub depth_factors: Vec<f64>,
 }
 
@@ -206,7 +206,7 @@ pub struct Scores {
     pub warnings: Vec<pb::GeometryWarning>,
     /// The table that was found, with [`Workspace::find_table`].
     pub table: Option<pb::FoundTable>,
-    /// By which the depths of each view were multiplied, with [`Workspace::correct_depth_scale`].
+    /// Factors by which the depths of the views were multiplied, with [`Workspace::correct_depth_scale`].
     pub depth_factors: Vec<f64>,
 }
 

@@ -1,6 +1,6 @@
 use std::str::FromStr;
 
-use crate::metadata::{MetadataError, PREFIX};
+use crate::metadata_error::{MetadataError, PREFIX};
 use crate::onnx::{ModelProto, StringStringEntryProto};
 
 /// Platt's scaling of the log-odds of success (Platt, "Probabilistic Outputs for Support Vector Machines", 1999), so

@@ -6,7 +6,8 @@ use std::collections::BTreeMap;
 use grasp::gpd::{CHANNELS, IMAGE_SIZE};
 
 use crate::graph::{Builder, Conv};
-use crate::metadata::{PREFIX, PROVENANCE};
+use crate::metadata::PROVENANCE;
+use crate::metadata_error::PREFIX;
 use crate::onnx::{AttributeProto, ModelProto, StringStringEntryProto};
 
 /// Input of the classifier: f32 `[batch, CHANNELS, IMAGE_SIZE, IMAGE_SIZE]` in [0, 1].

@@ -25,7 +25,7 @@ pub struct Scenes {
     pub warnings: Vec<Warning>,
     /// The table that determined the workspace.
     pub table: Option<FoundTable>,
-    /// By which the depths of each view were multiplied; empty if they were not to be corrected.
+    /// Factors by which the depths of the views were multiplied; empty if they were not to be corrected.
     pub depth_factors: Vec<f64>,
     /// The time that the fusion took; `None` for a volume.
     pub fusion: Option<Duration>,

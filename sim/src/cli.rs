@@ -19,7 +19,7 @@ mod tables;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
 use clap::{Args, Parser, ValueEnum};
 use grasp_picture::{Picture, object_color};
 use grasp_sim::camera::{self, DepthNoise, Views};
@@ -35,12 +35,6 @@ pub enum Command {
     Label(label::Label),
     /// Observe labelled scenes again with other views and noise; scenes and trials stay the same.
     Observe(observe::Observe),
-    /// The former name of `observe`.
-    #[command(hide = true, disable_help_flag = true)]
-    Look {
-        #[arg(num_args = 0.., trailing_var_arg = true, allow_hyphen_values = true)]
-        _rest: Vec<String>,
-    },
     /// Convert a data set to another format.
     Convert(convert::Convert),
     /// Merge data sets that several machines have labelled.
@@ -72,7 +66,6 @@ impl Command {
         match self {
             Self::Label(command) => command.run(),
             Self::Observe(command) => command.run(),
-            Self::Look { .. } => bail!(renamed("look", "observe")),
             Self::Convert(command) => command.run(),
             Self::Merge(command) => command.run(),
             Self::Stats(command) => command.run(),
@@ -98,7 +91,7 @@ struct SceneArgs {
 
     /// Objects: the procedural sets `train`, `test` or `generated` (a new object at every draw), or a folder of URDF
     /// files [default: train for labels and candidates, otherwise test].
-    #[arg(long, value_parser = parse_objects)]
+    #[arg(long)]
     objects: Option<String>,
 
     /// Part of the folder's files in the order of their names: `validation` is every fifth file, `train` the others.
@@ -109,7 +102,7 @@ struct SceneArgs {
     /// same azimuth ±5°, 30–75° from the vertical), `circle` (six views from above), or `random:MIN-MAX` (MIN to MAX
     /// views of any azimuth, 20–75° from the vertical). From a comma-separated list one entry is drawn for each
     /// observation.
-    #[arg(long, default_value = "side", value_parser = parse_camera_words)]
+    #[arg(long, default_value = "side")]
     views: String,
 
     /// Share of the observations with depth noise.
@@ -223,8 +216,7 @@ impl Scene {
 
     fn objects(self, name: &str) -> anyhow::Result<ObjectSet> {
         Ok(match (name, self) {
-            // `endless` is the former name, which older data sets contain.
-            ("generated" | "endless", _) => ObjectSet::generated(),
+            ("generated", _) => ObjectSet::generated(),
             ("train", _) => ObjectSet::procedural(Split::Train),
             ("test", Self::Pile) => ObjectSet::procedural(Split::PileTest),
             ("test", Self::Packed) => ObjectSet::procedural(Split::PackedTest),
@@ -250,24 +242,6 @@ impl SceneArgs {
     fn views(&self) -> anyhow::Result<Views> {
         parse_views(&self.views).with_context(|| format!("--views is `{}`: use {VIEWS}", self.views))
     }
-}
-
-/// The error for a renamed word of the command line.
-fn renamed(old: &str, new: &str) -> String {
-    format!("`{old}` is now `{new}`")
-}
-
-fn parse_objects(text: &str) -> Result<String, String> {
-    if text == "endless" { Err(renamed("endless", "generated")) } else { Ok(text.to_owned()) }
-}
-
-fn parse_camera_words(text: &str) -> Result<String, String> {
-    if text.contains("anywhere") { Err(renamed("anywhere", "random")) } else { Ok(text.to_owned()) }
-}
-
-/// Rejects `--looks`, the former name of `--observations`.
-fn refuse_looks(_: &str) -> Result<String, String> {
-    Err(renamed("--looks", "--observations"))
 }
 
 /// Parses a quality of grasps, with the limits of the server.
@@ -297,8 +271,7 @@ fn parse_views(text: &str) -> Option<Views> {
             degrees.is_finite().then(|| Views::Side { azimuth: degrees.to_radians() })
         }
         "circle" if rest.is_empty() => Some(Views::Circle),
-        // `anywhere` is the former name, which older data sets contain.
-        "random" | "anywhere" => {
+        "random" => {
             let (min, max) = rest.split_once('-').unwrap_or((rest, rest));
             let (min, max) = (min.parse().ok()?, max.parse().ok()?);
             (1 <= min && min <= max).then_some(Views::Random(min..=max))
@@ -329,7 +302,8 @@ mod tests {
         assert_eq!(parse_views("random:2"), Some(Views::Random(2..=2)));
         let one_of = Views::OneOf(vec![Views::Random(1..=1), Views::Circle]);
         assert_eq!(parse_views("random:1,circle"), Some(one_of));
-        for wrong in ["", "top", "side:x", "side:nan", "side:inf", "anywhere", "random:0-2", "random:3-2", "circle:1"] {
+        for wrong in ["", "top", "side:x", "side:nan", "side:inf", "anywhere:1", "random:0-2", "random:3-2", "circle:1"]
+        {
             assert_eq!(parse_views(wrong), None, "{wrong}");
         }
         for wrong in ["side,", "side,top"] {

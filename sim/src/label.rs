@@ -19,7 +19,7 @@ use crate::trial;
 pub const YAWS: usize = DISTINCT_YAWS + 1;
 
 /// Enlargement of the hand on its approach to a labelled grasp, metres per side, in addition to the contact distance.
-const SWELL: f64 = 0.0012;
+const PADDING: f64 = 0.0012;
 
 /// Maximum number of repetitions of a successful grasp, each with a small pose error.
 const REPEATS: usize = 6;
@@ -252,7 +252,7 @@ fn try_point(world: &World, cloud: &[SurfacePoint], rng: &mut impl Rng) -> Point
     let turned =
         |yaw: usize| pose * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw as f64 * PI / DISTINCT_YAWS as f64);
     let tried: [Option<f64>; DISTINCT_YAWS] =
-        std::array::from_fn(|yaw| match trial::label(world, &turned(yaw), SWELL) {
+        std::array::from_fn(|yaw| match trial::label(world, &turned(yaw), PADDING) {
             trial::Outcome::Lifted { width, .. } => Some(width),
             _ => None,
         });

@@ -73,12 +73,12 @@ impl Outcome {
     }
 }
 
-/// Tries a grasp for a label: any contact on the approach is a failure. The hand is enlarged by `swell` metres per side
+/// Tries a grasp for a label: any contact on the approach is a failure. The hand is enlarged by `padding` metres per side
 /// for the contact test. `world` is not changed.
 #[must_use]
-pub fn label(world: &World, grasp: &Isometry3<f64>, swell: f64) -> Outcome {
+pub fn label(world: &World, grasp: &Isometry3<f64>, padding: f64) -> Outcome {
     // One test of the swept hand covers the pre-grasp and every step of the approach.
-    if world.is_near(&SWEPT_HAND, grasp, CONTACT_GAP + swell) {
+    if world.is_near(&SWEPT_HAND, grasp, CONTACT_GAP + padding) {
         return Outcome::BlockedOnApproach;
     }
     close_and_lift(&mut world.clone(), grasp, grasp, Until::NothingIsHeld)

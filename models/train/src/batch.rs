@@ -10,7 +10,7 @@ use crate::augment::Transform;
 use crate::loss::Targets;
 use crate::occupancy::OccupancyTargets;
 use crate::teacher::Teacher;
-use crate::trainer::TrainError;
+use crate::train_error::TrainError;
 use crate::training_settings::TrainingSettings;
 
 /// Number of batches that a background thread reads in advance.

@@ -226,9 +226,6 @@ enum AugmentArg {
     Rotate,
     Mirror,
     Shift,
-    /// The former name of `rotate`.
-    #[value(hide = true)]
-    Turns,
 }
 
 fn main() -> anyhow::Result<()> {

@@ -29,9 +29,6 @@ pub(crate) struct Export {
     /// computation. The network must regress axes.
     #[arg(long)]
     average_rotations: bool,
-    /// The former name of `--average-rotations`.
-    #[arg(long, hide = true, num_args = 0..=1, default_missing_value = "", value_parser = refuse_former_name)]
-    turns: Option<String>,
     /// Output file. Its stem is the model's name.
     #[arg(long)]
     out: PathBuf,
@@ -44,10 +41,6 @@ pub(crate) struct Export {
     /// Number of volumes for the calibration, evenly spaced over the data sets.
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
     calibrate: u64,
-}
-
-fn refuse_former_name(_: &str) -> Result<String, String> {
-    Err("`--turns` is now `--average-rotations`".to_owned())
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]

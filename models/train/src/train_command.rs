@@ -48,7 +48,6 @@ pub(crate) fn train(training: &TrainArgs) -> Result<()> {
             || training.patience.is_none() && training.keep == KeptWeights::Last,
         "--patience and --keep best need results; give --evaluate, or --val greater than 0"
     );
-    ensure!(!training.augment.contains(&AugmentArg::Turns), "`--augment turns` is now `--augment rotate`");
     ensure!(
         training.max_shift.is_none() || training.augment.contains(&AugmentArg::Shift),
         "--max-shift needs --augment shift"

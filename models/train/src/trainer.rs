@@ -1,13 +1,12 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use grasp_data::{DataError, Dataset};
+use grasp_data::Dataset;
 use grasp_models::onnx::ModelProto;
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use tch::{TchError, no_grad};
-use thiserror::Error;
+use tch::no_grad;
 
 use crate::adam::Adam;
 use crate::batch::{Batch, Example, read_ahead};
@@ -16,42 +15,10 @@ use crate::epoch_record::{EpochRecord, Validation};
 use crate::execution_options::ExecutionOptions;
 use crate::executor::Executor;
 use crate::loss::{Loss, LossError, LossSums, LossWeights};
-use crate::supported::ExecuteError;
-use crate::teacher::{Teacher, TeacherError};
+use crate::teacher::Teacher;
+use crate::train_error::TrainError;
 use crate::training_settings::TrainingSettings;
 use crate::weight_average::WeightAverage;
-
-/// Why training stopped.
-#[derive(Debug, Error)]
-pub enum TrainError {
-    /// The settings do not fit the data.
-    #[error("{0}")]
-    Settings(String),
-    /// The data cannot be read.
-    #[error(transparent)]
-    Data(#[from] DataError),
-    /// The graph cannot be executed.
-    #[error(transparent)]
-    Execute(#[from] ExecuteError),
-    /// libtorch failed.
-    #[error(transparent)]
-    Torch(#[from] TchError),
-    /// The checkpoint cannot be resumed.
-    #[error(transparent)]
-    Checkpoint(#[from] CheckpointError),
-    /// The teacher failed.
-    #[error("--teacher: {0}")]
-    Teacher(#[from] TeacherError),
-    /// The loss cannot be computed.
-    #[error(transparent)]
-    Loss(#[from] LossError),
-    /// The training diverged.
-    #[error("the loss is not finite at step {step}; use a smaller learning rate or a warm-up")]
-    Diverged {
-        /// Number of the step.
-        step: u64,
-    },
-}
 
 /// How [`Trainer::epoch`] ended.
 #[derive(Clone, Debug, PartialEq)]

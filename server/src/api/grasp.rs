@@ -22,7 +22,7 @@ use crate::open_streams::OpenStreams;
 use crate::telemetry::recent::Outcome;
 use crate::telemetry::recorder::{self, Recorder};
 use crate::tracked_volumes::TrackedVolumes;
-use replies::Prepared;
+use replies::SceneRequest;
 
 pub(crate) use replies::outputs;
 
@@ -101,7 +101,7 @@ impl GraspApi {
         model: Arc<Model>,
         params: DetectParams,
         call: &mut Call,
-    ) -> Result<Prepared, RequestError> {
+    ) -> Result<SceneRequest, RequestError> {
         let origin = FrameStamp::checked("volume.frame_id", std::mem::take(&mut volume.frame_id), volume.stamp)?;
         params.check_without_views()?;
         call.set_model(&model);
@@ -118,7 +118,7 @@ impl GraspApi {
         check_margin(params.margin, volume.resolution() as f64 * volume.voxel_size())?;
         let region = (params.margin > 0.0).then(|| volume.within(params.margin));
         let scenes = Scenes { scenes: vec![Scene { region, ..volume.into() }], ..Scenes::default() };
-        Ok(Prepared { model, params: params.into(), scenes, origin, waited })
+        Ok(SceneRequest { model, params: params.into(), scenes, origin, waited })
     }
 
     /// Decodes views, and fuses them for a model.
@@ -129,7 +129,7 @@ impl GraspApi {
         model: Arc<Model>,
         params: DetectParams,
         call: &mut Call,
-    ) -> Result<Prepared, RequestError> {
+    ) -> Result<SceneRequest, RequestError> {
         views.check()?;
         let (workspace, origin) = workspace_of(workspace)?;
         call.set_model(&model);
@@ -142,7 +142,7 @@ impl GraspApi {
         let scenes = blocking(permit, call.deadline, move |is_wanted| {
             perceive(views.decode()?, workspace, &reader.input, &asked, is_wanted)
         });
-        Ok(Prepared { scenes: scenes.await?, model, params, origin, waited })
+        Ok(SceneRequest { scenes: scenes.await?, model, params, origin, waited })
     }
 
     /// Scores the candidates of a request.
@@ -169,10 +169,11 @@ impl GraspApi {
                 let field = format!("{message}.workspace.extent");
                 return Err(RequestError::invalid(field, "given", "must be absent"));
             }
-            let prepared = self.of_views(views, workspace, Arc::clone(&model), params.clone(), call).await;
-            prepared.map_err(|error| if error.field().starts_with("options") { error } else { error.inside(message) })
+            let scene_request = self.of_views(views, workspace, Arc::clone(&model), params.clone(), call).await;
+            scene_request
+                .map_err(|error| if error.field().starts_with("options") { error } else { error.inside(message) })
         };
-        let prepared = match scene {
+        let scene_request = match scene {
             None => {
                 let needed = "volume, depth or clouds must be given";
                 return Err(RequestError::invalid("scene", "absent", needed));
@@ -185,7 +186,7 @@ impl GraspApi {
                 in_views(Views::Clouds(views), workspace, "clouds", call).await?
             }
         };
-        prepared.score(candidates, call).await
+        scene_request.score(candidates, call).await
     }
 
     /// Finds the table in a view.

@@ -177,7 +177,7 @@ impl RequestBody {
     }
 }
 
-/// The status for a client that is gone. A client that cancels resets the stream, which hyper reports as the end of the
+/// The status of a request that was cancelled or whose connection was lost. A client that cancels resets the stream, which hyper reports as the end of the
 /// body, and a lost connection as its error. tonic takes both, and the code CANCELLED, for the end of the request, and
 /// would report a malformed message.
 fn gone() -> Status {

@@ -12,7 +12,7 @@ use tokio_rustls::rustls::{self, RootCertStore};
 use tracing::warn;
 use x509_parser::pem::Pem;
 
-/// How long before its end a certificate is warned about.
+/// Remaining validity of a certificate below which the server warns.
 const SOON: Duration = Duration::from_secs(14 * 24 * 3600);
 
 /// A checked configuration of TLS.

@@ -11,7 +11,6 @@ use grasp_sim::ordered;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::data::DataArgs;
-use super::refuse_looks;
 
 /// The same seed gives the same data on any number of threads. An interrupted run continues where it stopped, also with
 /// a larger number of scenes.
@@ -36,9 +35,6 @@ pub struct Label {
     /// Observations of each scene, with different views and noise; more than one needs the packed format.
     #[arg(long, default_value_t = 1)]
     observations: usize,
-
-    #[arg(long, hide = true, value_parser = refuse_looks)]
-    looks: Option<String>,
 
     /// Output folder.
     #[arg(long)]

@@ -10,7 +10,7 @@ use nalgebra::{Isometry3, Point3};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::{Scene, parse_objects};
+use super::Scene;
 
 /// Columns and rows of the picture, and the distance between objects, metres.
 const COLUMNS: usize = 10;
@@ -21,7 +21,7 @@ const PITCH: f64 = 0.16;
 #[derive(Args)]
 pub struct Objects {
     /// Objects: the procedural sets `train`, `test` or `generated`, or a folder of URDF files.
-    #[arg(long, default_value = "train", value_parser = parse_objects)]
+    #[arg(long, default_value = "train")]
     objects: String,
 
     /// Scenario of the test objects.

@@ -9,7 +9,7 @@ use grasp_sim::label::SceneConfig;
 use grasp_sim::ordered;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{Part, Scene, Sensor, VIEWS, parse_camera_words, parse_share, parse_views, refuse_looks};
+use super::{Part, Scene, Sensor, VIEWS, parse_share, parse_views};
 
 /// Much faster than labelling, because no grasp is tried. An interrupted run continues where it stopped.
 #[derive(Args)]
@@ -18,15 +18,12 @@ pub struct Observe {
     data: PathBuf,
 
     /// Cameras, as for `label`.
-    #[arg(long, value_parser = parse_camera_words)]
+    #[arg(long)]
     views: String,
 
     /// Observations of each scene.
     #[arg(long, default_value_t = 1)]
     observations: usize,
-
-    #[arg(long, hide = true, value_parser = refuse_looks)]
-    looks: Option<String>,
 
     /// Share of the observations with depth noise.
     #[arg(long, default_value_t = 1.0, value_parser = parse_share)]

@@ -157,7 +157,7 @@ class Detection:
     table: FoundTable | None = None
     """The table that was found, if the workspace has `find_table`."""
     depth_factors: tuple[float, ...] = ()
-    """By which the depths of each view were multiplied, if the workspace has `correct_depth_scale`."""
+    """Factors by which the depths of the views were multiplied, if the workspace has `correct_depth_scale`."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ class Scores:
     table: FoundTable | None
     """The table that was found, if the workspace has `find_table`."""
     depth_factors: tuple[float, ...]
-    """By which the depths of each view were multiplied, if the workspace has `correct_depth_scale`."""
+    """Factors by which the depths of the views were multiplied, if the workspace has `correct_depth_scale`."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 mod cloud;
 mod detect_args;
+mod drawing;
 mod export;
 mod files;
 mod image;

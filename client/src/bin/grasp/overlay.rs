@@ -10,8 +10,8 @@ use grasp_client::Detection;
 use grasp_picture::{Picture, quality_color};
 use nalgebra::Isometry3;
 
+use crate::drawing::{SHOWN, frame};
 use crate::files::in_file;
-use crate::view::{SHOWN, frame};
 
 /// A picture of the task frame over an image of the camera.
 pub(crate) struct Overlay(Picture);

@@ -316,8 +316,6 @@ fn errors_name_the_flag_or_the_file() {
         ("train --data data --out x.onnx", "--network"),
         ("train --from start.onnx --data data --out x.onnx --device cuda:99", "--device is cuda:99"),
         ("train --from start.onnx --data data --out x.onnx --device gpu", "cuda:N"),
-        ("train --network vgn --data data --out x.onnx --augment turns", "`--augment turns` is now `--augment rotate`"),
-        ("export --from start.onnx --precision fp16 --turns --out x.onnx", "`--turns` is now `--average-rotations`"),
         ("export --from start.onnx --precision int8 --out x.onnx", "add --data"),
     ] {
         let output = command(folder.path(), arguments).output().unwrap();

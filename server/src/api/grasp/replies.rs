@@ -14,7 +14,7 @@ use crate::api::call::Call;
 use crate::telemetry::recent::{Outcome, Shown};
 
 /// A checked request: the scenes for a model.
-pub(crate) struct Prepared {
+pub(crate) struct SceneRequest {
     pub model: Arc<Model>,
     pub params: Arc<DetectParams>,
     pub scenes: Scenes,
@@ -34,7 +34,7 @@ struct Context {
     preprocessing: Duration,
 }
 
-impl Prepared {
+impl SceneRequest {
     /// Detects grasps in the scenes.
     pub async fn detect(self, call: &mut Call) -> Result<(pb::DetectGraspsResponse, Option<Outcome>), RequestError> {
         let request = call.metadata(self.params.priority);

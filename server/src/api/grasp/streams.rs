@@ -16,7 +16,7 @@ use tonic::codegen::BoxStream;
 use tonic::{Request, Response, Status, Streaming};
 use tracing::warn;
 
-use super::replies::Prepared;
+use super::replies::SceneRequest;
 use super::{GraspApi, grasps, workspace_of};
 use crate::api::blocking::blocking;
 use crate::api::call::{Answer, Call, CallContext};
@@ -235,7 +235,7 @@ impl GraspApi {
         origin.stamp = stamp.or(origin.stamp);
         *tracked = Some((Arc::new(track), origin.clone()));
         *views_added = true;
-        Prepared { model, params, scenes, origin, waited }.detect(call).await
+        SceneRequest { model, params, scenes, origin, waited }.detect(call).await
     }
 }
 

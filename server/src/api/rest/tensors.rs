@@ -26,7 +26,7 @@ const MAX_ENTRIES: usize = 64;
 const BINARY_SIZE: &str = "binary_data_size";
 /// The parameter of an output: whether it is returned behind the JSON part.
 const BINARY: &str = "binary_data";
-/// The parameter of a request: the default of the one before.
+/// The parameter of a request: the default of [`BINARY`] for all outputs.
 const BINARY_OUTPUT: &str = "binary_data_output";
 
 /// An inference request, with the bytes of its binary tensors.
