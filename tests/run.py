@@ -33,7 +33,7 @@ HAS_LIBTORCH = bool(os.environ.get("LIBTORCH")) or native.PLATFORM in native.LIB
 if not HAS_LIBTORCH:
     WORKSPACE += ["--exclude", "grasp-train"]
 # Seconds after which a test program is stopped.
-LIMIT = 1200
+LIMIT = 1800
 
 # Downloads by the variable that has their paths.
 NEEDED_TO_COMPILE = {"LIBTORCH": native.libtorch} if HAS_LIBTORCH else {}

@@ -10,7 +10,7 @@ use crate::model::Model;
 use crate::observer::Refusal;
 use crate::scheduler::{Refused, Scheduler, Service};
 
-/// A semaphore whose waiting requests get the permits in the order of a [`Scheduler`], for work on the CPU that needs much
+/// A semaphore whose waiting requests get the permits in the order of a `Scheduler`, for work on the CPU that needs much
 /// memory: the conversion of a request and the fusion of its views. A bounded number of requests wait.
 #[derive(Clone)]
 pub struct FairSemaphore(Arc<Scheduler<oneshot::Sender<Permit>>>);

@@ -74,6 +74,18 @@ pub enum NoMeasurement {
         /// Depth of the workspace centre, metres.
         distance: f64,
     },
+    /// All readings on the workspace are beyond the range.
+    #[error(
+        "all depths on the workspace are beyond {DEPTH_MAX} m: at least {depth:.3} m, {:.1} × the {distance:.3} m of the \
+         workspace centre; check the depth unit and the camera pose",
+        f64::from(*depth) / distance
+    )]
+    Far {
+        /// Smallest depth measured on the workspace, metres.
+        depth: f32,
+        /// Depth of the workspace centre, metres.
+        distance: f64,
+    },
     /// All measured surfaces are in front of the workspace.
     #[error(
         "all measured depths are in front of the workspace: at most {depth:.4} m, its centre is at {distance:.3} m; \
@@ -224,9 +236,17 @@ impl Fusion {
         if pixels.is_empty() {
             return NoMeasurement::Outside { u: centre_u, v: centre_v };
         }
-        let depth = pixels.iter().map(|&(u, v)| image.depth()[v * camera.width + u]);
-        let depth = depth.filter(|depth| *depth > 0.0 && *depth <= DEPTH_MAX).fold(0.0, f32::max);
-        if depth > 0.0 { NoMeasurement::Hidden { depth, distance } } else { NoMeasurement::NoReading { distance } }
+        let readings = || {
+            let depth = pixels.iter().map(|&(u, v)| image.depth()[v * camera.width + u]);
+            depth.filter(|depth| *depth > 0.0 && depth.is_finite())
+        };
+        if let Some(depth) = readings().filter(|depth| *depth <= DEPTH_MAX).reduce(f32::max) {
+            return NoMeasurement::Hidden { depth, distance };
+        }
+        match readings().reduce(f32::min) {
+            Some(depth) => NoMeasurement::Far { depth, distance },
+            None => NoMeasurement::NoReading { distance },
+        }
     }
 
     /// Share of the voxels that a view has measured, also as free space.
@@ -391,6 +411,7 @@ mod tests {
             facing(),
             "no pixel on the workspace has a depth between 0 and 2 m; the workspace centre is at a depth of 0.650 m",
         );
+        nothing(2.6, facing(), "beyond 2 m: at least 2.600 m, 4.0 × the 0.650 m of the workspace centre");
         nothing(0.000_65, facing(), "in front of the workspace: at most 0.0007 m, its centre is at 0.650 m");
     }
 

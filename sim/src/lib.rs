@@ -22,5 +22,4 @@ pub mod statistics;
 pub mod tables;
 pub mod trial;
 
-/// Height of the table's top in the task frame, metres.
-pub const TABLE_HEIGHT: f64 = 0.05;
+pub use grasp::TABLE_HEIGHT;

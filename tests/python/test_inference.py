@@ -4,11 +4,13 @@
     GRASPD_PERF_ANALYZER=$(python3 tests/tools.py perf-analyzer) $(python3 tests/tools.py python) -m unittest discover --start-directory tests/python --pattern test_inference.py
 """
 
+import gzip
 import json
 import os
 import re
 import subprocess
 import unittest
+import zlib
 from queue import SimpleQueue
 from tempfile import NamedTemporaryFile
 from urllib.error import HTTPError
@@ -211,6 +213,25 @@ class InferenceTest(unittest.TestCase):
             np.testing.assert_array_equal(values, expected[output["name"]])
             at += size
         self.assertEqual(at, len(body))
+
+    def test_rest_reads_compressed_bodies(self):
+        body = json.dumps({"inputs": [{"name": "tsdf", "datatype": "FP32", "shape": [1, 1, *EDGE], "data": VOLUMES[0].tolist()}]})
+        plain, gzipped = body.encode(), gzip.compress(body.encode())
+        _, _, expected = self.rest(f"/models/{MODEL}/infer", plain)
+        for encoding, data in {"gzip": gzipped, "deflate": zlib.compress(plain), "identity": plain}.items():
+            with self.subTest(encoding):
+                status, _, text = self.rest(f"/models/{MODEL}/infer", data, Content_Encoding=encoding)
+                self.assertEqual(status, 200, text)
+                self.assertEqual(json.loads(text)["outputs"], json.loads(expected)["outputs"])
+        for data, message in [
+            (gzipped[: len(gzipped) // 2], "the body is not valid"),
+            (plain, "the body is not valid"),
+            # 20 kB that are 20 MB.
+            (gzip.compress(bytes(20 << 20)), "--max-message-bytes"),
+        ]:
+            with self.subTest(message):
+                status, _, text = self.rest(f"/models/{MODEL}/infer", data, Content_Encoding="gzip")
+                self.assertEqual((status, message in json.loads(text)["error"]), (400, True), text)
 
     def test_rest_errors_say_what_is_wrong(self):
         tensor = {"name": "tsdf", "datatype": "FP32", "shape": [1, 1, *EDGE], "data": [0.5]}

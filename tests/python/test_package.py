@@ -232,6 +232,61 @@ class DetectTest(ServerTest):
         with self.assertRaisesRegex(graspd.InvalidArgument, "candidates is a list of 0"):
             self.client.score(views(), [])
 
+    def test_arrays_of_other_libraries_are_read(self):
+        pose = CAMERAS[0]
+        depth = scene.depth(pose)
+        mask = np.isfinite(depth) & (depth > 0)
+        projection = np.hstack([scene.K, np.zeros((3, 1))])
+
+        def found(depth, k=scene.K, labels=None):
+            view = graspd.DepthView(depth, k, camera_from_task=pose, labels=labels)
+            return positions(self.client.detect_from_depth(view, options=LOW))
+
+        expected = found(depth, labels=mask.astype(np.uint8))
+        self.assertGreater(len(expected), 0)
+        for name, again in {
+            "H × W × 1, 3 × 4": found(depth[..., None], projection, mask[..., None]),
+            "bool": found(depth, labels=mask),
+            "float": found(depth, labels=mask.astype(np.float64)),
+            "masked": found(np.ma.masked_array(np.where(mask, depth, 0.3), mask=~mask), labels=mask),
+        }.items():
+            with self.subTest(name):
+                np.testing.assert_array_equal(again, expected)
+        with self.assertRaisesRegex(ValueError, "whole numbers or truth values, got 0.5"):
+            found(depth, labels=mask * 0.5)
+        with self.assertRaisesRegex(ValueError, "the fourth column is"):
+            found(depth, projection + [0, 0, 0, 1])
+
+    def test_structured_and_coloured_point_clouds_are_read(self):
+        pose = graspd.Pose.from_matrix(np.linalg.inv(CAMERAS[0]))
+        points = scene.cloud(CAMERAS[0])[:-1]
+        structured = np.zeros(len(points), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<f4")])
+        structured["x"], structured["y"], structured["z"] = points.T
+
+        def found(points):
+            view = graspd.CloudView(points, (0, 0, 0), frame_from_cloud=pose)
+            return positions(self.client.detect_from_cloud(view, options=LOW))
+
+        expected = found(points)
+        self.assertGreater(len(expected), 0)
+        far = np.vstack([points, [[0, 0, 0.2]]])
+        for name, again in {
+            "structured": found(structured),
+            "coloured": found(np.hstack([points, points])),
+            "masked": found(np.ma.masked_array(far, mask=far[:, 2:] == 0.2 * np.ones(3))),
+        }.items():
+            with self.subTest(name):
+                np.testing.assert_array_equal(again, expected)
+        with self.assertRaisesRegex(ValueError, "the fields x, y and z, got x, y"):
+            found(structured[["x", "y"]])
+
+    def test_a_server_on_this_machine_is_called_without_the_proxy(self):
+        code = "import sys, graspd; print(graspd.Client(sys.argv[1]).health())"
+        environment = os.environ | {"http_proxy": "http://127.0.0.1:9", "PYTHONPATH": INSTALLED.name}
+        command = [sys.executable, "-c", code, self.server.grpc]
+        run = subprocess.run(command, env=environment, capture_output=True, text=True)
+        self.assertEqual(run.stdout, "True\n", run.stderr)
+
     def test_wrong_geometry_is_reported_and_logged_once(self):
         wire.logged.clear()
         view, height = views()[:1], graspd.Options(collision=graspd.CollisionCheck("off", table_height=0.02))
@@ -665,6 +720,13 @@ class AsyncioTest(unittest.IsolatedAsyncioTestCase):
         found = await asyncio.gather(*(self.client.detect(volume, LOW) for _ in range(32)))
         self.assertTrue(all(answer.grasps == found[0].grasps for answer in found))
         self.assertGreater(refused(self.server), 0)
+
+    async def test_a_client_is_made_before_the_event_loop_runs(self):
+        def health():
+            client = graspd.aio.Client(self.server.grpc)
+            return asyncio.run(client.health())
+
+        self.assertTrue(await asyncio.to_thread(health))
 
     async def test_errors_are_raised(self):
         with self.assertRaises(graspd.InvalidArgument) as caught:

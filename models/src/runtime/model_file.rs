@@ -103,7 +103,12 @@ fn optimized(model: &ModelProto, bytes: &[u8]) -> Option<Vec<u8>> {
     if model.encoded_len() != bytes.len() {
         return None;
     }
-    with_upsampling_folded(&with_full_weights(model).ok()?).map(|model| model.encode_to_vec())
+    let mut full = with_full_weights(model).ok()?;
+    if let (Some(full), Some(graph)) = (&mut full.graph, &model.graph) {
+        // Old exporters list the weights among the inputs too. The optimized graph has other weights, and needs these no more.
+        full.input.retain(|input| graph.initializer.iter().all(|weight| weight.name() != input.name()));
+    }
+    with_upsampling_folded(&full).map(|model| model.encode_to_vec())
 }
 
 #[cfg(test)]

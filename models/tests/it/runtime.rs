@@ -320,6 +320,18 @@ fn a_classifier_scores_images_independently() {
 }
 
 #[test]
+fn weights_may_be_listed_among_the_inputs() {
+    let mut model = build("vgn", 0).unwrap();
+    let graph = model.graph.as_mut().unwrap();
+    for weight in &graph.initializer {
+        let dims = weight.dims.iter().map(|&edge| Dimension::size(edge)).collect();
+        graph.input.push(ValueInfoProto::tensor(weight.name(), dims));
+    }
+    let (_folder, path) = save(&model);
+    Network::load(&path, &Options::default()).unwrap();
+}
+
+#[test]
 fn a_network_is_not_loaded_as_a_classifier_nor_a_classifier_as_a_network() {
     let (_folder, path) = save(&build("vgn", 0).unwrap());
     let error = Classifier::load(&path, &Image::SHAPE, &Options::default()).err().unwrap().to_string();

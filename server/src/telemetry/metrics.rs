@@ -308,11 +308,8 @@ impl Metrics {
     /// A limit on the open connections of a listener (`grpc`, `http` or `rest`), with its metrics.
     pub fn connections(&self, listener: &str, limit: usize) -> ConnectionLimit {
         self.connections_limit.with_label_values(&[listener]).set(i64::try_from(limit).unwrap_or(i64::MAX));
-        ConnectionLimit {
-            limit,
-            open: self.connections.with_label_values(&[listener]),
-            refused: self.connections_refused.with_label_values(&[listener]),
-        }
+        let open = self.connections.with_label_values(&[listener]);
+        ConnectionLimit::new(limit, open, self.connections_refused.with_label_values(&[listener]))
     }
 
     /// A budget of `capacity` bytes for messages that are being received, with its metrics.

@@ -8,6 +8,7 @@ use std::time::Duration;
 use http::Extensions;
 use prometheus::{IntCounter, IntGauge};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Sleep, sleep};
 use tokio_rustls::server::TlsStream;
 use tokio_rustls::{Accept, TlsAcceptor};
@@ -22,24 +23,34 @@ use crate::transport::receive_budget::{PeerShare, ReceiveBudget};
 #[derive(Clone)]
 pub(crate) struct ConnectionLimit {
     pub limit: usize,
-    pub open: IntGauge,
+    permits: Arc<Semaphore>,
+    open: IntGauge,
     pub refused: IntCounter,
 }
 
 impl ConnectionLimit {
-    /// Counts an open connection until the value is dropped.
-    pub fn count(&self) -> Counted {
+    /// A limit whose open and refused connections are counted.
+    pub fn new(limit: usize, open: IntGauge, refused: IntCounter) -> Self {
+        Self { limit, permits: Arc::new(Semaphore::new(limit.min(Semaphore::MAX_PERMITS))), open, refused }
+    }
+
+    /// A place for a connection; None if the limit is reached.
+    pub fn acquire(&self) -> Option<ConnectionPermit> {
+        let permit = Arc::clone(&self.permits).try_acquire_owned().ok()?;
         self.open.inc();
-        Counted(self.open.clone())
+        Some(ConnectionPermit { _permit: permit, open: self.open.clone() })
     }
 }
 
-/// An open connection in the metrics.
-pub(crate) struct Counted(IntGauge);
+/// The place of an open connection, which is counted.
+pub(crate) struct ConnectionPermit {
+    _permit: OwnedSemaphorePermit,
+    open: IntGauge,
+}
 
-impl Drop for Counted {
+impl Drop for ConnectionPermit {
     fn drop(&mut self) {
-        self.0.dec();
+        self.open.dec();
     }
 }
 
@@ -61,16 +72,14 @@ pub(crate) fn accept(
         }
         accepted
     });
-    accepted.filter_map(move |accepted| match accepted {
-        Ok(stream) if limit.open.get() < i64::try_from(limit.limit).unwrap_or(i64::MAX) => {
-            Some(Ok(Connection::new(stream, tls.as_ref(), timeout, limit.count(), &budget)))
-        }
-        Ok(_) => {
+    accepted.filter_map(move |accepted| match (accepted, limit.acquire()) {
+        (Ok(stream), Some(permit)) => Some(Ok(Connection::new(stream, tls.as_ref(), timeout, permit, &budget))),
+        (Ok(_), None) => {
             limit.refused.inc();
-            warn!(open = limit.open.get(), "connection refused: the limit is reached (--max-connections)");
+            warn!(open = limit.limit, "connection refused: the limit is reached (--max-connections)");
             None
         }
-        Err(error) => Some(Err(error)),
+        (Err(error), _) => Some(Err(error)),
     })
 }
 
@@ -86,7 +95,7 @@ pub(crate) struct Connection {
     stream: Stage,
     /// Missing bytes of the preface and their timeout; None after the preface.
     preface: Option<(usize, Pin<Box<Sleep>>)>,
-    _counted: Counted,
+    _permit: ConnectionPermit,
     peer: Peer,
 }
 
@@ -124,7 +133,7 @@ impl Connection {
         stream: Socket,
         tls: Option<&TlsAcceptor>,
         timeout: Duration,
-        counted: Counted,
+        permit: ConnectionPermit,
         budget: &Arc<ReceiveBudget>,
     ) -> Self {
         let address = peer(&stream);
@@ -133,7 +142,7 @@ impl Connection {
             None => Stage::Plain(stream),
             Some(tls) => Stage::Handshake(Box::new(tls.accept(stream))),
         };
-        Self { stream, preface: Some((PREFACE, Box::pin(sleep(timeout)))), _counted: counted, peer }
+        Self { stream, preface: Some((PREFACE, Box::pin(sleep(timeout)))), _permit: permit, peer }
     }
 
     /// The bytes, when the handshake is done.
@@ -253,7 +262,7 @@ mod tests {
         let open = IntGauge::new("open", "Open connections.").unwrap();
         let refused = IntCounter::new("refused", "Refused connections.").unwrap();
         let timeout = Duration::from_secs(10);
-        let limit = ConnectionLimit { limit: 1, open, refused };
+        let limit = ConnectionLimit::new(1, open, refused);
         let mut incoming = pin!(accept(listener, None, limit, timeout, budget()));
 
         let _silent = TcpStream::connect(address).await.unwrap();
@@ -268,7 +277,7 @@ mod tests {
         let (listener, address) = listener().await;
         let open = IntGauge::new("open", "Open connections.").unwrap();
         let refused = IntCounter::new("refused", "Refused connections.").unwrap();
-        let limit = ConnectionLimit { limit: 1, open: open.clone(), refused: refused.clone() };
+        let limit = ConnectionLimit::new(1, open.clone(), refused.clone());
         let mut incoming = pin!(accept(listener, None, limit, Duration::from_secs(10), budget()));
 
         let _first = TcpStream::connect(address).await.unwrap();

@@ -12,7 +12,7 @@ use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
-use tokio::task::AbortHandle;
+use tokio::task::JoinHandle;
 use tokio_io_timeout::TimeoutStream;
 use tokio_rustls::TlsAcceptor;
 use tokio_util::either::Either;
@@ -21,7 +21,7 @@ use tower::Service;
 use tracing::{debug, warn};
 
 use crate::readiness::{State, draining};
-use crate::transport::connections::{ConnectionLimit, Counted, Peer};
+use crate::transport::connections::{ConnectionLimit, ConnectionPermit, Peer};
 use crate::transport::receive_budget::ReceiveBudget;
 
 /// Maximum time for the header of a request, and between two requests of a connection.
@@ -45,7 +45,7 @@ pub(crate) struct HttpConfig {
 
 /// An open connection.
 struct Open {
-    task: AbortHandle,
+    task: JoinHandle<()>,
     /// Whether the client has sent a request.
     has_requested: Arc<AtomicBool>,
 }
@@ -69,24 +69,31 @@ pub(crate) async fn serve(listener: TcpListener, config: HttpConfig, app: Router
             }
         };
         open.retain(|connection| !connection.task.is_finished());
-        if open.len() >= config.limit.limit {
-            let is_silent = |connection: &Open| !connection.has_requested.load(Ordering::Relaxed);
-            let Some(silent) = open.iter().position(is_silent) else {
-                config.limit.refused.inc();
-                warn!(open = open.len(), "HTTP connection refused: the limit is reached");
-                continue;
-            };
-            open.remove(silent).task.abort();
-        }
+        let Some(permit) = place(&mut open, &config.limit).await else {
+            config.limit.refused.inc();
+            warn!(open = open.len(), "HTTP connection refused: the limit is reached");
+            continue;
+        };
         let has_requested = Arc::new(AtomicBool::new(false));
         let (app, requested) = (app.clone(), Arc::clone(&has_requested));
-        let connection = serve_connection(stream, config.clone(), app, requested, config.limit.count(), state.clone());
-        let task = tasks.spawn(connection);
-        open.push(Open { task: task.abort_handle(), has_requested });
+        let connection = serve_connection(stream, config.clone(), app, requested, permit, state.clone());
+        open.push(Open { task: tasks.spawn(connection), has_requested });
     }
     drop(listener);
     tasks.close();
     tasks.wait().await;
+}
+
+/// A place for a connection. At the limit, the oldest connection without a request ends for it.
+async fn place(open: &mut Vec<Open>, limit: &ConnectionLimit) -> Option<ConnectionPermit> {
+    if let Some(permit) = limit.acquire() {
+        return Some(permit);
+    }
+    let silent = open.iter().position(|connection| !connection.has_requested.load(Ordering::Relaxed))?;
+    let silent = open.remove(silent);
+    silent.task.abort();
+    let _ = silent.task.await;
+    limit.acquire()
 }
 
 async fn serve_connection(
@@ -94,7 +101,7 @@ async fn serve_connection(
     HttpConfig { tls, budget, .. }: HttpConfig,
     app: Router,
     has_requested: Arc<AtomicBool>,
-    _counted: Counted,
+    _permit: ConnectionPermit,
     state: watch::Receiver<State>,
 ) {
     let address = stream.peer_addr().ok();

@@ -398,7 +398,7 @@ fn depth_images_are_read_in_every_format() {
     let output = run(&server, &command(&["detect", "--png"], in_metres));
     assert!(text(&output.stderr).contains("--png needs depths in millimetres"), "{output:?}");
     let colour = folder.path().join("colour.exr");
-    exr::prelude::write_rgb_file(&colour, CAMERA.width, CAMERA.height, |_, _| (0.5_f32, 0.5_f32, 0.5_f32)).unwrap();
+    exr::prelude::write_rgb_file(&colour, CAMERA.width, CAMERA.height, |_, _| (0.5_f32, 0.4_f32, 0.3_f32)).unwrap();
     let output = run(&server, &["detect", colour.to_str().unwrap(), "--intrinsics", &in_metres[3], "--find-table"]);
     let error = text(&output.stderr);
     assert!(error.contains("colour.exr") && error.contains("channels in the file: B, G, R"), "{error}");
@@ -679,6 +679,90 @@ async fn one_depth_image_and_its_intrinsics_suffice() {
 
     let without = with("detect", &[]);
     assert!(String::from_utf8_lossy(&without.stderr).contains("`grasp table` finds"), "{without:?}");
+}
+
+/// A PNG with 16 bits per pixel.
+fn write_png(path: &str, values: impl Iterator<Item = u16>) {
+    let encoder = png::Encoder::new(File::create(path).unwrap(), CAMERA.width as u32, CAMERA.height as u32);
+    let mut image = png_header(encoder, png::ColorType::Grayscale, png::BitDepth::Sixteen);
+    image.write_image_data(&values.flat_map(u16::to_be_bytes).collect::<Vec<_>>()).unwrap();
+}
+
+#[test]
+fn files_of_other_tools_are_read_and_contradictions_refused() {
+    let server = Server::run(&[TestModel::new("mirror").resolution(40)], &[]);
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let camera = camera(35.0, -90.0);
+    let metres = depth(&camera);
+    write_png(&path("mm.png"), metres.iter().map(|metres| (metres * 1e3).round() as u16));
+    write_png(&path("half_mm.png"), metres.iter().map(|metres| 2 * (metres * 1e3).round() as u16));
+    let (fx, cx, cy) = (CAMERA.fx, CAMERA.cx, CAMERA.cy);
+    let k = format!("{fx},{fx},{cx},{cy}");
+    let file = |name: &str, content: String| {
+        std::fs::write(path(name), content).unwrap();
+        path(name)
+    };
+    let rows = camera.inverse().to_homogeneous();
+    let pose = file(
+        "pose.txt",
+        rows.row_iter().map(|row| row.iter().map(|c| format!("{c} ")).collect::<String>() + "\n").collect(),
+    );
+    let Translation3 { vector: at } = camera.inverse().translation;
+    let turn = camera.inverse().rotation;
+    let stamped = file(
+        "stamped.yaml",
+        format!(
+            "header: {{frame_id: base}}\nchild_frame_id: camera\ntransform:\n  translation: {{x: {}, y: {}, z: {}}}\n  rotation: {{x: {}, y: {}, z: {}, w: {}}}\n",
+            at.x, at.y, at.z, turn.i, turn.j, turn.k, turn.w
+        ),
+    );
+    let detect = |image: &str, intrinsics: &str, pose: &str, more: &[&str]| {
+        let image = path(image);
+        let args =
+            ["detect", &image, "--intrinsics", intrinsics, "--frame-from-camera", pose, "--threshold", "0.6", "--json"];
+        run(&server, &[&args, more].concat())
+    };
+    let qualities = |output: Output| -> Vec<Value> {
+        let reply: Value = serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{output:?}"));
+        reply["grasps"].as_array().unwrap().iter().map(|grasp| grasp["quality"].clone()).collect()
+    };
+    let expected = qualities(detect("mm.png", &k, &stamped, &[]));
+    assert!(!expected.is_empty());
+
+    let scaled =
+        file("scaled.json", format!(r#"{{"fx": {fx}, "fy": {fx}, "cx": {cx}, "cy": {cy}, "depth_scale": 0.0005}}"#));
+    assert_eq!(qualities(detect("half_mm.png", &scaled, &pose, &[])), expected);
+    let opencv = file(
+        "opencv.yaml",
+        format!(
+            "%YAML:1.0\n---\nimage_width: 160\nimage_height: 120\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ {fx}, 0., {cx}, 0., {fx}, {cy}, 0., 0., 1. ]\n"
+        ),
+    );
+    assert_eq!(qualities(detect("mm.png", &opencv, &pose, &[])), expected);
+
+    let refused = |output: Output, expected: &str| {
+        let error = text(&output.stderr);
+        assert!(!output.status.success() && error.contains(expected), "{expected}: {error}");
+    };
+    let other =
+        file("other.json", format!(r#"{{"width": 320, "height": 240, "K": [{fx}, 0, {cx}, 0, {fx}, {cy}, 0, 0, 1]}}"#));
+    refused(
+        detect("mm.png", &other, &pose, &[]),
+        "of images of 320 × 240 pixels, the image has 160 × 120; if the image was scaled",
+    );
+    refused(
+        detect("half_mm.png", &scaled, &pose, &["--depth-scale", "0.001"]),
+        "--depth-scale is 0.001 m, but the file",
+    );
+    refused(detect("mm.png", &k, &pose, &["--depth-scale", "1000"]), "did you mean 0.001?");
+    let fisheye = file(
+        "fisheye.json",
+        format!(
+            r#"{{"K": [{fx}, 0, {cx}, 0, {fx}, {cy}, 0, 0, 1], "D": [0.1, 0.1], "distortion_model": "double_sphere"}}"#
+        ),
+    );
+    refused(detect("mm.png", &fisheye, &pose, &[]), "double_sphere");
 }
 
 #[tokio::test]

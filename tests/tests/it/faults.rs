@@ -5,7 +5,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use grasp::Volume;
-use grasp_client::{Client, DataType, DetectOptions, Error, LocalServer, Options};
+use grasp_client::{Access, Client, DataType, DetectOptions, Error, LocalServer, Options, Retry};
 use grasp_proto::pb::grasp_service_client::GraspServiceClient;
 use grasp_proto::{encode, pb};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs, graspd, metric, resident_bytes};
@@ -397,7 +397,9 @@ async fn connections_are_replaced_at_their_age_and_no_call_fails() {
             });
         }
     });
-    let client = Client::connect(address).await.unwrap();
+    // A call that is sent while its connection is closed was not processed, and is sent again.
+    let access = Access { retry: Retry::RECOMMENDED, ..Access::default() };
+    let client = Client::connect_with(address, access).await.unwrap();
     let (requests, sent) = mpsc::channel(1);
     let mut stream = GraspServiceClient::new(server.channel().await);
     let request =

@@ -183,7 +183,7 @@ fn random_requests_are_answered_or_refused() {
     });
     outcome.unwrap();
     let (answered, refused) = (answered.get(), refused.get());
-    assert!(answered > 500 && refused > 500, "{answered} answered, {refused} refused: the requests are too uniform");
+    assert!(answered > 100 && refused > 100, "{answered} answered, {refused} refused: the requests are too uniform");
     target.assert_usable();
 }
 
@@ -250,7 +250,7 @@ fn random_candidates_are_scored_or_refused() {
     });
     outcome.unwrap();
     let (answered, refused) = (answered.get(), refused.get());
-    assert!(answered > 60 && refused > 60, "{answered} answered, {refused} refused: the requests are too uniform");
+    assert!(answered > 20 && refused > 20, "{answered} answered, {refused} refused: the requests are too uniform");
     target.assert_usable();
 }
 

@@ -48,11 +48,11 @@ async fn bodies_that_stall_or_are_too_large_are_refused() {
 }
 
 #[tokio::test]
-async fn web_pages_and_compressed_bodies_are_refused() {
+async fn web_pages_and_unknown_encodings_are_refused() {
     let server = Server::run(&[TestModel::new("mirror")], &["--rest", "127.0.0.1:0", "--allow-model-control"]);
     for (header, status, reason) in [
         ("Origin: http://attacker.example.com", 403, "requests of web pages are not accepted"),
-        ("Content-Encoding: gzip", 400, "the header Content-Encoding is"),
+        ("Content-Encoding: br", 400, "the header Content-Encoding is"),
     ] {
         let mut stream = TcpStream::connect(server.rest().unwrap()).await.unwrap();
         let path = "/v2/repository/models/mirror/unload";
@@ -123,4 +123,16 @@ async fn connections_are_limited_and_counted() {
     assert_eq!((metric(""), metric("_refused_total")), (2.0, 1.0));
     drop(held);
     server.wait_for("graspd_connections{listener=\"rest\"}", 0.0).await;
+}
+
+#[tokio::test]
+async fn requests_expire_at_the_time_in_their_header() {
+    let server = Server::run(&[TestModel::new("mirror").convolutions(60)], &["--rest", "127.0.0.1:0"]);
+    let mut stream = TcpStream::connect(server.rest().unwrap()).await.unwrap();
+    let (body, head) = (infer(), "Host: graspd\r\nConnection: close\r\ngrpc-timeout: 100m");
+    let head = format!("POST {INFER} HTTP/1.1\r\n{head}\r\nContent-Length: {}\r\n\r\n", body.len());
+    stream.write_all(head.as_bytes()).await.unwrap();
+    stream.write_all(body.as_bytes()).await.unwrap();
+    let (status, body) = response(stream).await;
+    assert!(status == 408 && body.contains("deadline"), "{status} {body}");
 }

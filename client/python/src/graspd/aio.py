@@ -26,7 +26,7 @@ from graspd.streams import Adding, Detecting
 
 
 class Client(Connection[grpc.aio.Channel]):
-    """A connection to graspd. Create and use it in one event loop. Calls may run concurrently.
+    """A connection to graspd. Use it in one event loop. Calls may run concurrently.
 
     Arguments, results and errors are those of `graspd.Client`.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Generic, TypeAlias, TypeVar
@@ -55,10 +56,15 @@ class Connection(Generic[Channel]):
         if ca or cert or address.startswith("https://"):
             credentials = grpc.ssl_channel_credentials(ca, key, cert)
         target = address.removeprefix("http://").removeprefix("https://")
-        self._channel = self._open(target, credentials, OPTIONS + replicas(target))
+        self._destination = (target, credentials, OPTIONS + replicas(target) + without_proxy(target))
         self._metadata = () if token is None else (("authorization", bearer(token)),)
         self._timeout = timeout
         self._retry = retry
+
+    @cached_property
+    def _channel(self) -> Channel:
+        """Opened by the first call: a channel of asyncio belongs to the running event loop."""
+        return self._open(*self._destination)
 
     def _open(self, target: str, credentials: grpc.ChannelCredentials | None, options: ChannelOptions) -> Channel:
         raise NotImplementedError
@@ -71,6 +77,13 @@ def replicas(target: str) -> ChannelOptions:
         return ()
     # gRPC sends the whole list as the authority of a call, which is not valid in HTTP/2.
     return (("grpc.lb_policy_name", "round_robin"), ("grpc.default_authority", addresses.split(",")[0]))
+
+
+def without_proxy(target: str) -> ChannelOptions:
+    """The options for a server on this machine: gRPC would send its calls to the proxy of `http_proxy` too."""
+    host = target.removeprefix("dns:").removeprefix("ipv4:").removeprefix("ipv6:").lstrip("/")
+    is_here = host.startswith(("localhost:", "127.", "[::1]"))
+    return (("grpc.enable_http_proxy", 0),) if is_here else ()
 
 
 def bearer(token: str) -> str:

@@ -44,26 +44,29 @@ class DepthView:
     have neither if the workspace has `find_table`: the frame is then that of the camera."""
 
     depth: Any
-    """``[row][column]``, an array or an image of PIL: distance along the optical axis, floats in metres or integers in
-    millimetres. 0, NaN and infinity mean no reading."""
+    """``[row][column]`` or ``[row][column][1]``, an array or an image of PIL: distance along the optical axis, floats in
+    metres or integers in millimetres. 0, NaN, infinity and masked pixels mean no reading."""
     k: NDArray[np.floating[Any]]
-    """The 3 × 3 intrinsic matrix, pixels (ROS: ``CameraInfo.k``). Pixel centres have integer coordinates."""
+    """The 3 × 3 intrinsic matrix, pixels (ROS: ``CameraInfo.k``), or a 3 × 4 projection matrix without a translation. Pixel
+    centres have integer coordinates."""
     _: KW_ONLY
     camera_from_task: PoseLike | None = None
     """``T_camera_task``: maps points of the task frame into the camera frame (z forward, x right, y down)."""
     frame_from_camera: PoseLike | None = None
     """``T_frame_camera``: the camera's pose in the workspace's `frame_id`, as hand-eye calibration returns it."""
     labels: Any = None
-    """``[row][column]``: label of the object that each pixel shows, integers from 0 to 65535; 0 is no object. None:
-    unknown."""
+    """``[row][column]``: label of the object that each pixel shows, whole numbers from 0 to 65535, or truth values; 0 is no
+    object. None: unknown."""
     png: bool = False
     """Send integer depths as PNG: fewer bytes on a slow network, for a few milliseconds of computation."""
 
     def __post_init__(self) -> None:
-        if self.labels is not None and np.shape(self.labels) != np.shape(self.depth):
+        shape = np.shape(self.depth)
+        if len(shape) != 2 and (len(shape) != 3 or shape[2] != 1):
+            raise ValueError(f"a depth image must be an array [row][column], got shape {shape}")
+        if self.labels is not None and np.shape(self.labels) not in (shape, shape[:2]):
             raise ValueError(f"labels must have the shape of depth, got {np.shape(self.labels)}")
-        if np.ndim(self.depth) != 2:
-            raise ValueError(f"a depth image must be an array [row][column], got shape {np.shape(self.depth)}")
+        intrinsic_matrix(self.k)
         if self.camera_from_task is not None and self.frame_from_camera is not None:
             raise ValueError("a depth image has one of camera_from_task and frame_from_camera, got both")
 
@@ -73,19 +76,48 @@ class CloudView:
     """A point cloud observed by one camera."""
 
     points: NDArray[np.floating[Any]]
-    """``[…][3]``: x, y, z, metres. Points with a NaN are ignored."""
+    """``[…][3]``: x, y, z, metres; colours or normals may follow. Or a structured array with the fields x, y and z, as from
+    ROS's ``PointCloud2``. Points that are masked or have a NaN are ignored."""
     camera_position: Vector
     """Position of the camera in the frame of the points, metres: (0, 0, 0) for points in the camera frame."""
     frame_from_cloud: PoseLike | None = None
     """``T_frame_cloud``: maps the points into the workspace's `frame_id`; None: identity."""
     labels: NDArray[np.integer[Any]] | None = None
-    """``[…]``: label of the object of each point, integers from 0 to 65535; 0 is no object. None: unknown."""
+    """``[…]``: label of the object of each point, whole numbers from 0 to 65535, or truth values; 0 is no object. None:
+    unknown."""
 
     def __post_init__(self) -> None:
-        if self.labels is not None and np.shape(self.labels) != np.shape(self.points)[:-1]:
+        points = coordinates(self.points)
+        if self.labels is not None and np.shape(self.labels) != points.shape[:-1]:
             raise ValueError(f"labels must be one for each point, got shape {np.shape(self.labels)}")
-        if np.shape(self.points)[-1:] != (3,):
-            raise ValueError(f"a point cloud must be an array […][3] of x, y, z, got shape {np.shape(self.points)}")
+
+
+def intrinsic_matrix(k: Any) -> NDArray[np.float64]:
+    """The 3 × 3 matrix of a 3 × 3 or a 3 × 4 matrix."""
+    matrix: NDArray[np.float64] = np.asarray(k, np.float64)
+    if matrix.size == 12:
+        matrix = matrix.reshape(3, 4)
+        if matrix[:, 3].any():
+            raise ValueError(f"k must be a 3 × 3 matrix; the fourth column is {matrix[:, 3].tolist()}, must be 0")
+        matrix = matrix[:, :3]
+    if matrix.size != 9:
+        raise ValueError(f"k must be a 3 × 3 matrix, got shape {matrix.shape}")
+    return matrix.reshape(3, 3)
+
+
+def coordinates(points: Any) -> NDArray[Any]:
+    """x, y and z of each point; NaN for masked points."""
+    names = getattr(getattr(points, "dtype", None), "names", None)
+    if names is not None:
+        if not {"x", "y", "z"} <= set(names):
+            raise ValueError(f"a structured point cloud must have the fields x, y and z, got {', '.join(names)}")
+        points = np.ma.stack([points[axis] for axis in "xyz"], axis=-1)
+    if np.ma.isMA(points):
+        points = np.ma.filled(points.astype(np.float32), np.nan)
+    array: NDArray[Any] = np.asarray(points)
+    if array.shape[-1:] not in [(3,), (4,), (6,), (7,)]:
+        raise ValueError(f"a point cloud must be an array […][3] of x, y, z, got shape {array.shape}")
+    return array[..., :3]
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from graspd import grasp_pb2 as pb
 from graspd.detection import Detection, Dropped, FoundTable, GeometryWarning, Grasp, Latency, Model, Score, Scores
 from graspd.geometry import Pose, PoseLike, Vector
 from graspd.options import Box, Candidate, CollisionCheck, Cone, Convention, Gripper, Options, Retreat
-from graspd.seen import CloudView, DepthView, Volume, Workspace
+from graspd.seen import CloudView, DepthView, Volume, Workspace, coordinates, intrinsic_matrix
 
 Observation: TypeAlias = Volume | NDArray[Any] | DepthView | CloudView | Iterable[DepthView | CloudView]
 """A volume, depth images or point clouds."""
@@ -183,8 +183,10 @@ def encoded(values: NDArray[Any], dtype: DTypeLike | None) -> NDArray[Any]:
 
 
 def depth_message(view: DepthView) -> pb.DepthView:
-    image = np.asarray(view.depth)
-    height, width = image.shape
+    # A masked pixel has no reading.
+    image = np.ma.filled(view.depth, 0) if np.ma.isMA(view.depth) else np.asarray(view.depth)
+    height, width = image.shape[:2]
+    image = image.reshape(height, width)
     if np.issubdtype(image.dtype, np.integer):
         if image.size and not (0 <= image.min() and image.max() <= 65535):
             raise ValueError(
@@ -204,8 +206,8 @@ def depth_message(view: DepthView) -> pb.DepthView:
     return pb.DepthView(
         data=data,
         unit=unit,
-        labels=None if view.labels is None else labels_message(np.asarray(view.labels)),
-        camera=pb.Camera(width=width, height=height, k=np.ravel(view.k).tolist()),
+        labels=None if view.labels is None else labels_message(view.labels),
+        camera=pb.Camera(width=width, height=height, k=intrinsic_matrix(view.k).ravel().tolist()),
         camera_from_task=pose_message(view.camera_from_task),
         frame_from_camera=pose_message(view.frame_from_camera),
     )
@@ -225,9 +227,12 @@ def png_file(depth: NDArray[Any]) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(filtered.tobytes(), 1)) + chunk(b"IEND", b"")
 
 
-def labels_message(labels: NDArray[Any]) -> pb.Labels:
-    if not np.issubdtype(labels.dtype, np.integer):
-        raise ValueError(f"labels must be integers, got {labels.dtype}")
+def labels_message(labels: Any) -> pb.Labels:
+    labels = np.ma.filled(labels, 0) if np.ma.isMA(labels) else np.asarray(labels)
+    if not (np.issubdtype(labels.dtype, np.number) or labels.dtype == bool):
+        raise ValueError(f"labels must be whole numbers or truth values, got {labels.dtype}")
+    if np.issubdtype(labels.dtype, np.inexact) and not (labels == np.rint(labels)).all():
+        raise ValueError(f"labels must be whole numbers or truth values, got {labels[labels != np.rint(labels)][0]}")
     if labels.size and not (0 <= labels.min() and labels.max() <= 65535):
         raise ValueError(f"labels must be from 0 to 65535, got {labels.min()} to {labels.max()}")
     if labels.size and labels.max() > 255:
@@ -238,7 +243,7 @@ def labels_message(labels: NDArray[Any]) -> pb.Labels:
 def cloud_message(view: CloudView) -> pb.CloudView:
     return pb.CloudView(
         labels=given(labels_message, view.labels),
-        points=np.asarray(view.points, "<f4").tobytes(),
+        points=coordinates(view.points).astype("<f4").tobytes(),
         camera_position=vector_message(view.camera_position),
         frame_from_cloud=pose_message(view.frame_from_cloud),
     )

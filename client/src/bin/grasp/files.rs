@@ -5,6 +5,7 @@ use std::io::{self, BufReader, Cursor, Read};
 use std::path::Path;
 
 use anyhow::{Context, bail};
+use npyz::half::f16;
 use npyz::npz::{NpzArchive, file_name_from_array_name};
 use npyz::{Deserialize, NpyFile, Order, TypeChar};
 
@@ -55,23 +56,36 @@ pub(crate) fn has_extension(path: &Path, wanted: &str) -> bool {
 
 /// The array of a .npy file; for a .npz file its only array, or the array of this name.
 pub(crate) fn array(path: &Path, name: &str) -> anyhow::Result<Array> {
+    array_of(path, &[name])
+}
+
+/// As [`array`], with the first of several names.
+pub(crate) fn array_of(path: &Path, wanted: &[&str]) -> anyhow::Result<Array> {
     let file = BufReader::new(File::open(path)?);
     if !has_extension(path, "npz") {
         let file = NpyFile::new(Box::new(file) as Box<dyn Read>);
-        return file.context("neither a .npy file nor an image or a point cloud of a known format");
+        return plain(file.context("neither a .npy file nor an image or a point cloud of a known format")?);
     }
     let mut archive = NpzArchive::new(file)?;
     let names: Vec<String> = archive.array_names().map(str::to_owned).collect();
     let name = match &names[..] {
         [only] => only,
-        _ => names
-            .iter()
-            .find(|other| *other == name)
-            .with_context(|| format!("no array `{name}`; arrays in the file: {}", names.join(", ")))?,
+        _ => names.iter().find(|name| wanted.iter().any(|wanted| name.eq_ignore_ascii_case(wanted))).with_context(
+            || format!("no array `{}`; arrays in the file: {}", wanted.join("` or `"), names.join(", ")),
+        )?,
     };
     let mut bytes = Vec::new();
     archive.zip_archive().by_name(&file_name_from_array_name(name))?.read_to_end(&mut bytes)?;
-    Ok(NpyFile::new(Box::new(Cursor::new(bytes)) as Box<dyn Read>)?)
+    plain(NpyFile::new(Box::new(Cursor::new(bytes)) as Box<dyn Read>)?)
+}
+
+/// Refuses a pickled Python object: reading it would execute what is in the file.
+fn plain(array: Array) -> anyhow::Result<Array> {
+    let is_object = matches!(array.dtype(), npyz::DType::Plain(plain) if plain.to_string().ends_with('O'));
+    if is_object {
+        bail!("a pickled Python object, such as a dictionary; save the array alone: numpy.save(FILE, data[\"depth\"])");
+    }
+    Ok(array)
 }
 
 /// Type and size in bytes of the values. An error names the `needed` types if they are not among `supported`.
@@ -101,10 +115,11 @@ pub(crate) fn values<T: Deserialize + Copy>(array: Array) -> io::Result<Vec<T>> 
     Ok((0..values.len()).map(value_at).collect())
 }
 
-/// The values of an f32 or f64 array in row-major order.
+/// The values of an array of floats in row-major order.
 pub(crate) fn floats(array: Array) -> anyhow::Result<Vec<f64>> {
-    Ok(match kind(&array, "f64 or f32", &[(TypeChar::Float, 8), (TypeChar::Float, 4)])? {
+    Ok(match kind(&array, "f64, f32 or f16", &[(TypeChar::Float, 8), (TypeChar::Float, 4), (TypeChar::Float, 2)])? {
         (_, 8) => values(array)?,
+        (_, 2) => values::<f16>(array)?.into_iter().map(f16::to_f64).collect(),
         _ => values::<f32>(array)?.into_iter().map(f64::from).collect(),
     })
 }

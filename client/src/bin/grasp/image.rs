@@ -11,11 +11,48 @@ use tiff::decoder::{Decoder, DecodingResult};
 use crate::files::{self, Format};
 
 /// The unit of integer depths of most cameras, metres.
-pub(crate) const MILLIMETRE: f32 = 1e-3;
+const MILLIMETRE: f64 = 1e-3;
 
-/// Reads a depth image from a .png, .tiff, .exr or .npy file, with integer depths in units of `scale` metres. Returns the
-/// depth, the width and the height.
-pub(crate) fn read(path: &Path, scale: f32) -> anyhow::Result<(Depth, u32, u32)> {
+/// Parses the unit of depths, metres.
+pub(crate) fn parse_scale(text: &str) -> Result<f64, String> {
+    let scale: f64 = text.parse().map_err(|_| "must be a number".to_owned())?;
+    // Written so that NaN fails.
+    if !(scale > 0.0 && scale.is_finite()) {
+        return Err("must be above 0: the size of one unit of the depths, metres".to_owned());
+    }
+    if scale > 1.0 {
+        return Err(format!("is the size of one unit of the depths, metres; did you mean {}?", scale.recip()));
+    }
+    Ok(scale)
+}
+
+/// Unit of the depths of a file, metres.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Scale {
+    /// Given by the user, for integers and for floats.
+    Given(f64),
+    /// That of the camera's file, for integers.
+    OfIntegers(f64),
+    /// Integers are in millimetres, floats in metres.
+    Default,
+}
+
+impl Scale {
+    /// The unit that the user gives, or that is in the camera's file. Both must agree.
+    pub fn new(given: Option<f64>, of_camera: Option<f64>) -> anyhow::Result<Self> {
+        match (given, of_camera) {
+            (Some(given), Some(of_camera)) if (given - of_camera).abs() > 1e-3 * given => {
+                bail!("--depth-scale is {given} m, but the file of the intrinsics has a depth scale of {of_camera} m")
+            }
+            (Some(given), _) => Ok(Self::Given(given)),
+            (None, Some(of_camera)) => Ok(Self::OfIntegers(of_camera)),
+            (None, None) => Ok(Self::Default),
+        }
+    }
+}
+
+/// Reads a depth image from a .png, .tiff, .exr or .npy file. Returns the depth, the width and the height.
+pub(crate) fn read(path: &Path, scale: Scale) -> anyhow::Result<(Depth, u32, u32)> {
     files::in_file(path, |path| {
         let (depth, width, height) = match Format::of(path)? {
             Format::Png => png(path)?,
@@ -26,11 +63,14 @@ pub(crate) fn read(path: &Path, scale: f32) -> anyhow::Result<(Depth, u32, u32)>
             }
             Format::Other => npy(path)?,
         };
-        let depth = match depth {
-            Depth::Millimetres(depth) if scale != MILLIMETRE => {
-                Depth::Metres(depth.into_iter().map(|depth| f32::from(depth) * scale).collect())
+        let depth = match (depth, scale) {
+            (Depth::Millimetres(depth), Scale::Given(scale) | Scale::OfIntegers(scale)) if scale != MILLIMETRE => {
+                Depth::Metres(depth.into_iter().map(|depth| f32::from(depth) * scale as f32).collect())
             }
-            depth => depth,
+            (Depth::Metres(depth), Scale::Given(scale)) => {
+                Depth::Metres(depth.into_iter().map(|depth| depth * scale as f32).collect())
+            }
+            (depth, _) => depth,
         };
         Ok((depth, width, height))
     })
@@ -38,7 +78,7 @@ pub(crate) fn read(path: &Path, scale: f32) -> anyhow::Result<(Depth, u32, u32)>
 
 fn npy(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
     let array = files::array(path, "depth")?;
-    let &[height, width] = array.shape() else {
+    let (&[height, width] | &[height, width, 1]) = array.shape() else {
         bail!(
             "shape {:?}: a depth image must be height × width; for a volume or a point cloud leave out --intrinsics",
             array.shape()
@@ -73,21 +113,31 @@ fn tiff(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
     Ok((depth, width, height))
 }
 
-/// Names of the channel with the depth in files of renderers that have several channels. Not R: a colour image has it.
-const CHANNELS: [&str; 4] = ["Z", "depth.Z", "Depth.Z", "depth"];
+/// Whether a channel has the depth, in files of renderers with several channels. Not R: a colour image has it.
+fn is_depth(name: &str) -> bool {
+    let name = name.to_lowercase();
+    ["z", "depth", "depth.z", "depth.v"].contains(&&*name) || name.ends_with(".depth.z") || name.ends_with(".depth.v")
+}
 
 fn exr(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
     let reader = exr::prelude::read().no_deep_data().largest_resolution_level().all_channels().all_layers();
     let image = reader.all_attributes().non_parallel().from_file(path).context("not a valid EXR file")?;
     let channels = || image.layer_data.iter().flat_map(|layer| layer.channel_data.list.iter().map(move |c| (layer, c)));
-    let found = CHANNELS.iter().find_map(|name| channels().find(|(_, channel)| channel.name == **name));
-    // A depth image of one channel needs no name.
-    let (layer, channel) =
-        found.or_else(|| channels().next().filter(|_| channels().count() == 1)).with_context(|| {
-            let names: Vec<_> = channels().map(|(_, channel)| channel.name.to_string()).collect();
-            format!("no channel {}; channels in the file: {}", CHANNELS.join(" or "), names.join(", "))
-        })?;
-    let depth = channel.sample_data.values_as_f32().collect();
+    let found = channels().find(|(_, channel)| is_depth(&channel.name.to_string()));
+    // A depth image of one channel needs no name, nor one whose channels are equal.
+    let values = |channel: &exr::prelude::AnyChannel<exr::prelude::FlatSamples>| -> Vec<f32> {
+        channel.sample_data.values_as_f32().collect()
+    };
+    let all_equal = || {
+        let first = channels().next()?;
+        let bits = |channel| values(channel).into_iter().map(f32::to_bits).collect::<Vec<_>>();
+        channels().skip(1).all(|(_, other)| bits(other) == bits(first.1)).then_some(first)
+    };
+    let (layer, channel) = found.or_else(all_equal).with_context(|| {
+        let names: Vec<_> = channels().map(|(_, channel)| channel.name.to_string()).collect();
+        format!("no channel Z or depth; channels in the file: {}", names.join(", "))
+    })?;
+    let depth = values(channel);
     Ok((Depth::Metres(depth), u32::try_from(layer.size.width())?, u32::try_from(layer.size.height())?))
 }
 

@@ -7,8 +7,27 @@ use npyz::TypeChar;
 
 use crate::files::{self, Format};
 
-/// Reads the labels of objects from a PNG with 8- or 16-bit grey values or a .npy file with integers.
-pub(crate) fn read(path: &Path) -> anyhow::Result<Vec<u16>> {
+/// Labels of pixels or points, with the shape of their array: height and width, or a count.
+pub(crate) struct Labels {
+    pub values: Vec<u16>,
+    pub shape: Vec<u64>,
+}
+
+impl Labels {
+    /// The labels of the pixels of an image.
+    pub fn of_image(self, width: u32, height: u32) -> anyhow::Result<Vec<u16>> {
+        let Self { values, shape } = self;
+        ensure!(
+            shape == [u64::from(height), u64::from(width)],
+            "--labels: labels of shape {shape:?} for an image of {height} × {width} (height × width)"
+        );
+        Ok(values)
+    }
+}
+
+/// Reads the labels of objects from a PNG with 8- or 16-bit grey values, or a .npy file with integers, truth values, or
+/// floats that are whole numbers.
+pub(crate) fn read(path: &Path) -> anyhow::Result<Labels> {
     files::in_file(path, |path| match Format::of(path)? {
         Format::Png => png(path),
         Format::Other => npy(path),
@@ -16,34 +35,53 @@ pub(crate) fn read(path: &Path) -> anyhow::Result<Vec<u16>> {
     })
 }
 
-fn npy(path: &Path) -> anyhow::Result<Vec<u16>> {
+fn npy(path: &Path) -> anyhow::Result<Labels> {
     let array = files::array(path, "labels")?;
-    let supported = [(TypeChar::Uint, 1), (TypeChar::Uint, 2), (TypeChar::Int, 4), (TypeChar::Int, 8)];
+    let supported = [
+        (TypeChar::Bool, 1),
+        (TypeChar::Uint, 1),
+        (TypeChar::Uint, 2),
+        (TypeChar::Int, 4),
+        (TypeChar::Int, 8),
+        (TypeChar::Float, 2),
+        (TypeChar::Float, 4),
+        (TypeChar::Float, 8),
+    ];
+    let shape = array.shape().to_vec();
     let narrowed = |labels: Vec<i64>| {
         let label =
             |label: i64| u16::try_from(label).with_context(|| format!("label {label}; must be from 0 to 65535"));
         labels.into_iter().map(label).collect()
     };
-    match files::kind(&array, "u8, u16, i32 or i64", &supported)? {
-        (TypeChar::Uint, 1) => Ok(files::values::<u8>(array)?.into_iter().map(u16::from).collect()),
-        (TypeChar::Uint, _) => Ok(files::values(array)?),
-        (_, 4) => narrowed(files::values::<i32>(array)?.into_iter().map(i64::from).collect()),
-        _ => narrowed(files::values(array)?),
-    }
+    let whole = |value: f64| {
+        ensure!(value.fract() == 0.0 && value.abs() < 1e9, "label {value}; must be a whole number from 0 to 65535");
+        Ok(value as i64)
+    };
+    let values: anyhow::Result<Vec<u16>> =
+        match files::kind(&array, "u8, u16, i32, i64, bool, or whole numbers as floats", &supported)? {
+            (TypeChar::Bool, _) => Ok(files::values::<bool>(array)?.into_iter().map(u16::from).collect()),
+            (TypeChar::Uint, 1) => Ok(files::values::<u8>(array)?.into_iter().map(u16::from).collect()),
+            (TypeChar::Uint, _) => Ok(files::values(array)?),
+            (TypeChar::Int, 4) => narrowed(files::values::<i32>(array)?.into_iter().map(i64::from).collect()),
+            (TypeChar::Int, _) => narrowed(files::values(array)?),
+            _ => narrowed(files::floats(array)?.into_iter().map(whole).collect::<anyhow::Result<_>>()?),
+        };
+    Ok(Labels { values: values?, shape })
 }
 
-fn png(path: &Path) -> anyhow::Result<Vec<u16>> {
+fn png(path: &Path) -> anyhow::Result<Labels> {
     let mut reader = png::Decoder::new(BufReader::new(File::open(path)?)).read_info().context("not a PNG file")?;
-    let png::Info { bit_depth, color_type, .. } = *reader.info();
+    let png::Info { width, height, bit_depth, color_type, .. } = *reader.info();
     ensure!(
         color_type == png::ColorType::Grayscale || color_type == png::ColorType::Indexed,
         "PNG is {color_type:?}; labels must be grey values or indices of 8 or 16 bits"
     );
     let mut bytes = vec![0; reader.output_buffer_size().context("the image is too large")?];
     reader.next_frame(&mut bytes)?;
-    match bit_depth {
-        png::BitDepth::Eight => Ok(bytes.into_iter().map(u16::from).collect()),
-        png::BitDepth::Sixteen => Ok(bytes.as_chunks().0.iter().map(|&bytes| u16::from_be_bytes(bytes)).collect()),
+    let values = match bit_depth {
+        png::BitDepth::Eight => bytes.into_iter().map(u16::from).collect(),
+        png::BitDepth::Sixteen => bytes.as_chunks().0.iter().map(|&bytes| u16::from_be_bytes(bytes)).collect(),
         _ => bail!("PNG has {bit_depth:?} bits; labels must have 8 or 16 bits"),
-    }
+    };
+    Ok(Labels { values, shape: vec![height.into(), width.into()] })
 }

@@ -1,7 +1,10 @@
 //! Command line client of graspd.
 
+mod camera;
 mod cloud;
 mod detect_args;
+mod distortion;
+mod document;
 mod drawing;
 mod export;
 mod files;

@@ -1,7 +1,5 @@
-//! Poses and intrinsic matrices from .npy and JSON files.
+//! Poses from files, and from numbers on the command line.
 
-use std::fs::File;
-use std::io::BufReader;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
@@ -10,6 +8,7 @@ use grasp_client::Candidate;
 use nalgebra::{Isometry3, Matrix3, Matrix4, Quaternion, Rotation3, Translation3, UnitQuaternion, Vector3};
 use serde_json::Value;
 
+use crate::document::{document, flat};
 use crate::files::{self, has_extension, in_file};
 use crate::numbers::Numbers;
 
@@ -97,23 +96,6 @@ fn each(path: &Path, count: usize, inputs: &str) -> anyhow::Result<Vec<Isometry3
     Ok(poses)
 }
 
-/// The nine numbers of an intrinsic matrix in row-major order: FX,FY,CX,CY, nine numbers, or a file.
-pub(crate) fn intrinsics(text: &str) -> anyhow::Result<[f64; 9]> {
-    if let Ok(Numbers([fx, fy, cx, cy])) = text.parse::<Numbers<4>>() {
-        return Ok([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]);
-    }
-    if let Ok(Numbers(k)) = text.parse::<Numbers<9>>() {
-        return Ok(k);
-    }
-    in_file(Path::new(text), matrix_k)
-}
-
-/// The file of intrinsics, if they are in one.
-pub(crate) fn intrinsics_file(text: &str) -> Option<PathBuf> {
-    let is_numbers = text.split(',').all(|number| number.trim().parse::<f64>().is_ok());
-    (!is_numbers).then(|| PathBuf::from(text))
-}
-
 /// The rotation of a quaternion, with the server's check of its norm.
 fn unit(quaternion: Quaternion<f64>) -> Result<UnitQuaternion<f64>, String> {
     let norm = quaternion.norm();
@@ -125,82 +107,30 @@ fn unit(quaternion: Quaternion<f64>) -> Result<UnitQuaternion<f64>, String> {
     }
 }
 
-/// The numbers of a .npy file.
-fn numbers(path: &Path) -> anyhow::Result<Vec<f64>> {
-    files::floats(files::array(path, "")?)
-}
-
-fn json(path: &Path) -> anyhow::Result<Value> {
-    Ok(serde_json::from_reader(BufReader::new(File::open(path)?))?)
-}
-
-/// All numbers of nested arrays, in order.
-fn flat(value: &Value) -> Vec<f64> {
-    match value {
-        Value::Number(number) => number.as_f64().into_iter().collect(),
-        Value::Array(values) => values.iter().flat_map(flat).collect(),
-        _ => Vec::new(),
-    }
-}
-
-fn matrix_k(path: &Path) -> anyhow::Result<[f64; 9]> {
-    let numbers =
-        if has_extension(path, "npy") { numbers(path)? } else { intrinsic_numbers(&std::fs::read_to_string(path)?)? };
-    let count = numbers.len();
-    numbers
-        .try_into()
-        .ok()
-        .with_context(|| format!("{count} numbers in the file; an intrinsic matrix has nine, in row-major order"))
-}
-
-/// The numbers of an intrinsic matrix in JSON or YAML, in row-major order.
-fn intrinsic_numbers(text: &str) -> anyhow::Result<Vec<f64>> {
-    // YAML includes JSON. `rostopic echo` separates messages by `---`.
-    let first = text.trim_start_matches("---").split("\n---").next().unwrap_or_default();
-    let value: Value = serde_saphyr::from_str(first).context("neither JSON nor YAML")?;
-    // ROS's CameraInfo and calibration file, librealsense and Open3D.
-    let of_ros = value.get("camera_matrix").and_then(|matrix| matrix.get("data"));
-    if let Some(k) = ["k", "K"].iter().find_map(|key| value.get(key)).or(of_ros) {
-        return Ok(flat(k));
-    }
-    if let Some(columns) = value.get("intrinsic").unwrap_or(&value).get("intrinsic_matrix") {
-        // Column by column.
-        let numbers = flat(columns);
-        ensure!(
-            numbers.len() == 9,
-            "{} numbers in `intrinsic_matrix`; it must have nine, column by column",
-            numbers.len()
-        );
-        return Ok((0..numbers.len()).map(|i| numbers[i % 3 * 3 + i / 3]).collect());
-    }
-    let number = |names: [&str; 2]| names.iter().find_map(|name| value.get(name)?.as_f64());
-    if let [Some(fx), Some(fy), Some(cx), Some(cy)] = [["fx"; 2], ["fy"; 2], ["cx", "ppx"], ["cy", "ppy"]].map(number) {
-        return Ok(vec![fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]);
-    }
-    Ok(flat(&value))
+fn is_array(path: &Path) -> bool {
+    has_extension(path, "npy") || has_extension(path, "npz")
 }
 
 fn poses(path: &Path) -> anyhow::Result<Vec<Isometry3<f64>>> {
-    if has_extension(path, "npy") {
-        return matrices(&numbers(path)?);
+    if is_array(path) {
+        return matrices(&files::floats(files::array(path, "pose")?)?);
     }
-    match json(path)? {
-        value @ Value::Object(_) => Ok(vec![named(&value)?]),
-        Value::Array(values) if values.iter().all(Value::is_object) => values.iter().map(named).collect(),
+    match document(path)? {
+        value @ Value::Object(_) => Ok(vec![pose(&value)?]),
+        Value::Array(values) if values.iter().all(Value::is_object) => values.iter().map(pose).collect(),
         value => matrices(&flat(&value)),
     }
 }
 
 fn candidates(path: &Path) -> anyhow::Result<Vec<Candidate>> {
-    if has_extension(path, "npy") {
+    if is_array(path) {
         return Ok(poses(path)?.into_iter().map(Candidate::from).collect());
     }
-    let value = json(path)?;
+    let value = document(path)?;
     let candidate = |value: &Value| {
-        let pose = named(value)?;
         let width = value.get("width").filter(|width| !width.is_null());
         let width = width.map(|width| width.as_f64().with_context(|| format!("`width` is {width}, must be a number")));
-        Ok(Candidate { pose, width: width.transpose()? })
+        Ok(Candidate { pose: pose(value)?, width: width.transpose()? })
     };
     match value.get("grasps").unwrap_or(&value) {
         value @ Value::Object(_) => Ok(vec![candidate(value)?]),
@@ -209,17 +139,52 @@ fn candidates(path: &Path) -> anyhow::Result<Vec<Candidate>> {
     }
 }
 
-fn named(value: &Value) -> anyhow::Result<Isometry3<f64>> {
-    let part = |key: &str| value.get(key).map(flat).unwrap_or_default();
-    // `grasp detect --json` writes `orientation_xyzw`.
-    let key = if value.get("orientation").is_some() { "orientation" } else { "orientation_xyzw" };
-    let (position, orientation) = (part("position"), part(key));
-    let (&[x, y, z], &[qx, qy, qz, qw]) = (&position[..], &orientation[..]) else {
-        bail!("a pose must have `position` (x, y, z) and `orientation` or `orientation_xyzw` (quaternion x, y, z, w)")
-    };
-    let rotation = unit(Quaternion::new(qw, qx, qy, qz)).map_err(|reason| anyhow!("`{key}`: {reason}"))?;
-    Ok(Isometry3::from_parts(Translation3::new(x, y, z), rotation))
+/// The pose of an object: position and orientation under the names of this program, of ROS or of easy_handeye, or a named
+/// matrix, alone or in another object.
+fn pose(value: &Value) -> anyhow::Result<Isometry3<f64>> {
+    if let Some(found) = find(value) {
+        return found;
+    }
+    let keys = value.as_object().map(|map| map.keys().cloned().collect::<Vec<_>>().join(", ")).unwrap_or_default();
+    bail!(
+        "a pose must have `position` (x, y, z) and `orientation` (quaternion x, y, z, w), or be a 4×4 matrix; keys in the \
+         file: {keys}"
+    )
 }
+
+fn find(value: &Value) -> Option<anyhow::Result<Isometry3<f64>>> {
+    let map = value.as_object()?;
+    // Arrays, or objects with these keys.
+    let part = |names: &[&'static str], keys: &[&str]| {
+        names.iter().find_map(|&name| {
+            let value = map.get(name)?;
+            let numbers = keys.iter().map(|key| value.get(*key)?.as_f64()).collect::<Option<_>>();
+            Some((name, numbers.unwrap_or_else(|| flat(value))))
+        })
+    };
+    let direct = |keys: &[&str]| keys.iter().map(|key| map.get(*key)?.as_f64()).collect::<Option<Vec<_>>>();
+    let position = part(&["position", "translation"], &["x", "y", "z"]).map(|(_, position)| position);
+    let position = position.or_else(|| direct(&["x", "y", "z"]));
+    // `grasp detect --json` writes `orientation_xyzw`.
+    let names = ["orientation", "orientation_xyzw", "rotation", "quaternion"];
+    let orientation = part(&names, &["x", "y", "z", "w"]).or_else(|| Some(("qw", direct(&["qx", "qy", "qz", "qw"])?)));
+    if let (Some(&[x, y, z]), Some((key, &[qx, qy, qz, qw]))) =
+        (position.as_deref(), orientation.as_ref().map(|(key, numbers)| (key, &numbers[..])))
+    {
+        let rotation = unit(Quaternion::new(qw, qx, qy, qz)).map_err(|reason| anyhow!("`{key}`: {reason}"));
+        return Some(rotation.map(|rotation| Isometry3::from_parts(Translation3::new(x, y, z), rotation)));
+    }
+    map.values().find_map(|inner| {
+        let numbers = flat(inner.get("data").unwrap_or(inner));
+        if numbers.len() == 16 {
+            return Some(matrices(&numbers).map(|poses| poses[0]));
+        }
+        find(inner)
+    })
+}
+
+/// Largest deviation of a rotation from an orthonormal matrix that is corrected: room for three decimals.
+const CORRECTED: f64 = 1e-2;
 
 fn matrices(numbers: &[f64]) -> anyhow::Result<Vec<Isometry3<f64>>> {
     ensure!(
@@ -230,12 +195,16 @@ fn matrices(numbers: &[f64]) -> anyhow::Result<Vec<Isometry3<f64>>> {
     let pose = |numbers: &[f64]| {
         let matrix = Matrix4::from_row_slice(numbers);
         let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into();
-        let orthonormal = (rotation * rotation.transpose() - Matrix3::identity()).norm() < 1e-3;
+        let deviation = (rotation * rotation.transpose() - Matrix3::identity()).norm();
         ensure!(
-            orthonormal && rotation.determinant() > 0.0 && numbers[12..] == [0.0, 0.0, 0.0, 1.0],
-            "invalid pose matrix: the upper left 3×3 block must be a rotation, the last row 0 0 0 1; got {:?}",
+            deviation < CORRECTED && rotation.determinant() > 0.0 && numbers[12..] == [0.0, 0.0, 0.0, 1.0],
+            "invalid pose matrix: the upper left 3×3 block must be a rotation (R·Rᵀ deviates from the identity by \
+             {deviation:.3}, at most {CORRECTED} is corrected), the last row 0 0 0 1; got {:?}",
             numbers.chunks(4).collect::<Vec<_>>()
         );
+        if deviation > 1e-3 {
+            eprintln!("warning: the rotation of a pose has few decimals; it was orthonormalised ({deviation:.4} off)");
+        }
         let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&rotation));
         Ok(Isometry3::from_parts(Translation3::new(numbers[3], numbers[7], numbers[11]), rotation))
     };
@@ -247,34 +216,6 @@ mod tests {
     use nalgebra::Point3;
 
     use super::*;
-
-    const K: [f64; 9] = [540.0, 0.0, 320.0, 0.0, 541.0, 240.0, 0.0, 0.0, 1.0];
-
-    #[test]
-    fn intrinsics_are_read_in_the_formats_of_other_tools() {
-        let texts = [
-            r#"{"k": [540, 0, 320, 0, 541, 240, 0, 0, 1]}"#,
-            "[[540, 0, 320], [0, 541, 240], [0, 0, 1]]",
-            // ROS 2, ROS 1, the calibration file of camera_calibration.
-            "header:\n  frame_id: camera\nk:\n- 540.0\n- 0.0\n- 320.0\n- 0.0\n- 541.0\n- 240.0\n- 0.0\n- 0.0\n- 1.0\nr: []\n---\n",
-            "height: 480\nK: [540.0, 0.0, 320.0, 0.0, 541.0, 240.0,\n  0.0, 0.0, 1.0]\nD: [0.1]\n---\nheight: 1\n",
-            "image_width: 640\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [540, 0, 320, 0, 541, 240, 0, 0, 1]\n",
-            // Open3D, column by column, alone and in a PinholeCameraParameters; librealsense.
-            r#"{"width": 640, "height": 480, "intrinsic_matrix": [540, 0, 0, 0, 541, 0, 320, 240, 1]}"#,
-            r#"{"extrinsic": [1], "intrinsic": {"intrinsic_matrix": [540, 0, 0, 0, 541, 0, 320, 240, 1]}}"#,
-            r#"{"width": 640, "fx": 540, "fy": 541, "ppx": 320, "ppy": 240, "coeffs": [0, 0, 0, 0, 0]}"#,
-        ];
-        for text in texts {
-            assert_eq!(intrinsic_numbers(text).unwrap(), K, "{text}");
-        }
-        assert!(intrinsic_numbers("k: [1, 2").is_err());
-        let error = intrinsic_numbers(r#"{"intrinsic_matrix": [540, 540, 320, 240]}"#).unwrap_err().to_string();
-        assert!(error.contains("4 numbers in `intrinsic_matrix`"), "{error}");
-        assert_eq!(intrinsics("540, 541,320,240").unwrap(), [540.0, 0.0, 320.0, 0.0, 541.0, 240.0, 0.0, 0.0, 1.0]);
-        assert_eq!(intrinsics("540,0,320,0,541,240,0,0,1").unwrap(), K);
-        assert_eq!(intrinsics_file("540,541,320,240"), None);
-        assert_eq!(intrinsics_file("k,1.json"), Some(PathBuf::from("k,1.json")));
-    }
 
     #[test]
     fn poses_are_numbers_or_files() {
@@ -295,13 +236,50 @@ mod tests {
     #[test]
     fn poses_of_files_and_of_detect_are_read() {
         for key in ["orientation", "orientation_xyzw"] {
-            let pose = named(&serde_json::json!({ "position": [1, 2, 3], key: [0, 0, 1, 0] })).unwrap();
+            let pose = super::pose(&serde_json::json!({ "position": [1, 2, 3], key: [0, 0, 1, 0] })).unwrap();
             assert!((pose * Point3::new(1.0, 0.0, 0.0) - Point3::new(0.0, 2.0, 3.0)).norm() < 1e-12, "{key}");
-            let long = named(&serde_json::json!({ "position": [1, 2, 3], key: [0, 0, 0, 2] }));
+            let long = super::pose(&serde_json::json!({ "position": [1, 2, 3], key: [0, 0, 0, 2] }));
             let error = long.unwrap_err().to_string();
             assert!(error.starts_with(&format!("`{key}`: the norm of the quaternion is 2")), "{error}");
         }
-        assert!(named(&serde_json::json!({ "position": [1, 2, 3] })).is_err());
+        assert!(super::pose(&serde_json::json!({ "position": [1, 2, 3] })).is_err());
+    }
+
+    #[test]
+    fn poses_of_other_tools_are_read() {
+        let texts = [
+            "position: [1.0, 2.0, 3.0]\norientation: [0.0, 0.0, 1.0, 0.0]\n",
+            r#"{"position": {"x": 1.0, "y": 2.0, "z": 3.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 1.0, "w": 0.0}}"#,
+            // A TransformStamped and a PoseStamped of ROS, easy_handeye, OpenCV, a named matrix.
+            "header:\n  frame_id: base\ntransform:\n  translation: {x: 1.0, y: 2.0, z: 3.0}\n  rotation: {x: 0.0, y: 0.0, z: 1.0, w: 0.0}\n",
+            "header:\n  frame_id: base\npose:\n  position: {x: 1.0, y: 2.0, z: 3.0}\n  orientation: {x: 0.0, y: 0.0, z: 1.0, w: 0.0}\n",
+            "parameters:\n  eye_on_hand: false\ntransformation: {qw: 0.0, qx: 0.0, qy: 0.0, qz: 1.0, x: 1.0, y: 2.0, z: 3.0}\n",
+            "%YAML:1.0\n---\nState: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n   data: [-1, 0, 0, 1, 0, -1, 0, 2, 0, 0, 1, 3, 0, 0, 0, 1]\n",
+            r#"{"T_base_camera": [[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]}"#,
+        ];
+        for text in texts {
+            let found = pose(&crate::document::parse(text).unwrap()).unwrap();
+            assert!((found * Point3::new(1.0, 0.0, 0.0) - Point3::new(0.0, 2.0, 3.0)).norm() < 1e-12, "{text}");
+        }
+        let rows = crate::document::parse("-1.0 0 0 1\n0 -1 0 2\n0 0 1 3\n0 0 0 1\n").unwrap();
+        assert!(matrices(&flat(&rows)).is_ok());
+        let error = super::pose(&serde_json::json!({ "where": 1 })).unwrap_err().to_string();
+        assert!(error.ends_with("keys in the file: where"), "{error}");
+    }
+
+    #[test]
+    fn rotations_with_three_decimals_are_orthonormalised() {
+        let rotation = UnitQuaternion::from_euler_angles(0.3, -0.7, 2.1);
+        let mut numbers = vec![0.0_f64; 16];
+        for (row, column) in (0..3).flat_map(|row| (0..3).map(move |column| (row, column))) {
+            let exact: f64 = rotation.to_rotation_matrix()[(row, column)];
+            numbers[4 * row + column] = (exact * 1000.0).round() / 1000.0;
+        }
+        numbers[15] = 1.0;
+        assert!(matrices(&numbers).unwrap()[0].rotation.angle_to(&rotation) < 1e-3);
+        numbers[0] += 0.05;
+        let error = matrices(&numbers).unwrap_err().to_string();
+        assert!(error.contains("deviates from the identity by"), "{error}");
     }
 
     #[test]

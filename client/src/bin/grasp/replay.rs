@@ -233,6 +233,7 @@ fn median(values: &mut [f64]) -> Option<f64> {
 
 /// The files of a folder, the oldest first, or the file.
 fn files(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    ensure!(path.exists(), "{}: no such file or folder", path.display());
     if !path.is_dir() {
         return Ok(vec![path.to_owned()]);
     }

@@ -10,9 +10,12 @@ use grasp_client::{
 use grasp_perception::{View, overview, seen_from};
 use nalgebra::Isometry3;
 
+use crate::camera::{self, Camera};
+use crate::image::{self, Scale};
+use crate::labels::{self, Labels};
 use crate::numbers::Numbers;
 use crate::pose::Poses;
-use crate::{cloud, image, labels, pose, volume};
+use crate::{cloud, volume};
 
 /// The observation: a volume, depth images with camera poses, or point clouds with camera positions.
 #[derive(Args, Clone)]
@@ -29,14 +32,15 @@ pub(crate) struct SceneArgs {
     #[arg(long, value_name = "METRES", conflicts_with_all = ["intrinsics", "camera_position"])]
     voxel_size: Option<f64>,
 
-    /// Intrinsic matrix of the cameras: 3×3 .npy, JSON or YAML of ROS's CameraInfo, JSON of Open3D or librealsense, or
-    /// the numbers FX,FY,CX,CY.
+    /// Intrinsics of the cameras: JSON, YAML or text of ROS (CameraInfo), OpenCV, Open3D, librealsense, kalibr or BOP, a
+    /// matrix in a .npy or .npz, or the numbers FX,FY,CX,CY. Images of a lens with distortion are rectified.
     #[arg(long, value_name = "FILE|NUMBERS", conflicts_with = "camera_position")]
     intrinsics: Option<String>,
 
-    /// Unit of integer depths, metres.
-    #[arg(long, value_name = "METRES", default_value_t = image::MILLIMETRE, requires = "intrinsics")]
-    depth_scale: f32,
+    /// Unit of the depths, metres: 0.0001 for tenths of a millimetre. Default: that of the file of the intrinsics, or else
+    /// 0.001 for integers and 1 for floats.
+    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, requires = "intrinsics")]
+    depth_scale: Option<f64>,
 
     /// Send depth images as PNG files: fewer bytes on a slow network. They must be in millimetres.
     #[arg(long, requires = "intrinsics")]
@@ -71,6 +75,10 @@ pub(crate) struct SceneArgs {
     /// it once for all point clouds, or once for each.
     #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true)]
     camera_position: Vec<Numbers<3>>,
+
+    /// Unit of the points, metres: 0.001 for millimetres. Default: 0.001 for integers and 1 for floats.
+    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, requires = "camera_position")]
+    cloud_scale: Option<f64>,
 
     /// T_frame_cloud of each point cloud, formats as for --camera-from-task. Default: identity.
     #[arg(long, value_name = "FILE|NUMBERS", requires = "camera_position", allow_hyphen_values = true)]
@@ -112,7 +120,7 @@ impl SceneArgs {
     pub fn files(&self) -> impl Iterator<Item = PathBuf> {
         let Self { files, intrinsics, camera_from_task, frame_from_camera, frame_from_cloud, workspace, .. } = self;
         let poses = [camera_from_task, frame_from_camera, frame_from_cloud, workspace].into_iter().flatten();
-        let intrinsics = intrinsics.as_deref().and_then(pose::intrinsics_file);
+        let intrinsics = intrinsics.as_deref().and_then(camera::file);
         let labels = self.labels.iter().cloned();
         files.iter().cloned().chain(labels).chain(intrinsics).chain(poses.filter_map(Poses::file).cloned())
     }
@@ -149,9 +157,9 @@ impl SceneArgs {
     }
 
     /// The labels of each file, if given.
-    fn labels(&self) -> anyhow::Result<Vec<Option<Vec<u16>>>> {
+    fn labels(&self) -> anyhow::Result<Vec<Option<Labels>>> {
         if self.labels.is_empty() {
-            return Ok(vec![None; self.files.len()]);
+            return Ok(self.files.iter().map(|_| None).collect());
         }
         ensure!(
             self.labels.len() == self.files.len(),
@@ -163,7 +171,8 @@ impl SceneArgs {
     }
 
     fn images(&self, intrinsics: &str) -> anyhow::Result<Vec<DepthView>> {
-        let k = pose::intrinsics(intrinsics)?;
+        let camera = Camera::read(intrinsics)?;
+        let scale = Scale::new(self.depth_scale, camera.depth_scale)?;
         let of_camera = Poses::Numbers(Isometry3::identity());
         let (poses, direction): (_, fn(Isometry3<f64>) -> Extrinsics) =
             match (&self.camera_from_task, &self.frame_from_camera) {
@@ -178,16 +187,16 @@ impl SceneArgs {
                 ),
             };
         let poses = poses.each(self.files.len(), "images")?;
-        let view = |((file, pose), labels): ((&PathBuf, Isometry3<f64>), _)| {
-            let (depth, width, height) = image::read(file, self.depth_scale)?;
-            let depth = match depth {
+        let view = |((file, pose), labels): ((&PathBuf, Isometry3<f64>), Option<Labels>)| {
+            let view = camera.view(file, scale, labels, direction(pose))?;
+            let depth = match view.depth {
                 Depth::Millimetres(depth) if self.png => Depth::Png(depth),
                 Depth::Metres(_) if self.png => {
                     bail!("{}: --png needs depths in millimetres, in a PNG, TIFF or .npy with 16 bits", file.display())
                 }
                 depth => depth,
             };
-            Ok(DepthView { depth, width, height, k, extrinsics: direction(pose), labels })
+            Ok(DepthView { depth, ..view })
         };
         self.files.iter().zip(poses).zip(self.labels()?).map(view).collect()
     }
@@ -206,9 +215,16 @@ impl SceneArgs {
             Some(poses) => poses.each(count, "point clouds")?,
             None => vec![Isometry3::identity(); count],
         };
-        let view = |(((file, Numbers(camera_position)), frame_from_cloud), labels): (((&PathBuf, _), _), _)| {
-            Ok(CloudView { points: cloud::read(file)?, frame_from_cloud, camera_position, labels })
-        };
+        let view =
+            |(((file, Numbers(camera_position)), frame_from_cloud), labels): (((&PathBuf, _), _), Option<Labels>)| {
+                let labels = labels.map(|Labels { values, .. }| values);
+                Ok(CloudView {
+                    points: cloud::read(file, self.cloud_scale)?,
+                    frame_from_cloud,
+                    camera_position,
+                    labels,
+                })
+            };
         self.files.iter().zip(positions).zip(poses).zip(self.labels()?).map(view).collect()
     }
 }

@@ -6,15 +6,17 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 use grasp::{TABLE_HEIGHT, WORKSPACE_SIZE};
-use grasp_client::{DepthView, Extrinsics};
+use grasp_client::Extrinsics;
 use grasp_perception::{Cloud, FoundTable, Frame, Tabletop, View, Workspace, overview};
 use nalgebra::{Isometry3, Point3, Unit, Vector3};
 use serde_json::{Value, json};
 
+use crate::camera::Camera;
 use crate::files::in_file;
+use crate::image::{self, Scale};
 use crate::numbers::Numbers;
 use crate::overlay::Overlay;
-use crate::{cloud, image, pose, show};
+use crate::{cloud, show};
 
 #[derive(Args)]
 pub(crate) struct Table {
@@ -22,8 +24,7 @@ pub(crate) struct Table {
     /// metres. Or point cloud, with --camera-position: PCD, PLY, .npy or .npz.
     file: PathBuf,
 
-    /// Intrinsic matrix of the camera: 3×3 .npy, JSON or YAML of ROS's CameraInfo, JSON of Open3D or of RealSense, or
-    /// the numbers FX,FY,CX,CY.
+    /// Intrinsics of the camera, formats as for `grasp detect`.
     #[arg(long, value_name = "FILE|NUMBERS", required_unless_present = "camera_position")]
     intrinsics: Option<String>,
 
@@ -31,9 +32,13 @@ pub(crate) struct Table {
     #[arg(long, value_name = "X,Y,Z", conflicts_with = "intrinsics", allow_hyphen_values = true)]
     camera_position: Option<Numbers<3>>,
 
-    /// Unit of integer depths, metres.
-    #[arg(long, value_name = "METRES", default_value_t = image::MILLIMETRE)]
-    depth_scale: f32,
+    /// Unit of the depths, metres. Default: that of the file of the intrinsics, or else 0.001 for integers and 1 for floats.
+    #[arg(long, value_name = "METRES", value_parser = image::parse_scale)]
+    depth_scale: Option<f64>,
+
+    /// Unit of the points, metres: 0.001 for millimetres. Default: 0.001 for integers and 1 for floats.
+    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, requires = "camera_position")]
+    cloud_scale: Option<f64>,
 
     /// Direction of gravity in the camera frame (z forward, x right, y down), or in the frame of the points: the reversed
     /// reading of an accelerometer at rest. Without it a wall that fills the image is taken for a table.
@@ -85,17 +90,17 @@ impl Table {
     fn find(&self, workspace: &mut Workspace) -> anyhow::Result<(FoundTable, View)> {
         let (height, edge) = (self.table_height, WORKSPACE_SIZE);
         if let Some(Numbers(eye)) = self.camera_position {
-            let points = cloud::read(&self.file)?.into_iter().map(|point| Point3::from(point).cast::<f64>());
+            let points =
+                cloud::read(&self.file, self.cloud_scale)?.into_iter().map(|point| Point3::from(point).cast::<f64>());
             let points = points.filter(|point| point.iter().all(|c| c.is_finite())).collect();
             let cloud = Cloud { points, eye: Point3::from(eye), labels: None };
             let seen = overview(&cloud.points, &cloud.eye);
             let seen = seen.context("--camera-position must be the position from which the points were seen")?;
             return Ok((workspace.find_table_in_cloud(&cloud, height, edge)?, seen));
         }
-        let k = pose::intrinsics(self.intrinsics.as_deref().unwrap_or_default())?;
-        let (depth, width, height_pixels) = image::read(&self.file, self.depth_scale)?;
-        let extrinsics = Extrinsics::FrameFromCamera(Isometry3::identity());
-        let view = DepthView { depth, width, height: height_pixels, k, extrinsics, labels: None };
+        let camera = Camera::read(self.intrinsics.as_deref().unwrap_or_default())?;
+        let scale = Scale::new(self.depth_scale, camera.depth_scale)?;
+        let view = camera.view(&self.file, scale, None, Extrinsics::FrameFromCamera(Isometry3::identity()))?;
         let mut frame: Frame = grasp_proto::frame(&(&view).into())?;
         let found = workspace.find_table_in_frame(&mut frame, true, height, edge)?;
         Ok((found, frame.in_task(&Isometry3::identity())?))

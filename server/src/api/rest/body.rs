@@ -1,12 +1,15 @@
 //! Bodies of HTTP requests, with the limits on gRPC messages.
 
 use std::future::poll_fn;
+use std::io::{self, Write};
 use std::pin::Pin;
 use std::time::{Duration, Instant};
 
 use axum::body::{Body, Bytes};
+use axum::http::HeaderValue;
 use axum::http::header::{CONTENT_ENCODING, CONTENT_LENGTH, EXPECT};
 use axum::http::request::Parts;
+use flate2::write::{GzDecoder, ZlibDecoder};
 use http_body::{Body as _, Frame};
 use tokio::time::timeout;
 use tonic::{Code, Status};
@@ -41,29 +44,103 @@ pub(super) async fn discard(mut body: Body, parts: &Parts, limits: Limits) {
 }
 
 async fn receive(body: &mut Body, parts: &Parts, limits: Limits) -> Result<Message, Status> {
-    if let Some(encoding) = parts.headers.get(CONTENT_ENCODING) {
-        return Err(Status::invalid_argument(format!("the header Content-Encoding is {encoding:?}, must be absent")));
-    }
+    let mut content = Content::new(parts.headers.get(CONTENT_ENCODING), limits.message_bytes)?;
     let announced = parts.headers.get(CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse::<usize>().ok());
     if let Some(bytes) = announced.filter(|bytes| *bytes > limits.message_bytes) {
         return Err(limits.too_large(bytes));
     }
     let peer = Peer::of(&parts.extensions).ok_or_else(|| Status::internal("the request belongs to no connection"))?;
     let mut received = peer.share.clone().message();
-    let mut bytes: Vec<u8> = Vec::new();
     let started = Instant::now();
     loop {
         let longest = limits.longest(announced.unwrap_or(limits.message_bytes));
         let pause = limits.stall.min(longest.saturating_sub(started.elapsed()));
         let frame = timeout(pause, next(body)).await.map_err(|_| stalled(pause, limits.stall))?;
-        let Some(frame) = frame else { return Ok(Message { bytes: bytes.into(), _received: received }) };
+        let Some(frame) = frame else { return Ok(Message { bytes: content.finish()?, _received: received }) };
         let frame = frame.map_err(|error| Status::cancelled(format!("the body ended early: {error}")))?;
         let Some(data) = frame.data_ref() else { continue };
-        if bytes.len() + data.len() > limits.message_bytes {
-            return Err(limits.too_large(bytes.len() + data.len()));
+        let before = content.output().bytes.len();
+        if let Err(error) = content.write(data) {
+            return Err(match content.output().excess {
+                Some(bytes) => limits.too_large(bytes),
+                None => Status::invalid_argument(format!("the body is not valid: {error}")),
+            });
         }
-        received.add(data.len())?;
-        bytes.extend_from_slice(data);
+        received.add(content.output().bytes.len() - before)?;
+    }
+}
+
+/// The content of a body, decompressed as it arrives.
+enum Content {
+    Plain(Output),
+    Gzip(GzDecoder<Output>),
+    /// In the zlib format, as HTTP defines it (RFC 9110).
+    Deflate(ZlibDecoder<Output>),
+}
+
+impl Content {
+    fn new(encoding: Option<&HeaderValue>, limit: usize) -> Result<Self, Status> {
+        let output = Output { bytes: Vec::new(), limit, excess: None };
+        match encoding.map(HeaderValue::as_bytes) {
+            None | Some(b"identity") => Ok(Self::Plain(output)),
+            Some(b"gzip") => Ok(Self::Gzip(GzDecoder::new(output))),
+            Some(b"deflate") => Ok(Self::Deflate(ZlibDecoder::new(output))),
+            Some(other) => {
+                let other = String::from_utf8_lossy(other);
+                let reason = format!("the header Content-Encoding is {other:?}, must be gzip, deflate or absent");
+                Err(Status::invalid_argument(reason))
+            }
+        }
+    }
+
+    fn output(&self) -> &Output {
+        match self {
+            Self::Plain(output) => output,
+            Self::Gzip(decoder) => decoder.get_ref(),
+            Self::Deflate(decoder) => decoder.get_ref(),
+        }
+    }
+
+    fn write(&mut self, data: &[u8]) -> io::Result<()> {
+        match self {
+            Self::Plain(output) => output.write_all(data),
+            Self::Gzip(decoder) => decoder.write_all(data).and_then(|()| decoder.flush()),
+            Self::Deflate(decoder) => decoder.write_all(data).and_then(|()| decoder.flush()),
+        }
+    }
+
+    fn finish(self) -> Result<Bytes, Status> {
+        let output = match self {
+            Self::Plain(output) => Ok(output),
+            Self::Gzip(decoder) => decoder.finish(),
+            Self::Deflate(decoder) => decoder.finish(),
+        };
+        let output = output.map_err(|error| Status::invalid_argument(format!("the body is not valid: {error}")))?;
+        Ok(output.bytes.into())
+    }
+}
+
+/// Decompressed bytes, up to a limit.
+struct Output {
+    bytes: Vec<u8>,
+    limit: usize,
+    /// Number of bytes that exceeded the limit.
+    excess: Option<usize>,
+}
+
+impl Write for Output {
+    fn write(&mut self, data: &[u8]) -> io::Result<usize> {
+        let bytes = self.bytes.len() + data.len();
+        if bytes > self.limit {
+            self.excess = Some(bytes);
+            return Err(io::Error::other("the body is too large"));
+        }
+        self.bytes.extend_from_slice(data);
+        Ok(data.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
     }
 }
 
