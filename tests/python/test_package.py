@@ -281,11 +281,12 @@ class DetectTest(ServerTest):
             found(structured[["x", "y"]])
 
     def test_a_server_on_this_machine_is_called_without_the_proxy(self):
-        code = "import sys, graspd; print(graspd.Client(sys.argv[1]).health())"
+        code = "import sys, graspd; print(graspd.Client(sys.argv[1]).health(), graspd.aio.__name__, graspd.__version__)"
         environment = os.environ | {"http_proxy": "http://127.0.0.1:9", "PYTHONPATH": INSTALLED.name}
         command = [sys.executable, "-c", code, self.server.grpc]
         run = subprocess.run(command, env=environment, capture_output=True, text=True)
-        self.assertEqual(run.stdout, "True\n", run.stderr)
+        self.assertEqual(run.stdout.split()[:2], ["True", "graspd.aio"], run.stderr)
+        self.assertIn(f'version = "{run.stdout.split()[2]}"', (PACKAGE / "pyproject.toml").read_text())
 
     def test_wrong_geometry_is_reported_and_logged_once(self):
         wire.logged.clear()
@@ -417,7 +418,6 @@ class ErrorsTest(ServerTest):
 
     def test_invalid_arguments_raise_value_errors(self):
         volume, depth, pose = scene.volume(*CAMERAS), scene.depth(CAMERAS[0]), np.eye(4)
-        never = graspd.CollisionCheck("never")
         for call, expected in [
             (lambda: graspd.Volume(volume[:-1]), r"must be a cube .* got shape \(39, 40, 40\)"),
             (lambda: graspd.Volume(np.zeros((0, 0, 0))), "must be a cube"),
@@ -430,12 +430,23 @@ class ErrorsTest(ServerTest):
             (lambda: self.client.detect(graspd.Volume(2 * volume, dtype=np.uint8)), r"in \[0, 1\]"),
             (lambda: self.client.detect_from_depth([replace(views()[0], depth=depth > 0)]), "got bool"),
             (lambda: self.client.detect_from_depth([replace(views()[0], depth=depth.astype(int) - 1)]), "from 0 to 65535"),
-            (lambda: self.client.detect(volume, graspd.Options(collision=never)), "MODE_NEVER"),
+            (lambda: graspd.CollisionCheck("never"), "mode is 'never', must be one of 'off', 'flag', 'filter'"),
+            (lambda: graspd.Convention("wrist"), "origin is 'wrist', must be one of 'finger_base'"),
+            (lambda: graspd.Options(priority="high"), "priority is 'high', must be one of 'normal', 'batch'"),
             (lambda: graspd.Client("127.0.0.1:1", tls_cert="a.pem"), "must be given together"),
             (lambda: graspd.Client("127.0.0.1:1", token=" "), "token is empty"),
             (lambda: graspd.Client("127.0.0.1:1", token="two\nlines"), "token"),
         ]:
             with self.subTest(expected), self.assertRaisesRegex(ValueError, expected):
+                call()
+
+    def test_arguments_of_a_wrong_type_raise_type_errors(self):
+        for call, expected in [
+            (lambda: graspd.Options(collision="filter"), r'collision is .filter., must be a graspd.CollisionCheck, such as'),
+            (lambda: graspd.Options(convention="tcp"), r"must be a graspd.Convention"),
+            (lambda: graspd.Options(region=((0, 0, 0), (1, 1, 1))), r"must be a graspd.Box"),
+        ]:
+            with self.subTest(expected), self.assertRaisesRegex(TypeError, expected):
                 call()
 
     def test_passed_deadlines_and_unreachable_servers(self):

@@ -741,6 +741,13 @@ fn files_of_other_tools_are_read_and_contradictions_refused() {
     );
     assert_eq!(qualities(detect("mm.png", &opencv, &pose, &[])), expected);
 
+    let shape = [CAMERA.height as u64, CAMERA.width as u64];
+    let whole = npyz::WriteOptions::new().default_dtype().shape(&shape);
+    let mut whole = whole.writer(File::create(path("i32.npy")).unwrap()).begin_nd().unwrap();
+    whole.extend(metres.iter().map(|metres| (metres * 1e3).round() as i32)).unwrap();
+    whole.finish().unwrap();
+    assert_eq!(qualities(detect("i32.npy", &k, &pose, &[])), expected);
+
     let refused = |output: Output, expected: &str| {
         let error = text(&output.stderr);
         assert!(!output.status.success() && error.contains(expected), "{expected}: {error}");
@@ -756,6 +763,8 @@ fn files_of_other_tools_are_read_and_contradictions_refused() {
         "--depth-scale is 0.001 m, but the file",
     );
     refused(detect("mm.png", &k, &pose, &["--depth-scale", "1000"]), "did you mean 0.001?");
+    std::fs::write(path("depth.jpg"), b"\xff\xd8\xff\xe0\0\x10JFIF").unwrap();
+    refused(detect("depth.jpg", &k, &pose, &[]), "depth.jpg: a JPEG file");
     let fisheye = file(
         "fisheye.json",
         format!(

@@ -5,6 +5,9 @@ durations in seconds, time stamps in nanoseconds since 1970. Quaternions are x, 
 frame b into frame a. Arrays of voxels are indexed ``[x][y][z]``.
 """
 
+from importlib.metadata import version
+
+from graspd import aio
 from graspd.client import Client, Tracking
 from graspd.detection import Detection, Dropped, FoundTable, GeometryWarning, Grasp, Latency, Model, Score, Scores
 from graspd.errors import (
@@ -22,6 +25,8 @@ from graspd.geometry import Pose
 from graspd.options import Box, Candidate, CollisionCheck, Cone, Convention, Gripper, Options, Retreat
 from graspd.retry import Retry
 from graspd.seen import CloudView, DepthView, Volume, Workspace
+
+__version__ = version("graspd")
 
 __all__ = [
     "Aborted",
@@ -58,4 +63,5 @@ __all__ = [
     "Unavailable",
     "Volume",
     "Workspace",
+    "aio",
 ]

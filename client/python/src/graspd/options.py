@@ -1,13 +1,24 @@
 """Options of requests. The names are those of `grasp.v1`, so that the `field` of an `InvalidArgument` is the path of an
-attribute. The server validates the values."""
+attribute. Values of a wrong type and unknown names raise `TypeError` and `ValueError`; the server validates the rest."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from graspd.geometry import PoseLike, Vector
+
+
+def check_choice(name: str, value: Any, *choices: str) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} is {value!r}, must be one of {', '.join(map(repr, choices))}")
+
+
+def check_type(name: str, value: Any, kind: type, example: str) -> None:
+    """Accepts None."""
+    if not (value is None or isinstance(value, kind)):
+        raise TypeError(f"{name} is {value!r}, must be a graspd.{kind.__name__}, such as {example}")
 
 
 @dataclass(frozen=True)
@@ -61,6 +72,9 @@ class CollisionCheck:
     """Also treat as an obstacle what lies behind a surface in a view and was measured by none. Other unobserved space counts as free. Needs
     depth images or point clouds."""
 
+    def __post_init__(self) -> None:
+        check_choice("CollisionCheck.mode", self.mode, "off", "flag", "filter")
+
 
 @dataclass(frozen=True)
 class Convention:
@@ -73,6 +87,10 @@ class Convention:
     """Axis of the grasp frame along which the fingers close."""
     parent_from_grasp: PoseLike | None = None
     """``T_parent_grasp``, for ``"parent"``: pose of the finger base, closing along `closing_axis`, in the link."""
+
+    def __post_init__(self) -> None:
+        check_choice("Convention.origin", self.origin, "finger_base", "tcp", "parent")
+        check_choice("Convention.closing_axis", self.closing_axis, "y", "x")
 
 
 @dataclass(frozen=True)
@@ -138,3 +156,12 @@ class Options:
     """Smallest distance of the point between the fingertips from the sides of the cube, metres; None: 0."""
     priority: Literal["normal", "batch"] = "normal"
     """``batch``: for offline processing; normal requests are processed first."""
+
+    def __post_init__(self) -> None:
+        check_choice("Options.priority", self.priority, "normal", "batch")
+        check_type("Options.collision", self.collision, CollisionCheck, 'CollisionCheck("filter")')
+        check_type("Options.convention", self.convention, Convention, 'Convention("tcp")')
+        check_type("Options.gripper", self.gripper, Gripper, "Gripper(0.08, 0.05, 0.0264, 0.021)")
+        check_type("Options.region", self.region, Box, "Box((0, 0, 0), (0.3, 0.3, 0.3))")
+        check_type("Options.approach", self.approach, Cone, "Cone((0, 0, -1), 0.8)")
+        check_type("Options.retreat", self.retreat, Retreat, "Retreat(0.1)")

@@ -12,6 +12,16 @@ use npyz::{Deserialize, NpyFile, Order, TypeChar};
 /// An array of a file; its values have not been read yet.
 pub(crate) type Array = NpyFile<Box<dyn Read>>;
 
+/// First bytes of files that cannot be read, with what to do.
+const REFUSED: [(&[u8], &str); 6] = [
+    (b"\xff\xd8\xff", "a JPEG file; its compression changes depths: save PNG with 16 bits, TIFF or .npy"),
+    (b"GIF8", "a GIF file; save PNG with 16 bits, TIFF or .npy"),
+    (b"RIFF", "a WebP file; save PNG with 16 bits, TIFF or .npy"),
+    (b"\x89HDF", "an HDF5 file; save the array as .npy"),
+    (b"#ROSBAG", "a ROS bag; save a message as PNG, .npy or PCD"),
+    (b"\x89MCAP", "an MCAP file; save a message as PNG, .npy or PCD"),
+];
+
 /// Format of a file, judged by its first bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Format {
@@ -29,6 +39,9 @@ impl Format {
         let mut first = Vec::new();
         File::open(path)?.take(8).read_to_end(&mut first)?;
         let starts = |magic: &[u8]| first.starts_with(magic);
+        if let Some((_, reason)) = REFUSED.iter().find(|(magic, _)| starts(magic)) {
+            bail!("{reason}");
+        }
         Ok(if starts(b"\x89PNG") {
             Self::Png
         } else if starts(b"II*\0") || starts(b"MM\0*") {
