@@ -243,7 +243,7 @@ def labels_message(labels: Any) -> pb.Labels:
 def cloud_message(view: CloudView) -> pb.CloudView:
     return pb.CloudView(
         labels=given(labels_message, view.labels),
-        points=coordinates(view.points).astype("<f4").tobytes(),
+        points=coordinates(view.points).astype("<f4", copy=False).tobytes(),
         camera_position=vector_message(view.camera_position),
         frame_from_cloud=pose_message(view.frame_from_cloud),
     )

@@ -16,7 +16,7 @@ pub(crate) type Array = NpyFile<Box<dyn Read>>;
 const REFUSED: [(&[u8], &str); 6] = [
     (b"\xff\xd8\xff", "a JPEG file; its compression changes depths: save PNG with 16 bits, TIFF or .npy"),
     (b"GIF8", "a GIF file; save PNG with 16 bits, TIFF or .npy"),
-    (b"RIFF", "a WebP file; save PNG with 16 bits, TIFF or .npy"),
+    (b"RIFF", "a RIFF file, such as WebP; save PNG with 16 bits, TIFF or .npy"),
     (b"\x89HDF", "an HDF5 file; save the array as .npy"),
     (b"#ROSBAG", "a ROS bag; save a message as PNG, .npy or PCD"),
     (b"\x89MCAP", "an MCAP file; save a message as PNG, .npy or PCD"),
@@ -126,6 +126,12 @@ pub(crate) fn values<T: Deserialize + Copy>(array: Array) -> io::Result<Vec<T>> 
         values[source]
     };
     Ok((0..values.len()).map(value_at).collect())
+}
+
+/// The values as u16. An error names the value as `what`.
+pub(crate) fn narrowed(values: impl IntoIterator<Item = impl Into<i64>>, what: &str) -> anyhow::Result<Vec<u16>> {
+    let value = |value: i64| u16::try_from(value).with_context(|| format!("{what} {value}; must be from 0 to 65535"));
+    values.into_iter().map(|whole| value(whole.into())).collect()
 }
 
 /// The values of an array of floats in row-major order.

@@ -86,16 +86,9 @@ fn npy(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
     };
     let supported =
         [(TypeChar::Float, 4), (TypeChar::Float, 8), (TypeChar::Uint, 2), (TypeChar::Int, 4), (TypeChar::Int, 8)];
-    let narrowed = |depths: Vec<i64>| {
-        let depth =
-            |depth: i64| u16::try_from(depth).with_context(|| format!("depth {depth}; must be from 0 to 65535"));
-        depths.into_iter().map(depth).collect::<anyhow::Result<_>>()
-    };
     let depth = match files::kind(&array, "f32 (metres) or u16 (millimetres)", &supported)? {
-        (TypeChar::Int, 4) => {
-            Depth::Millimetres(narrowed(files::values::<i32>(array)?.into_iter().map(i64::from).collect())?)
-        }
-        (TypeChar::Int, _) => Depth::Millimetres(narrowed(files::values(array)?)?),
+        (TypeChar::Int, 4) => Depth::Millimetres(files::narrowed(files::values::<i32>(array)?, "depth")?),
+        (TypeChar::Int, _) => Depth::Millimetres(files::narrowed(files::values::<i64>(array)?, "depth")?),
         (_, 4) => Depth::Metres(files::values(array)?),
         (_, 8) => Depth::Metres(files::values::<f64>(array)?.into_iter().map(|depth| depth as f32).collect()),
         _ => Depth::Millimetres(files::values(array)?),

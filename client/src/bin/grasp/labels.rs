@@ -48,11 +48,6 @@ fn npy(path: &Path) -> anyhow::Result<Labels> {
         (TypeChar::Float, 8),
     ];
     let shape = array.shape().to_vec();
-    let narrowed = |labels: Vec<i64>| {
-        let label =
-            |label: i64| u16::try_from(label).with_context(|| format!("label {label}; must be from 0 to 65535"));
-        labels.into_iter().map(label).collect()
-    };
     let whole = |value: f64| {
         ensure!(value.fract() == 0.0 && value.abs() < 1e9, "label {value}; must be a whole number from 0 to 65535");
         Ok(value as i64)
@@ -62,9 +57,12 @@ fn npy(path: &Path) -> anyhow::Result<Labels> {
             (TypeChar::Bool, _) => Ok(files::values::<bool>(array)?.into_iter().map(u16::from).collect()),
             (TypeChar::Uint, 1) => Ok(files::values::<u8>(array)?.into_iter().map(u16::from).collect()),
             (TypeChar::Uint, _) => Ok(files::values(array)?),
-            (TypeChar::Int, 4) => narrowed(files::values::<i32>(array)?.into_iter().map(i64::from).collect()),
-            (TypeChar::Int, _) => narrowed(files::values(array)?),
-            _ => narrowed(files::floats(array)?.into_iter().map(whole).collect::<anyhow::Result<_>>()?),
+            (TypeChar::Int, 4) => files::narrowed(files::values::<i32>(array)?, "label"),
+            (TypeChar::Int, _) => files::narrowed(files::values::<i64>(array)?, "label"),
+            _ => files::narrowed(
+                files::floats(array)?.into_iter().map(whole).collect::<anyhow::Result<Vec<i64>>>()?,
+                "label",
+            ),
         };
     Ok(Labels { values: values?, shape })
 }
