@@ -7,7 +7,7 @@ use tracing::warn;
 
 use super::backend::{AvailableBackends, Backend};
 use super::library::runtime;
-use super::model_file::ModelFile;
+use super::model_file::{ModelFile, without_weight_inputs};
 use super::{LoadError, LoadReason, Options, RuntimeError};
 use crate::Entry;
 
@@ -20,7 +20,8 @@ pub(super) fn load<T>(
     let load = || {
         // Fails early if ONNX Runtime cannot be loaded.
         runtime()?;
-        let (model, _) = fastest(&ModelFile::new(path, &fs::read(path)?, options), options, open_checked)?;
+        let bytes = without_weight_inputs(fs::read(path)?)?;
+        let (model, _) = fastest(&ModelFile::new(path, &bytes, options), options, open_checked)?;
         Ok(model)
     };
     load().map_err(|reason| LoadError { path: path.to_owned(), reason })
@@ -36,7 +37,7 @@ pub(super) fn load_several<T>(
 ) -> Result<Vec<T>, LoadError> {
     let load = || {
         runtime()?;
-        let bytes = entry.bytes()?;
+        let bytes = without_weight_inputs(entry.bytes()?)?;
         let model = ModelFile::new(&entry.path, &bytes, options);
         let (first, backend) = fastest(&model, options, open_checked)?;
         let others = (1..count).map(|_| open(&model, backend));

@@ -1,6 +1,7 @@
 //! A model file, from which sessions are created.
 
 use std::cell::OnceCell;
+use std::collections::HashSet;
 use std::path::Path;
 
 use ort::session::Session;
@@ -103,12 +104,24 @@ fn optimized(model: &ModelProto, bytes: &[u8]) -> Option<Vec<u8>> {
     if model.encoded_len() != bytes.len() {
         return None;
     }
-    let mut full = with_full_weights(model).ok()?;
-    if let (Some(full), Some(graph)) = (&mut full.graph, &model.graph) {
-        // Old exporters list the weights among the inputs too. The optimized graph has other weights, and needs these no more.
-        full.input.retain(|input| graph.initializer.iter().all(|weight| weight.name() != input.name()));
+    with_upsampling_folded(&with_full_weights(model).ok()?).map(|model| model.encode_to_vec())
+}
+
+/// The file without the weights among its inputs, as old exporters list them: ONNX Runtime would not treat these weights as
+/// constants, and its OpenVINO provider crashes the process.
+pub(super) fn without_weight_inputs(bytes: Vec<u8>) -> Result<Vec<u8>, LoadReason> {
+    let Ok(mut model) = ModelProto::from_bytes(&bytes) else { return Ok(bytes) };
+    let is_whole = model.encoded_len() == bytes.len();
+    let Some(graph) = &mut model.graph else { return Ok(bytes) };
+    let weights: HashSet<String> = graph.initializer.iter().map(|weight| weight.name().to_owned()).collect();
+    let Some(listed) = graph.input.iter().find(|input| weights.contains(input.name())) else { return Ok(bytes) };
+    if !is_whole {
+        let what =
+            format!("the weight `{}` is also an input; export with keep_initializers_as_inputs=False", listed.name());
+        return Err(LoadReason::Signature { what });
     }
-    with_upsampling_folded(&full).map(|model| model.encode_to_vec())
+    graph.input.retain(|input| !weights.contains(input.name()));
+    Ok(model.encode_to_vec())
 }
 
 #[cfg(test)]
