@@ -32,7 +32,7 @@ async fn main() -> Result<(), Error> {
         // Grasps from above, at most 1 rad from the vertical, without collision of the open hand.
         approach: Some(pb::Cone { axis: Some(pb::Vector3 { x: 0.0, y: 0.0, z: -1.0 }), angle: 1.0 }),
         collision: Some(pb::CollisionCheck {
-            mode: pb::collision_check::Mode::Filter.into(),
+            mode: Some(pb::collision_check::Mode::Filter.into()),
             ..pb::CollisionCheck::default()
         }),
         ..DetectOptions::default()

@@ -120,7 +120,7 @@ impl Detection {
         let detected = |grasp: Grasp| Detected {
             collides: obstacles
                 .as_ref()
-                .filter(|_| params.collision == Collision::Flag)
+                .filter(|_| params.collision == Some(Collision::Flag))
                 .map(|obstacles| obstacles.collides(&grasp.pose)),
             open_width: obstacles.as_ref().and_then(|obstacles| obstacles.opening(&grasp.pose, grasp.width)),
             object: volume.objects().and_then(|objects| objects.object(&grasp.pose, &params.hand())),
@@ -129,7 +129,7 @@ impl Detection {
         let grasps = grasps.into_iter().map(detected).collect();
         let table = params.table.and_then(|expected| Warning::of_table(&volume, expected));
         // The volume is kept for the page, which shows only its surface.
-        Self { grasps, dropped, over_limit, volumes: vec![volume.with_objects(None)], table }
+        Self { grasps, dropped, over_limit, volumes: vec![volume.alone()], table }
     }
 
     /// The grasps of all cubes of a workspace. `threshold` is the smallest quality without `force`.
@@ -211,7 +211,7 @@ impl Scores {
 
 /// The obstacles for the hand, unless the collision check is off.
 fn obstacles(volume: &Volume, params: &DetectParams) -> Option<Obstacles> {
-    (params.collision != Collision::Off).then(|| Obstacles::observed(volume, params.clearance()))
+    params.checks_collisions().then(|| Obstacles::observed(volume, params.clearance()))
 }
 
 fn is_inside(volume: &Volume, point: &Point3<f64>) -> bool {

@@ -103,7 +103,12 @@ impl Fusion {
     /// An empty field of `resolution`³ voxels over a cube with an edge of `size` metres.
     #[must_use]
     pub fn new(resolution: usize, size: f64) -> Self {
-        let voxel_size = size / resolution as f64;
+        Self::of_voxels(resolution, size / resolution as f64)
+    }
+
+    /// An empty field of `resolution`³ voxels with an edge of `voxel_size` metres.
+    #[must_use]
+    pub fn of_voxels(resolution: usize, voxel_size: f64) -> Self {
         Self {
             resolution,
             voxel_size,
@@ -249,11 +254,11 @@ impl Fusion {
         }
     }
 
-    /// Share of the voxels that a view has measured, also as free space.
+    /// Share of the voxels that a view has measured, also as free space, without those of `padding` on each side.
     #[must_use]
-    pub fn measured(&self) -> f64 {
-        let measured = self.voxels.iter().filter(|voxel| voxel.weight > 0.0).count();
-        measured as f64 / self.voxels.len() as f64
+    pub fn measured(&self, padding: usize) -> f64 {
+        let voxels = crate::volume::middle(&self.voxels, self.resolution, padding);
+        voxels.iter().filter(|voxel| voxel.weight > 0.0).count() as f64 / voxels.len() as f64
     }
 
     /// Share of an image's surface in the cube that lies in space which the fused views saw as free. `None` if fewer

@@ -19,13 +19,13 @@ pub struct ObjectMap {
 const CELL: f64 = 0.0075;
 
 impl ObjectMap {
-    /// A map from labelled points of the task frame. `frame_from_task` is its pose in the frame of the grasps. Empty
-    /// `wanted` means all surfaces.
+    /// A map from labelled points of the task frame. `frame_from_task` is its pose in the frame of the grasps. `wanted` is
+    /// `None` if all surfaces are to be grasped.
     #[must_use]
     pub fn new(
         points: impl Iterator<Item = (Point3<f64>, u16)>,
         frame_from_task: &Isometry3<f64>,
-        wanted: BTreeSet<u16>,
+        wanted: Option<BTreeSet<u16>>,
     ) -> Self {
         // Sorted, which needs less memory than a map of maps for a cloud of millions of points.
         let mut votes: Vec<([i32; 3], u16)> = points.map(|(point, label)| (cell(&point), label)).collect();
@@ -35,7 +35,7 @@ impl ObjectMap {
             most.first().copied().filter(|(_, label)| *label > 0)
         };
         let cells = votes.chunk_by(|(a, _), (b, _)| a == b).filter_map(of_cell).collect();
-        Self { map_from_frame: frame_from_task.inverse(), cells, wanted: Some(wanted).filter(|set| !set.is_empty()) }
+        Self { map_from_frame: frame_from_task.inverse(), cells, wanted }
     }
 
     /// A wanted object that was not observed.
@@ -134,22 +134,22 @@ mod tests {
     #[test]
     fn a_grasp_is_on_the_object_between_its_fingers() {
         let frame_from_task = Isometry3::new(Vector3::new(1.0, -2.0, 0.5), Vector3::new(0.0, 0.0, 0.7));
-        let map = ObjectMap::new(points(), &frame_from_task, BTreeSet::new());
+        let map = ObjectMap::new(points(), &frame_from_task, None);
         let object = |x| map.object(&over(x, &frame_from_task), &Hand::PANDA);
         assert_eq!([0.1, 0.2, 0.15].map(object), [Some(3), Some(7), None]);
         assert!(map.accepts(&over(0.15, &frame_from_task), &Hand::PANDA), "all grasps are wanted");
 
-        let map = ObjectMap::new(points(), &frame_from_task, [7].into());
+        let map = ObjectMap::new(points(), &frame_from_task, Some([7].into()));
         let admits = |x| map.accepts(&over(x, &frame_from_task), &Hand::PANDA);
         assert_eq!([0.1, 0.2, 0.15].map(admits), [false, true, false]);
         assert_eq!(map.missing(), None);
-        assert_eq!(ObjectMap::new(points(), &frame_from_task, [7, 9].into()).missing(), Some(9));
+        assert_eq!(ObjectMap::new(points(), &frame_from_task, Some([7, 9].into())).missing(), Some(9));
     }
 
     #[test]
     fn each_object_keeps_its_best_grasps() {
         let frame = Isometry3::identity();
-        let map = ObjectMap::new(points(), &frame, BTreeSet::new());
+        let map = ObjectMap::new(points(), &frame, None);
         let grasp = |x, quality| Grasp { pose: over(x, &frame), width: 0.04, quality };
         let grasps = vec![grasp(0.1, 0.9), grasp(0.1, 0.8), grasp(0.2, 0.7), grasp(0.1, 0.6), grasp(0.2, 0.5)];
         let qualities: Vec<f32> = map.limited(grasps, &Hand::PANDA, 1).iter().map(|grasp| grasp.quality).collect();

@@ -52,9 +52,11 @@ pub struct Obstacles {
 }
 
 impl Obstacles {
-    /// The obstacles in `volume`. Hidden voxels are known only in a volume that was fused from views.
+    /// The obstacles in `volume` and around it. Hidden voxels are known only in a volume that was fused from views.
     #[must_use]
     pub fn observed(volume: &Volume, clearance: Clearance) -> Self {
+        let pose = *volume.pose();
+        let volume = volume.observed();
         let (n, size) = (volume.resolution(), volume.voxel_size());
         let behind = 0.5 - clearance.behind / 2.0;
         let place = |cell: [f64; 3]| volume.pose() * Point3::from(cell.map(|c| c * size));
@@ -77,7 +79,7 @@ impl Obstacles {
         };
         let blocks = blocks.into_iter().enumerate().filter(|(_, points)| !points.is_empty()).map(block).collect();
         let hand = clearance.hand.grown(clearance.margin);
-        Self { clearance, hand, blocks, pose: *volume.pose() }
+        Self { clearance, hand, blocks, pose }
     }
 
     /// Whether the open hand collides on its way from the pre-grasp to `pose` (frame of the volume's pose).

@@ -36,8 +36,8 @@ pub struct DetectParams {
     pub constraints: Constraints,
     /// The hand; `None` means the Panda hand.
     pub hand: Option<Hand>,
-    /// Mode of the collision check.
-    pub collision: Collision,
+    /// Mode of the collision check; `None` means the default of the input: to drop grasps if there are views, else no check.
+    pub collision: Option<Collision>,
     /// Height of the table above the volume's bottom, metres; `None` without a table.
     pub table: Option<f64>,
     /// Smallest distance between the hand and the obstacles, metres.
@@ -91,9 +91,21 @@ impl DetectParams {
             force: self.force.or(own.force),
             constraints: Constraints { workspace, ..self.constraints },
             hand: self.hand,
-            clearance: (self.collision == Collision::Filter).then(|| self.clearance()),
+            clearance: (self.collision == Some(Collision::Filter)).then(|| self.clearance()),
             ..own
         }
+    }
+
+    /// The parameters for depth images and point clouds, in which the geometry of the scene is known.
+    #[must_use]
+    pub fn with_views(self) -> Self {
+        Self { collision: self.collision.or(Some(Collision::Filter)), ..self }
+    }
+
+    /// Whether collisions are checked.
+    #[must_use]
+    pub fn checks_collisions(&self) -> bool {
+        self.collision.is_some_and(|mode| mode != Collision::Off)
     }
 
     /// Parameters of the collision check.
@@ -124,14 +136,14 @@ impl DetectParams {
             let needed = "needs depth images or point clouds: a volume does not distinguish hidden from free space";
             return Err(RequestError::invalid("options.collision.hidden", true, needed));
         }
-        self.check_objects(false)
+        self.check_objects(false, false)
     }
 
-    /// Refuses options about objects if no view has labels.
+    /// Refuses options about objects if no view has labels. `are_found` tells whether objects were found without labels.
     ///
     /// # Errors
     /// [`RequestError`] names the option.
-    pub fn check_objects(&self, is_labelled: bool) -> Result<(), RequestError> {
+    pub fn check_objects(&self, is_labelled: bool, are_found: bool) -> Result<(), RequestError> {
         const NEEDED: &str = "needs views with labels";
         if is_labelled {
             return Ok(());
@@ -139,7 +151,7 @@ impl DetectParams {
         if let Some(first) = self.objects.first() {
             return Err(RequestError::invalid("options.objects", format_args!("[{first}, …]"), NEEDED));
         }
-        if self.max_grasps_per_object < usize::MAX {
+        if !are_found && self.max_grasps_per_object < usize::MAX {
             return Err(RequestError::invalid("options.max_grasps_per_object", self.max_grasps_per_object, NEEDED));
         }
         Ok(())

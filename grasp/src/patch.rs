@@ -12,7 +12,7 @@ use crate::Volume;
 ///   before and behind the fingertips;
 /// - the heights of the samples of the first channel above the bottom of the volume, as fractions of its edge.
 ///
-/// Values are interpolated linearly. Outside the volume they are 0, as where nothing was observed.
+/// Values are interpolated linearly. Outside of what was observed around the volume they are 0.
 #[derive(Clone, Copy, Debug)]
 pub struct Patch;
 
@@ -36,12 +36,14 @@ impl Patch {
         let (surroundings, heights) = rest.split_at_mut(SAMPLES);
         let in_volume = volume.pose().inverse() * pose;
         let per_voxel = 1.0 / volume.resolution() as f32;
+        let (observed, padding) = (volume.observed(), volume.padding() as f32);
+        let value = |at: Vector3<f32>| interpolated(observed, at.add_scalar(padding));
         HAND.for_each(&in_volume, volume.voxel_size(), |index, at| {
-            hand[index] = interpolated(volume, at);
+            hand[index] = value(at);
             heights[index] = ((at.z + 0.5) * per_voxel).clamp(0.0, 1.0);
         });
         SURROUNDINGS.for_each(&in_volume, volume.voxel_size(), |index, at| {
-            surroundings[index] = interpolated(volume, at);
+            surroundings[index] = value(at);
         });
     }
 }

@@ -65,7 +65,7 @@ impl Decoded {
 }
 
 /// Checks on grasps besides their quality.
-pub(crate) struct Selection<'a> {
+pub struct Selection<'a> {
     constraints: Constraints,
     hand: Hand,
     objects: Option<&'a ObjectMap>,
@@ -73,6 +73,8 @@ pub(crate) struct Selection<'a> {
 }
 
 impl<'a> Selection<'a> {
+    /// The checks of `params` in a volume.
+    #[must_use]
     pub fn new(volume: &'a Volume, params: &DecodeParams) -> Self {
         Self {
             constraints: params.constraints,
@@ -82,8 +84,14 @@ impl<'a> Selection<'a> {
         }
     }
 
+    /// Whether a grasp passes all checks.
+    #[must_use]
+    pub fn accepts(&self, pose: &Isometry3<f64>) -> bool {
+        self.keeps(pose, &mut Dropped::default())
+    }
+
     /// Whether a grasp passes all checks. Otherwise counts the reason in `dropped`.
-    pub fn keeps(&self, pose: &Isometry3<f64>, dropped: &mut Dropped) -> bool {
+    pub(crate) fn keeps(&self, pose: &Isometry3<f64>, dropped: &mut Dropped) -> bool {
         let count = match self.constraints.violation(pose, &self.hand) {
             Some(Violation::Region) => &mut dropped.region,
             Some(Violation::Approach) => &mut dropped.approach,

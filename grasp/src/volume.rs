@@ -18,6 +18,15 @@ pub struct Volume {
     values: Vec<f32>,
     hidden: Option<Vec<bool>>,
     objects: Option<Arc<ObjectMap>>,
+    surroundings: Option<Arc<Surroundings>>,
+}
+
+/// A larger volume with the same voxels, of which a volume is the middle.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Surroundings {
+    pub volume: Volume,
+    /// Voxels on each side of the middle.
+    pub padding: usize,
 }
 
 /// Why an array is not a valid [`Volume`].
@@ -110,7 +119,7 @@ impl Volume {
         if values.iter().fold(true, |zero, &v| zero & (v == 0.0)) {
             return Err(VolumeError::Empty);
         }
-        Ok(Self { resolution, voxel_size, pose, values, hidden: None, objects: None })
+        Ok(Self { resolution, voxel_size, pose, values, hidden: None, objects: None, surroundings: None })
     }
 
     /// The volume with its hidden voxels: those that lie behind a surface in a view and were measured by none.
@@ -122,6 +131,36 @@ impl Volume {
     #[must_use]
     pub fn with_objects(self, objects: Option<Arc<ObjectMap>>) -> Self {
         Self { objects, ..self }
+    }
+
+    /// The middle of the volume, without `padding` voxels on each side. The collision check and the patches of an
+    /// evaluator read what was observed around it, too. `None` if nothing was observed in it.
+    #[must_use]
+    pub fn middle(self, padding: usize) -> Option<Self> {
+        let resolution = self.resolution.checked_sub(2 * padding)?;
+        let offset = padding as f64 * self.voxel_size;
+        let pose = self.pose * Isometry3::translation(offset, offset, offset);
+        let values = middle(&self.values, self.resolution, padding);
+        let hidden = self.hidden.as_ref().map(|hidden| middle(hidden, self.resolution, padding));
+        let inner = Self::new(resolution, self.voxel_size, pose, values).ok()?;
+        Some(Self { hidden, surroundings: Some(Arc::new(Surroundings { volume: self, padding })), ..inner })
+    }
+
+    /// The volume without what was observed around it, and without objects.
+    #[must_use]
+    pub fn alone(self) -> Self {
+        Self { objects: None, surroundings: None, ..self }
+    }
+
+    /// All that was observed: the volume itself, or the larger one of which it is the middle.
+    #[must_use]
+    pub(crate) fn observed(&self) -> &Self {
+        self.surroundings.as_ref().map_or(self, |surroundings| &surroundings.volume)
+    }
+
+    /// Voxels on each side of this volume in the one that was [`observed`](Self::observed).
+    pub(crate) fn padding(&self) -> usize {
+        self.surroundings.as_ref().map_or(0, |surroundings| surroundings.padding)
     }
 
     /// Voxels along an edge.
@@ -178,6 +217,13 @@ impl Volume {
     pub fn objects(&self) -> Option<&ObjectMap> {
         self.objects.as_deref()
     }
+}
+
+/// The values of a cube of `resolution`³ without `padding` on each side.
+pub(crate) fn middle<T: Copy>(values: &[T], resolution: usize, padding: usize) -> Vec<T> {
+    let inner = padding..resolution - padding;
+    let columns = inner.clone().flat_map(|x| inner.clone().map(move |y| (x * resolution + y) * resolution));
+    columns.flat_map(|column| &values[column + inner.start..column + inner.end]).copied().collect()
 }
 
 /// Finds the index of the error. Slower than the check, so it runs only after the check has failed.

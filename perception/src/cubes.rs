@@ -1,13 +1,14 @@
+use std::collections::BTreeSet;
 use std::fmt::Display;
-use std::sync::Arc;
 use std::time::Instant;
 
-use grasp::{DetectParams, Fusion, ObjectMap, Region, RequestError, SurfacePoint, TABLE_HEIGHT};
+use grasp::{DetectParams, Fusion, Region, RequestError, SurfacePoint, TABLE_HEIGHT};
 use nalgebra::{Isometry3, Point3};
 
 use crate::grid::FusionGrid;
-use crate::layout::Part;
+use crate::layout::{OBJECT_MARGIN, Part};
 use crate::point_sampler::PointSampler;
+use crate::workspace::Cover;
 use crate::{FoundTable, Frames, InputGrid, Observation, Scene, Scenes, Warning, Workspace, check_margin};
 
 /// The scenes of a request with views: places the workspace, and fuses the views into its cubes. Stops when `is_wanted`
@@ -42,13 +43,19 @@ pub(crate) struct Cubes {
     corrects_depth_scale: bool,
     /// Whether views of several requests are integrated.
     is_tracked: bool,
+    /// The half-life of the measurements of tracked cubes, views.
+    half_life: Option<f64>,
+    /// The labels of the objects that were found on the table.
+    found: Option<BTreeSet<u16>>,
+    /// The warning about objects on the table that no cube holds.
+    left_out: Option<Warning>,
 }
 
-/// A cube and the field that its views are fused into.
+/// A cube, and the field that the views of a stream are fused into.
 #[derive(Clone, Debug)]
 struct Cube {
     grid: FusionGrid,
-    fusion: Fusion,
+    fusion: Option<Fusion>,
     /// `T_task_cube`.
     task_from_cube: Isometry3<f64>,
     /// The part of the workspace whose grasps come from this cube: smallest and largest x and y in the task frame.
@@ -56,7 +63,7 @@ struct Cube {
     inner: Option<[[f64; 2]; 2]>,
 }
 
-/// Most cubes of a workspace, which bounds the memory of a request to 80 MB: those of 2 × 2 m with the default margin.
+/// Most cubes of a workspace, which bounds the memory of a request to 200 MB: those of 2 × 2 m with the default margin.
 const MAX_CUBES: usize = 100;
 
 /// Smallest height of an object above the table, metres. Lower surfaces are noise, or too low for a hand.
@@ -71,39 +78,61 @@ impl Cubes {
         params: &DetectParams,
     ) -> Result<(Self, Observation, Option<FoundTable>), RequestError> {
         let height = params.table.unwrap_or(TABLE_HEIGHT);
-        let table = workspace.find_table(&mut frames, height, input.edge(workspace.size))?;
+        let edge = input.edge(workspace.size);
+        Self::count(input, &workspace, params.margin)?;
+        let Some((mut table, standing)) = workspace.find(&mut frames, height, edge)? else {
+            let observation = frames.in_task(&workspace.frame_from_task)?;
+            let cubes = Self::new(input, &workspace, None, &observation.eyes(), params.margin);
+            return Ok((cubes, observation, None));
+        };
+        let cover = workspace.cover(&mut table, &standing.objects, edge, params.margin);
         let observation = frames.in_task(&workspace.frame_from_task)?;
-        let cubes = Self::new(input, &workspace, &observation.eyes(), params.margin)?;
-        Ok((cubes, observation, table))
+        let cubes = Self::new(input, &workspace, cover.as_ref(), &observation.eyes(), params.margin);
+        let left_out = cover.filter(|cover| cover.left_out > 0).map(|Cover { left_out, corners }| {
+            Warning::ObjectsLeftOut { left_out, objects: table.objects, cubes: corners.len() }
+        });
+        // If nothing was found, everything may be grasped: objects may be too low to be found.
+        let found = standing.labels.filter(|_| !standing.objects.is_empty());
+        Ok((Self { found, left_out, ..cubes }, observation, Some(table)))
     }
 
-    /// The cubes that a planner requires for a workspace. `eyes` are the camera positions in the task frame, metres.
-    fn new(input: &InputGrid, workspace: &Workspace, eyes: &[Point3<f64>], margin: f64) -> Result<Self, RequestError> {
+    /// The cubes that a planner requires for a workspace, or those that `cover` the objects on a table. `eyes` are the camera
+    /// positions in the task frame, metres.
+    fn new(input: &InputGrid, workspace: &Workspace, cover: Option<&Cover>, eyes: &[Point3<f64>], margin: f64) -> Self {
         let Workspace { frame_from_task, size, extent, correct_depth_scale, .. } = *workspace;
-        Self::count(input, workspace, margin)?;
         let edge = input.edge(size);
+        // Where the cube was placed by the caller, the volume is what the networks were trained with.
+        let is_padded = workspace.find_table || extent.is_some();
         let cube = |[x, y]: [f64; 2], inner| {
             let task_from_cube = Isometry3::translation(x, y, 0.0);
             let eyes: Vec<_> = eyes.iter().map(|eye| task_from_cube.inverse() * eye).collect();
-            let grid = FusionGrid::new(input, frame_from_task * task_from_cube, edge, &eyes);
-            Cube { fusion: grid.fusion(), grid, task_from_cube, inner }
+            let grid = FusionGrid::new(input, frame_from_task * task_from_cube, edge, &eyes, is_padded);
+            Cube { fusion: None, grid, task_from_cube, inner }
         };
-        let cubes = match extent {
-            None => vec![cube([0.0; 2], None)],
-            Some(extent) => {
+        let margin_of_objects = margin.max(OBJECT_MARGIN);
+        let inner = |corner: &[f64; 2]| [margin_of_objects, edge - margin_of_objects].map(|c| corner.map(|x| x + c));
+        let cubes = match (extent, cover.map(|cover| cover.corners.as_slice())) {
+            (None, Some(corners @ [_, _, ..])) => {
+                corners.iter().map(|corner| cube(*corner, Some(inner(corner)))).collect()
+            }
+            (None, _) => vec![cube([0.0; 2], None)],
+            (Some(extent), _) => {
                 let parts = Part::cover(extent, edge, margin.max(Part::MARGIN));
                 parts.iter().map(|part| cube(part.corner, Some(part.inner))).collect()
             }
         };
         let extent = extent.unwrap_or([edge; 2]);
-        Ok(Self {
+        Self {
             cubes,
             frame_from_task,
             middle: extent.map(|length| length / 2.0),
             extent,
             corrects_depth_scale: correct_depth_scale,
             is_tracked: false,
-        })
+            half_life: None,
+            found: None,
+            left_out: None,
+        }
     }
 
     /// The number of cubes that a planner requires for a workspace. It is an error if the planner cannot use their size, or if
@@ -141,9 +170,7 @@ impl Cubes {
     /// the same weight.
     pub fn tracked(mut self, half_life: Option<f64>) -> Self {
         self.is_tracked = true;
-        if let Some(half_life) = half_life {
-            self.cubes = self.cubes.into_iter().map(|cube| cube.forgetting(half_life)).collect();
-        }
+        self.half_life = half_life;
         self
     }
 
@@ -169,11 +196,15 @@ impl Cubes {
         params: &DetectParams,
         is_wanted: &dyn Fn() -> bool,
     ) -> Result<Scenes, RequestError> {
-        params.check_objects(observation.is_labelled())?;
+        let are_found = self.found.is_some();
+        params.check_objects(observation.is_labelled() && !are_found, are_found)?;
         let (depth_factors, mut warnings) = self.correct_depth_scale(&mut observation, params.table)?;
-        let objects = observation.objects(&self.frame_from_task, &params.objects)?;
-        let points = self.integrate(&observation, &mut warnings, is_wanted)?;
-        let scenes = self.scenes(points, objects.as_ref(), params)?;
+        warnings.extend(self.left_out);
+        let wanted = self.found.as_ref().or(Some(&params.objects).filter(|wanted| !wanted.is_empty()));
+        let objects = observation.objects(&self.frame_from_task, wanted)?;
+        let scenes = self.integrate(&observation, params.margin, &mut warnings, is_wanted)?;
+        let of_objects = |scene: Scene| Scene { volume: scene.volume.with_objects(objects.clone()), ..scene };
+        let scenes = with_objects(scenes, params.table).into_iter().map(of_objects).collect();
         Ok(Scenes { scenes, warnings, depth_factors, ..Scenes::default() })
     }
 
@@ -194,61 +225,61 @@ impl Cubes {
         }
     }
 
-    /// Integrates views, each of which must see a part of the workspace. Returns for each cube the observed points, if the
-    /// planner needs them. Those of tracked cubes are not stored.
+    /// Integrates views, each of which must see a part of the workspace. Returns the scenes of the cubes in which a surface was
+    /// observed. Those of tracked cubes have no points.
     fn integrate(
         &mut self,
         observation: &Observation,
+        margin: f64,
         warnings: &mut Vec<Warning>,
         is_wanted: &dyn Fn() -> bool,
-    ) -> Result<Vec<Option<Vec<SurfacePoint>>>, RequestError> {
-        let samples = |cube: &Cube| cube.grid.needs_points() && !self.is_tracked;
-        let mut samplers: Vec<_> = self.cubes.iter().map(|cube| samples(cube).then(PointSampler::default)).collect();
-        let is_of_network = self.cubes.first().is_some_and(|cube| !cube.grid.needs_points());
-        for (index, eye) in observation.eyes().iter().enumerate() {
-            if is_of_network {
-                warnings.extend(Warning::of_camera(index, eye, self.middle));
-            }
-            let (mut is_seen, mut blind, mut disagreement) = (false, None, None);
-            for (cube, sampler) in self.cubes.iter_mut().zip(&mut samplers) {
+    ) -> Result<Vec<Scene>, RequestError> {
+        let eyes = observation.eyes();
+        let mut blind: Vec<Result<(), Option<RequestError>>> = vec![Err(None); eyes.len()];
+        let mut disagreements = vec![None; eyes.len()];
+        let (mut scenes, mut unseen) = (Vec::new(), Vec::new());
+        for cube in &mut self.cubes {
+            let mut fusion = cube.fusion.take().unwrap_or_else(|| {
+                let fusion = cube.grid.fusion();
+                match self.half_life {
+                    None => fusion,
+                    Some(half_life) => fusion.forgetting(half_life),
+                }
+            });
+            let mut sampler = (cube.grid.needs_points() && !self.is_tracked).then(PointSampler::default);
+            for index in 0..eyes.len() {
                 if !is_wanted() {
                     return Err(RequestError::expired());
                 }
-                match cube.integrate(observation, index, sampler.as_mut(), &mut disagreement) {
-                    Ok(()) => is_seen = true,
-                    Err(error) => blind = blind.or(Some(error)),
+                let seen = cube.integrate(&mut fusion, observation, index, sampler.as_mut(), &mut disagreements[index]);
+                match (seen, &mut blind[index]) {
+                    (Ok(()), seen) => *seen = Ok(()),
+                    (Err(error), Err(first)) => *first = first.take().or(Some(error)),
+                    (Err(_), Ok(())) => {}
                 }
             }
-            if let Some(error) = blind.filter(|_| !is_seen) {
+            unseen.extend(Warning::of_coverage(&fusion, cube.grid.padding));
+            scenes.extend(cube.grid.volume(&fusion).map(|volume| Scene {
+                volume,
+                points: sampler.map(PointSampler::into_points),
+                region: cube.region(&self.frame_from_task, margin),
+            }));
+            if self.is_tracked {
+                cube.fusion = Some(fusion);
+            }
+        }
+        let is_of_network = self.cubes.first().is_some_and(|cube| !cube.grid.needs_points());
+        for (index, ((eye, blind), disagreement)) in eyes.iter().zip(blind).zip(disagreements).enumerate() {
+            if let Err(Some(error)) = blind {
                 return Err(error);
+            }
+            if is_of_network {
+                warnings.extend(Warning::of_camera(index, eye, self.middle));
             }
             warnings.extend(disagreement);
         }
-        let unseen: Vec<_> = self.cubes.iter().filter_map(|cube| Warning::of_coverage(&cube.fusion)).collect();
         if unseen.len() == self.cubes.len() {
             warnings.extend(unseen.first());
-        }
-        Ok(samplers.into_iter().map(|sampler| sampler.map(PointSampler::into_points)).collect())
-    }
-
-    /// The scenes of the cubes in which something stands on the table, and at least one.
-    fn scenes(
-        &self,
-        points: Vec<Option<Vec<SurfacePoint>>>,
-        objects: Option<&Arc<ObjectMap>>,
-        params: &DetectParams,
-    ) -> Result<Vec<Scene>, RequestError> {
-        let scene = |(cube, points): (&Cube, Option<Vec<SurfacePoint>>)| {
-            let volume = cube.grid.volume(&cube.fusion)?.with_objects(objects.cloned());
-            Some(Scene { volume, points, region: cube.region(&self.frame_from_task, params.margin) })
-        };
-        let mut scenes: Vec<_> = self.cubes.iter().zip(points).filter_map(scene).collect();
-        let is_used =
-            |scene: &Scene| params.table.is_none_or(|table| scene.volume.has_surface_above(table + OBJECT_HEIGHT));
-        if scenes.iter().any(is_used) {
-            scenes.retain(is_used);
-        } else {
-            scenes.truncate(1);
         }
         if scenes.is_empty() {
             let reason = "none shows a surface in the workspace; check workspace.pose and the camera poses";
@@ -258,14 +289,22 @@ impl Cubes {
     }
 }
 
-impl Cube {
-    fn forgetting(self, half_life: f64) -> Self {
-        Self { fusion: self.fusion.forgetting(half_life), ..self }
+/// The scenes in which something stands on the table, at the height `table`, and at least one.
+fn with_objects(mut scenes: Vec<Scene>, table: Option<f64>) -> Vec<Scene> {
+    let is_used = |scene: &Scene| table.is_none_or(|table| scene.volume.has_surface_above(table + OBJECT_HEIGHT));
+    if scenes.iter().any(is_used) {
+        scenes.retain(is_used);
+    } else {
+        scenes.truncate(1);
     }
+    scenes
+}
 
+impl Cube {
     /// Integrates view `index`. `disagreement` becomes the warning if it contradicts the views before it.
     fn integrate(
-        &mut self,
+        &self,
+        fusion: &mut Fusion,
         observation: &Observation,
         index: usize,
         sampler: Option<&mut PointSampler>,
@@ -274,10 +313,10 @@ impl Cube {
         let (image, camera_from_cube) = observation.image(index, &self.task_from_cube, self.grid.size)?;
         let camera_from_grid = self.grid.camera_from_grid(&camera_from_cube);
         if disagreement.is_none() {
-            *disagreement = Warning::of_view(index, &self.fusion, &image, &camera_from_grid);
+            *disagreement = Warning::of_view(index, fusion, &image, &camera_from_grid);
         }
-        if self.fusion.integrate(&image, &camera_from_grid) == 0 {
-            let reason = self.fusion.no_measurement(&image, &camera_from_grid);
+        if fusion.integrate(&image, &camera_from_grid) == 0 {
+            let reason = fusion.no_measurement(&image, &camera_from_grid);
             let eye = self.task_from_cube * Point3::from(camera_from_cube.inverse().translation.vector);
             return Err(sees_nothing(index, &eye, reason));
         }

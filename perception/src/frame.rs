@@ -72,6 +72,21 @@ impl View {
         *self.image.intrinsics()
     }
 
+    /// The labels of points of the task frame, given those of the pixels: 0 for a point that no pixel shows.
+    pub(crate) fn labels_of(&self, points: &[Point3<f64>], labels: &[u16]) -> Vec<u16> {
+        /// Largest distance of a point from the depth of its pixel, metres.
+        const TOLERANCE: f64 = 0.01;
+        let Intrinsics { width, height, fx, fy, cx, cy } = self.intrinsics();
+        let label = |point: &Point3<f64>| {
+            let p = self.camera_from_task * point;
+            let [u, v] = [p.x / p.z * fx + cx, p.y / p.z * fy + cy].map(f64::round);
+            let is_inside = p.z > 0.0 && u >= 0.0 && v >= 0.0 && u < width as f64 && v < height as f64;
+            let index = is_inside.then(|| v as usize * width + u as usize)?;
+            ((f64::from(self.image.depth()[index]) - p.z).abs() <= TOLERANCE).then(|| labels[index])
+        };
+        points.iter().map(|point| label(point).unwrap_or(0)).collect()
+    }
+
     /// Position of the camera, metres.
     #[must_use]
     pub fn eye(&self) -> Point3<f64> {

@@ -62,15 +62,29 @@ pub(crate) struct FusionGrid {
     /// `T_cube_grid`: for a network trained with the camera on one side, the grid is rotated so that the camera is on
     /// that side.
     cube_from_grid: Isometry3<f64>,
+    /// Voxels that are fused around the cube on each side.
+    pub padding: usize,
 }
+
+/// Distance around a cube in which surfaces are fused, metres: as far as an evaluator and the collision check read around a
+/// grasp [`OBJECT_MARGIN`](crate::layout::OBJECT_MARGIN) from the side.
+const PADDING: f64 = 0.09;
 
 impl FusionGrid {
     /// The grid that a planner needs for a cube at `frame_from_cube` with an edge of `size` metres. `eyes` are the camera
-    /// positions in the frame of the cube, metres.
-    pub fn new(input: &InputGrid, frame_from_cube: Isometry3<f64>, size: f64, eyes: &[Point3<f64>]) -> Self {
+    /// positions in the frame of the cube, metres. With `is_padded` also what is around the cube is fused.
+    pub fn new(
+        input: &InputGrid,
+        frame_from_cube: Isometry3<f64>,
+        size: f64,
+        eyes: &[Point3<f64>],
+        is_padded: bool,
+    ) -> Self {
         let azimuth = input.network.and_then(|network| network.camera_azimuth);
         let cube_from_grid = azimuth.map_or_else(Isometry3::identity, |azimuth| rotated(azimuth, size, eyes));
-        Self { size, network: input.network, frame_from_cube, cube_from_grid }
+        let voxel_size = size / resolution(input.network) as f64;
+        let padding = if is_padded { (PADDING / voxel_size).ceil().min(MAX_PADDING) as usize } else { 0 };
+        Self { size, network: input.network, frame_from_cube, cube_from_grid, padding }
     }
 
     /// Whether a planner can read this grid.
@@ -98,19 +112,38 @@ impl FusionGrid {
 
     /// `T_camera_grid` of a camera with the pose `T_camera_cube`.
     pub fn camera_from_grid(&self, camera_from_cube: &Isometry3<f64>) -> Isometry3<f64> {
-        camera_from_cube * self.cube_from_grid
+        camera_from_cube * self.cube_from_grid * self.grid_from_field()
+    }
+
+    /// `T_grid_field`: the field extends beyond the grid by the padding.
+    fn grid_from_field(&self) -> Translation3<f64> {
+        let offset = -(self.padding as f64) * self.voxel_size();
+        Translation3::new(offset, offset, offset)
+    }
+
+    fn voxel_size(&self) -> f64 {
+        self.size / resolution(self.network) as f64
     }
 
     /// An empty field of this grid.
     pub fn fusion(&self) -> Fusion {
-        Fusion::new(self.network.map_or(RESOLUTION, |network| network.resolution), self.size)
+        Fusion::of_voxels(resolution(self.network) + 2 * self.padding, self.voxel_size())
     }
 
-    /// The fused volume; `None` if no surface was observed.
+    /// The fused volume; `None` if no surface was observed in it.
     pub fn volume(&self, fusion: &Fusion) -> Option<Volume> {
         // The only error of a field is that it is empty.
-        fusion.volume(self.frame_from_cube * self.cube_from_grid).ok()
+        let volume = fusion.volume(self.frame_from_cube * self.cube_from_grid * self.grid_from_field()).ok()?;
+        if self.padding == 0 { Some(volume) } else { volume.middle(self.padding) }
     }
+}
+
+/// Most voxels of padding, which bounds the memory for networks with small voxels.
+const MAX_PADDING: f64 = 16.0;
+
+/// Voxels along an edge of the grid that a planner reads.
+fn resolution(network: Option<NetworkGrid>) -> usize {
+    network.map_or(RESOLUTION, |network| network.resolution)
 }
 
 /// Checks that a margin leaves space for grasps in a cube with this edge, metres.

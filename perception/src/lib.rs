@@ -16,6 +16,7 @@ mod observation;
 mod point_sampler;
 mod rendering;
 mod scene;
+mod segmentation;
 mod table;
 mod tabletop;
 mod tracking;

@@ -117,11 +117,12 @@ impl Observation {
         }
     }
 
-    /// The objects that the labels of the views show, of which `wanted` are to be grasped. `None` without labels.
+    /// The objects that the labels of the views show, of which `wanted` are to be grasped, or all surfaces if it is `None`.
+    /// `None` without labels.
     pub(crate) fn objects(
         &self,
         frame_from_task: &Isometry3<f64>,
-        wanted: &BTreeSet<u16>,
+        wanted: Option<&BTreeSet<u16>>,
     ) -> Result<Option<Arc<ObjectMap>>, RequestError> {
         if !self.is_labelled() {
             return Ok(None);
@@ -133,7 +134,7 @@ impl Observation {
                 cloud.points.iter().copied().zip(labels)
             })),
         };
-        let map = ObjectMap::new(points, frame_from_task, wanted.clone());
+        let map = ObjectMap::new(points, frame_from_task, wanted.cloned());
         match map.missing() {
             None => Ok(Some(Arc::new(map))),
             Some(label) => {

@@ -4,11 +4,14 @@ use grasp::{DEPTH_MAX, DepthImage, WORKSPACE_SIZE};
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, SymmetricEigen, Translation3, Unit, UnitQuaternion, Vector3};
 use thiserror::Error;
 
+use crate::layout::{OBJECT_MARGIN, cover_objects};
+use crate::segmentation::Segmentation;
+
 /// A table in a depth image, and a workspace on it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tabletop {
-    /// `T_camera_task`: the workspace, a cube of [`WORKSPACE_SIZE`], holds what stands on the table near the middle of
-    /// the image. Its z axis is the normal of the table, its x axis points to the right in the image, and the table is
+    /// `T_camera_task`: the workspace, a cube of [`WORKSPACE_SIZE`], holds most of what stands on the table near the middle
+    /// of the image. Its z axis is the normal of the table, its x axis points to the right in the image, and the table is
     /// at the height that [`find`](Self::find) was given.
     pub camera_from_task: Isometry3<f64>,
     /// Distance of the camera from the plane of the table, metres.
@@ -71,6 +74,10 @@ const MIDDLE: f64 = 0.45;
 /// Largest angle between the table's normal and the vertical, radians.
 const LEVEL: f64 = 12.0 * std::f64::consts::PI / 180.0;
 
+/// Error of the angle between a plane and the vertical, radians. Of large planes, the most level ones are preferred by more
+/// than this.
+const LEVEL_ERROR: f64 = 3.0 * std::f64::consts::PI / 180.0;
+
 /// A plane below the largest one is the table, if it is parallel, not farther than this, metres, and at least this
 /// large in comparison: the top of a large object covers the middle of the image. What is farther below is the floor
 /// around a bin or a table.
@@ -79,9 +86,6 @@ const LARGE: f64 = 0.35;
 
 /// Largest angle between parallel planes, radians.
 const PARALLEL: f64 = 5.0 * std::f64::consts::PI / 180.0;
-
-/// Heights above the table at which points belong to objects, metres.
-const OBJECTS: std::ops::Range<f64> = 0.01..0.3;
 
 /// A sampled pixel.
 struct Sample {
@@ -105,6 +109,15 @@ impl Tabletop {
     /// # Errors
     /// [`NoTabletop`] if there is no plane large enough.
     pub fn find(image: &DepthImage, gravity: Option<Unit<Vector3<f64>>>, height: f64) -> Result<Self, NoTabletop> {
+        Self::find_with_objects(image, gravity, height).map(|(table, _)| table)
+    }
+
+    /// Finds the table, and what stands on it. The points of the objects are in the frame of the workspace.
+    pub(crate) fn find_with_objects(
+        image: &DepthImage,
+        gravity: Option<Unit<Vector3<f64>>>,
+        height: f64,
+    ) -> Result<(Self, Segmentation), NoTabletop> {
         let samples = samples(image);
         let (camera, step) = (image.intrinsics(), stride(image, POINTS));
         let pixels = (camera.width.div_ceil(step) * camera.height.div_ceil(step)) as f64;
@@ -120,7 +133,12 @@ impl Tabletop {
         scored.sort_by(|(a, _), (b, _)| b.total_cmp(a));
         let all: f64 = samples.iter().map(|sample| sample.weight).sum();
         let none = |share| NoTabletop::NoPlane { share, with_gravity: gravity.is_some() };
-        let &(largest_score, largest) = scored.first().ok_or_else(|| none(0.0))?;
+        let &(most, _) = scored.first().ok_or_else(|| none(0.0))?;
+        let tilt = |plane: &Plane| gravity.map_or(0.0, |down| plane.normal.angle(&-down.into_inner()));
+        let large = || scored.iter().filter(|(score, _)| *score >= LARGE * most);
+        let most_level = large().map(|(_, plane)| tilt(plane)).fold(f64::INFINITY, f64::min);
+        let &(largest_score, largest) =
+            large().find(|(_, plane)| tilt(plane) <= most_level + LEVEL_ERROR).ok_or_else(|| none(0.0))?;
         let below = scored.iter().find(|(score, plane)| {
             *score >= LARGE * largest_score
                 && plane.normal.angle(&largest.normal) < PARALLEL
@@ -135,14 +153,22 @@ impl Tabletop {
             return Err(none(share));
         }
         let squares: f64 = on_plane().map(|sample| plane.height(&sample.point).powi(2) * sample.weight).sum();
-        Ok(Self {
-            camera_from_task: plane.workspace(&samples, height),
+        let camera_from_table = plane.frame();
+        let segmentation = Segmentation::of(image, &camera_from_table);
+        let corner = match cover_objects(&segmentation.objects, WORKSPACE_SIZE, OBJECT_MARGIN, 1).0.first() {
+            Some(corner) => *corner,
+            None => plane.middle(&camera_from_table).map(|c| c - WORKSPACE_SIZE / 2.0),
+        };
+        let table_from_task = Translation3::new(corner[0], corner[1], -height);
+        let table = Self {
+            camera_from_task: camera_from_table * table_from_task,
             distance: -plane.offset,
             angle: plane.normal.angle(&-Vector3::z()),
             share,
             deviation: (squares / weight).sqrt(),
             tilt: gravity.map(|down| plane.normal.angle(&-down.into_inner())),
-        })
+        };
+        Ok((table, segmentation.moved([-corner[0], -corner[1]])))
     }
 }
 
@@ -221,47 +247,20 @@ impl Plane {
         })
     }
 
-    /// `T_camera_task` of the workspace over what stands on the plane.
-    fn workspace(&self, samples: &[Sample], height: f64) -> Isometry3<f64> {
+    /// `T_camera_table` of a frame on the plane: its z axis is the normal, and its x axis points to the right in the image;
+    /// for a camera that is rotated to the side, to its bottom.
+    fn frame(&self) -> Isometry3<f64> {
         let z = self.normal.into_inner();
-        // The right of the image along the plane; for a camera that is rotated to the side, its bottom.
         let x = [Vector3::x(), Vector3::y()].map(|axis| axis - z * axis.dot(&z));
         let x = (if x[0].norm() > 0.1 { x[0] } else { x[1] }).normalize();
         let rotation = Rotation3::from_basis_unchecked(&[x, z.cross(&x), z]);
-        let rotation = UnitQuaternion::from_rotation_matrix(&rotation);
-        let origin = z * self.offset;
-        let on_table = |point: &Point3<f64>| rotation.inverse() * (point.coords - origin);
-        let objects: Vec<(Vector3<f64>, f64)> = samples
-            .iter()
-            .map(|sample| (on_table(&sample.point), sample.weight))
-            .filter(|(at, _)| OBJECTS.contains(&at.z))
-            .collect();
-        let centre = densest(&objects).or_else(|| {
-            // Nothing stands on the table: where the optical axis meets it.
-            (z.z < -0.1).then(|| on_table(&Point3::new(0.0, 0.0, self.offset / z.z)))
-        });
-        let [x, y, _]: [f64; 3] = centre.unwrap_or_default().into();
-        let half = WORKSPACE_SIZE / 2.0;
-        Isometry3::from_parts(Translation3::from(origin), rotation) * Translation3::new(x - half, y - half, -height)
+        Isometry3::from_parts(Translation3::from(z * self.offset), UnitQuaternion::from_rotation_matrix(&rotation))
     }
-}
 
-/// The middle of the square with the edge of the workspace, less a margin, that holds most of the weight: the mean of
-/// the points in it. `None` if there are only a few points, which may be noise.
-fn densest(points: &[(Vector3<f64>, f64)]) -> Option<Vector3<f64>> {
-    const FEWEST: usize = 15;
-    const EDGE: f64 = 0.8 * WORKSPACE_SIZE;
-    let near = |centre: Vector3<f64>| {
-        points.iter().filter(move |(at, _)| (at - centre).xy().amax() <= EDGE / 2.0).map(|(at, weight)| (*at, *weight))
-    };
-    if points.len() < FEWEST {
-        return None;
+    /// Where the optical axis meets the plane, in its frame; the foot of the camera if they are almost parallel.
+    fn middle(&self, camera_from_table: &Isometry3<f64>) -> [f64; 2] {
+        let z = self.normal.z;
+        let seen = (z < -0.1).then(|| camera_from_table.inverse() * Point3::new(0.0, 0.0, self.offset / z));
+        seen.map_or([0.0; 2], |at| [at.x, at.y])
     }
-    let step = points.len().div_ceil(200);
-    let candidates = points.iter().step_by(step).map(|(at, _)| *at);
-    let weight = |centre: &Vector3<f64>| near(*centre).map(|(_, weight)| weight).sum::<f64>();
-    let best = candidates.max_by(|a, b| weight(a).total_cmp(&weight(b)))?;
-    // The middle of the bounds, not the mean: the sides that face the camera have more points than those behind.
-    let bounds = near(best).fold([best; 2], |[low, high], (at, _)| [low.inf(&at), high.sup(&at)]);
-    Some((bounds[0] + bounds[1]) / 2.0)
 }

@@ -99,6 +99,19 @@ pub enum Warning {
         /// Index of the view.
         view: usize,
     },
+    /// There are more objects on the table than cubes may cover.
+    #[error(
+        "{left_out} of the {objects} objects on the table are not in the workspace, which has {cubes} cubes; for a \
+         larger one set workspace.extent"
+    )]
+    ObjectsLeftOut {
+        /// Number of objects outside of the workspace.
+        left_out: usize,
+        /// Number of objects on the table.
+        objects: usize,
+        /// Number of cubes.
+        cubes: usize,
+    },
 }
 
 /// Range of the distances of the cameras from the middle of the workspace in training, metres.
@@ -154,10 +167,10 @@ impl Warning {
         (share > Self::CONTRADICTED).then_some(Self::ViewsDisagree { view, share })
     }
 
-    /// Checks how much of a volume was measured.
+    /// Checks how much of a volume was measured, the middle of a field with `padding` voxels on each side.
     #[must_use]
-    pub fn of_coverage(fused: &Fusion) -> Option<Warning> {
-        let share = fused.measured();
+    pub fn of_coverage(fused: &Fusion, padding: usize) -> Option<Warning> {
+        let share = fused.measured(padding);
         (share < Self::MEASURED).then_some(Self::MostlyUnseen { share })
     }
 

@@ -1,7 +1,7 @@
 use std::f64::consts::PI;
 use std::path::Path;
 
-use grasp::{DecodeParams, Decoded, FINGER_DEPTH, Grasp, Patch, Volume, select};
+use grasp::{DecodeParams, Decoded, FINGER_DEPTH, Grasp, Patch, Selection, Volume, select};
 use grasp_models::{Classifier, LoadError, Metadata, Options, RuntimeError};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
@@ -73,6 +73,7 @@ impl Evaluator {
         let depth = depth(params);
         self.evaluate(&mut grasps, volume, depth)?;
         sort(&mut grasps);
+        let selection = Selection::new(volume, params);
         let mut moving: Vec<usize> = (0..REFINED.min(grasps.len())).collect();
         for _ in 0..MOVES {
             if !is_wanted() {
@@ -82,8 +83,12 @@ impl Evaluator {
             self.evaluate(&mut moved, volume, depth)?;
             let of_grasp = moved.chunks_exact(VARIATIONS);
             let better = moving.iter().zip(of_grasp).filter_map(|(&index, moved)| {
-                let best = moved.iter().max_by(|a, b| a.quality.total_cmp(&b.quality))?;
-                (best.quality > grasps[index].quality).then_some((index, *best))
+                // A grasp that would be dropped is worse than every other one.
+                let value = |grasp: &Grasp| if selection.accepts(&grasp.pose) { grasp.quality } else { 0.0 };
+                let current = value(&grasps[index]);
+                let mut better: Vec<&Grasp> = moved.iter().filter(|grasp| grasp.quality > current).collect();
+                better.sort_by(|a, b| b.quality.total_cmp(&a.quality));
+                better.into_iter().find(|grasp| selection.accepts(&grasp.pose)).map(|best| (index, *best))
             });
             let better: Vec<(usize, Grasp)> = better.collect();
             better.iter().for_each(|&(index, grasp)| grasps[index] = grasp);

@@ -62,7 +62,7 @@ impl TryFrom<&pb::Options> for DetectParams {
                 min_height: number("options.min_height", options.min_height)?,
             },
             hand: options.gripper.as_ref().map(hand).transpose()?,
-            collision: mode(&collision)?,
+            collision: collision.mode.map(mode).transpose()?,
             table: Some(table).filter(|height| *height >= 0.0),
             clearance: length("options.collision.clearance", collision.clearance, MAX_MARGIN)?.unwrap_or_default(),
             hidden: collision.hidden,
@@ -194,15 +194,15 @@ fn hand(gripper: &pb::Gripper) -> Result<Hand, RequestError> {
     })
 }
 
-fn mode(collision: &pb::CollisionCheck) -> Result<Collision, RequestError> {
+fn mode(mode: i32) -> Result<Collision, RequestError> {
     use pb::collision_check::Mode;
-    match Mode::try_from(collision.mode) {
+    match Mode::try_from(mode) {
         Ok(Mode::Off) => Ok(Collision::Off),
         Ok(Mode::Flag) => Ok(Collision::Flag),
         Ok(Mode::Filter) => Ok(Collision::Filter),
         Err(_) => {
             let needed = "must be MODE_OFF (0), MODE_FLAG (1) or MODE_FILTER (2)";
-            Err(RequestError::invalid("options.collision.mode", collision.mode, needed))
+            Err(RequestError::invalid("options.collision.mode", mode, needed))
         }
     }
 }
@@ -266,7 +266,7 @@ mod tests {
         assert_eq!(pose, grasp);
         let z = |pose: Isometry3<f64>| (grasp.inverse() * pose).translation.vector.z;
         assert!((z(pregrasp) + 0.05).abs() < 1e-12 && (z(retreat) + 0.1).abs() < 1e-12);
-        assert_eq!((params.collision, params.table, params.max_grasps), (Collision::Off, Some(0.05), usize::MAX));
+        assert_eq!((params.collision, params.table, params.max_grasps), (None, Some(0.05), usize::MAX));
     }
 
     #[test]
@@ -292,11 +292,11 @@ mod tests {
         let params = |options: &pb::Options| DetectParams::try_from(options).unwrap();
         let of_objects = params(&pb::Options { objects: vec![7, 3], ..Default::default() });
         assert_eq!(of_objects.objects, [3, 7].into());
-        let refused = of_objects.check_objects(false).unwrap_err();
+        let refused = of_objects.check_objects(false, true).unwrap_err();
         assert_eq!(refused.to_string(), "options.objects is [3, …], needs views with labels");
-        assert!(of_objects.check_objects(true).is_ok());
+        assert!(of_objects.check_objects(true, false).is_ok());
         let limited = params(&pb::Options { max_grasps_per_object: 2, ..Default::default() });
-        assert_eq!(limited.check_objects(false).unwrap_err().field(), "options.max_grasps_per_object");
+        assert_eq!(limited.check_objects(false, false).unwrap_err().field(), "options.max_grasps_per_object");
         assert!(params(&pb::Options::default()).check_without_views().is_ok());
     }
 
@@ -361,7 +361,7 @@ mod tests {
             refused(pb::Options { convention, ..Default::default() }),
             "options.convention.parent_from_grasp is absent, must be given for ORIGIN_PARENT"
         );
-        let collision = Some(pb::CollisionCheck { mode: 7, ..Default::default() });
+        let collision = Some(pb::CollisionCheck { mode: Some(7), ..Default::default() });
         assert_eq!(
             refused(pb::Options { collision, ..Default::default() }),
             "options.collision.mode is 7, must be MODE_OFF (0), MODE_FLAG (1) or MODE_FILTER (2)"

@@ -25,6 +25,9 @@ impl From<&Warning> for pb::GeometryWarning {
                 (Code::CameraAngle, Some(view), &[("angle_degrees", degrees(angle))])
             }
             Warning::DepthScale { view } => (Code::DepthScale, Some(view), &[]),
+            Warning::ObjectsLeftOut { left_out, objects, .. } => {
+                (Code::ObjectsLeftOut, None, &[("left_out", left_out as f64), ("objects", objects as f64)])
+            }
         };
         Self {
             code: code.into(),

@@ -71,14 +71,25 @@ impl TryFrom<pb::Workspace> for Workspace {
         let gravity = gravity.map(|gravity| direction(Some(gravity), "workspace.gravity")).transpose()?;
         let size = Some(size).filter(|size| *size > 0.0);
         let extent = extent.map(checked_extent).transpose()?;
-        Ok(Self { frame_from_task, size, find_table, gravity, extent, correct_depth_scale })
+        Ok(Self { frame_from_task, size, find_table, find_objects: None, gravity, extent, correct_depth_scale })
     }
 }
 
 impl From<&FoundTable> for pb::FoundTable {
     fn from(table: &FoundTable) -> Self {
         let Tabletop { distance, angle, share, deviation, tilt, .. } = table.tabletop;
-        Self { workspace: Some((&table.frame_from_task).into()), distance, angle, share, deviation, tilt }
+        let [x, y] = table.extent;
+        Self {
+            workspace: Some((&table.frame_from_task).into()),
+            distance,
+            angle,
+            share,
+            deviation,
+            tilt,
+            extent: Some(pb::Extent { x, y }),
+            // Fits: an image has at most `u16::MAX` labels.
+            objects: table.objects as u32,
+        }
     }
 }
 

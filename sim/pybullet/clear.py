@@ -204,7 +204,7 @@ def attempts(planner: str, rounds: Iterable[Round]) -> Iterator[dict[str, Any]]:
 def main() -> None:
     """Runs the benchmark and prints the report."""
     args = arguments()
-    collision = CollisionCheck("filter") if args.clear else None
+    collision = CollisionCheck("filter" if args.clear else "off")
     if args.pictures:
         args.pictures.mkdir(parents=True, exist_ok=True)
     for path in filter(None, [args.attempts, args.out]):

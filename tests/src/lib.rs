@@ -16,3 +16,11 @@ pub use raw::Raw;
 pub use server::{Server, metric, peak_bytes, resident_bytes};
 pub use stolen::Stolen;
 pub use volumes::{blobs, expected};
+
+use grasp_proto::pb;
+
+/// No collision check, which with views is not the default. The hand of the test models points into the table.
+#[must_use]
+pub fn no_collision_check() -> Option<pb::CollisionCheck> {
+    Some(pb::CollisionCheck { mode: Some(pb::collision_check::Mode::Off.into()), ..Default::default() })
+}

@@ -91,7 +91,8 @@ impl GraspApi {
     ) -> Result<(pb::DetectGraspsResponse, Option<Outcome>), RequestError> {
         let params = DetectParams::try_from(&options.unwrap_or_default())?;
         let model = self.models.select(&params.model, &params.version, None)?;
-        self.of_views(views, workspace, model, params, call).await?.detect(call).await
+
+        self.of_views(views, workspace, true, model, params, call).await?.detect(call).await
     }
 
     /// Converts a volume for a model, which accepts its resolution.
@@ -121,17 +122,20 @@ impl GraspApi {
         Ok(SceneRequest { model, params: params.into(), scenes, origin, waited })
     }
 
-    /// Decodes views, and fuses them for a model.
+    /// Decodes views, and fuses them for a model. With `find_objects`, the objects on a table that is found are found, too.
     async fn of_views(
         &self,
         views: Views,
         workspace: Option<pb::Workspace>,
+        find_objects: bool,
         model: Arc<Model>,
         params: DetectParams,
         call: &mut Call,
     ) -> Result<SceneRequest, RequestError> {
         views.check()?;
         let (workspace, origin) = workspace_of(workspace)?;
+        let find_objects = find_objects.then(|| model.capacity().max(1));
+        let (workspace, params) = (Workspace { find_objects, ..workspace }, params.with_views());
         call.set_model(&model);
         let request = call.metadata(params.priority);
         model.check_capacity(1, request)?;
@@ -169,7 +173,7 @@ impl GraspApi {
                 let field = format!("{message}.workspace.extent");
                 return Err(RequestError::invalid(field, "given", "must be absent"));
             }
-            let scene_request = self.of_views(views, workspace, Arc::clone(&model), params.clone(), call).await;
+            let scene_request = self.of_views(views, workspace, false, Arc::clone(&model), params.clone(), call).await;
             scene_request
                 .map_err(|error| if error.field().starts_with("options") { error } else { error.inside(message) })
         };

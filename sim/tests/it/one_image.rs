@@ -58,7 +58,7 @@ fn most_objects_have_a_probable_grasp() {
         let points = labels.iter().enumerate().filter_map(|(pixel, &label)| {
             Some((camera_from_task.inverse() * image.point(pixel % width, pixel / width)?, label))
         });
-        let map = ObjectMap::new(points, &Isometry3::identity(), BTreeSet::new());
+        let map = ObjectMap::new(points, &Isometry3::identity(), None);
         let scene = Scene::from(fusion.volume(Isometry3::identity()).unwrap());
         let grasps = planner.plan(&scene, &params, &|| true).unwrap().grasps;
 

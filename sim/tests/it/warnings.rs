@@ -36,7 +36,7 @@ fn warnings(views: &[(View, Intrinsics)]) -> Vec<Warning> {
         warnings.extend(Warning::of_view(index, &fusion, &image, &view.camera_from_task));
         assert!(fusion.integrate(&image, &view.camera_from_task) > 0, "the camera sees the workspace");
     }
-    warnings.extend(Warning::of_coverage(&fusion));
+    warnings.extend(Warning::of_coverage(&fusion, 0));
     let volume = fusion.volume(Isometry3::identity());
     warnings.extend(volume.ok().and_then(|volume| Warning::of_table(&volume, TABLE_HEIGHT)));
     warnings

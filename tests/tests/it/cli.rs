@@ -59,7 +59,11 @@ fn files() -> (TempDir, Vec<PathBuf>) {
 }
 
 fn run(server: &Server, args: &[&str]) -> Output {
-    Command::new(grasp()).args(args).env("GRASPD_SERVER", server.grpc().to_string()).output().unwrap()
+    let checks = !["detect", "view"].contains(&args[0]) || args.contains(&"--collision");
+    // The hand of the test models points into the table.
+    let unchecked: &[&str] = if checks { &[] } else { &["--collision", "off"] };
+    let mut command = Command::new(grasp());
+    command.args(args).args(unchecked).env("GRASPD_SERVER", server.grpc().to_string()).output().unwrap()
 }
 
 fn text(bytes: &[u8]) -> &str {
@@ -246,7 +250,7 @@ fn watch_continues_after_a_refusal_and_detects_changed_poses() {
     // The cameras point away from the scene.
     poses(valid.map(|pose| Isometry3::rotation(Vector3::x() * std::f64::consts::PI) * pose));
     let mut watch = Command::new(grasp())
-        .args(["watch", &path("m0.npy"), &path("m1.npy"), "--intrinsics", &path("k.npy")])
+        .args(["watch", &path("m0.npy"), &path("m1.npy"), "--intrinsics", &path("k.npy"), "--collision", "off"])
         .args(["--camera-from-task", &path("poses.json"), "--json", "--threshold", "0.6"])
         .args(["--every", "0.02", "--count", "1"])
         .env("GRASPD_SERVER", server.grpc().to_string())
@@ -665,8 +669,9 @@ async fn one_depth_image_and_its_intrinsics_suffice() {
     let qualities = |found: &Value| -> Vec<Value> {
         found["grasps"].as_array().unwrap().iter().map(|grasp| grasp["quality"].clone()).collect()
     };
-    assert_eq!(qualities(&of_server), qualities(&of_file));
-    assert!(!qualities(&of_file).is_empty());
+    assert!(!qualities(&of_file).is_empty() && !qualities(&of_server).is_empty());
+    assert_eq!((&of_server["table"]["objects"], &table["objects"]), (&Value::from(1), &Value::from(1)));
+    assert!(of_server["grasps"].as_array().unwrap().iter().all(|grasp| grasp["object"] == 1), "{of_server}");
 
     let color = path("color.png");
     let drawn = with("view", &["--find-table", "--threshold", "0.6", "--color", &color, "--out", &path("over.png")]);

@@ -10,16 +10,17 @@ use grasp_client::{
 };
 use grasp_proto::pb;
 use grasp_tests::scene::{BLOCK, CAMERA, TABLE, camera, depth, view};
-use grasp_tests::{RESOLUTION, Server, TestModel, graspd};
+use grasp_tests::{RESOLUTION, Server, TestModel, graspd, no_collision_check};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use tonic::Code;
 
 fn low() -> Options {
-    Options { detect: DetectOptions { threshold: Some(0.6), ..DetectOptions::default() }, ..Options::default() }
+    with_options(DetectOptions { threshold: Some(0.6), ..DetectOptions::default() })
 }
 
 fn with_options(detect: DetectOptions) -> Options {
-    Options { detect, ..Options::default() }
+    let collision = detect.collision.or_else(no_collision_check);
+    Options { detect: DetectOptions { collision, ..detect }, ..Options::default() }
 }
 
 /// The volume that the server must fuse.
@@ -332,7 +333,7 @@ async fn planners_without_a_network_are_selected_by_name() {
     };
     assert_eq!((has_low_quality(0.5).await, has_low_quality(0.001).await), (false, true));
     // A table height above the block leaves no points to grasp.
-    let table = Some(pb::CollisionCheck { mode: 0, table_height: Some(0.2), ..Default::default() });
+    let table = Some(pb::CollisionCheck { mode: Some(0), table_height: Some(0.2), ..Default::default() });
     let detect = DetectOptions { model: "shaf".to_owned(), collision: table, ..DetectOptions::default() };
     let none = client.detect_from_depth(&views, &Workspace::default(), with_options(detect)).await.unwrap();
     assert!(none.grasps.is_empty() && none.dropped.as_ref().unwrap().mask > 1000, "{:?}", none.dropped);
@@ -502,7 +503,7 @@ async fn colliding_grasps_are_flagged_or_dropped() {
     let gripper = Some(pb::Gripper { max_opening, finger_depth, finger_width, finger_breadth, palm: None });
     let detect_with = async |client: &Client, detect| detect_with(client, DetectOptions { gripper, ..detect }).await;
     let all = detect_with(&client, DetectOptions::default()).await.grasps;
-    let collision = |mode: i32| Some(pb::CollisionCheck { mode, ..Default::default() });
+    let collision = |mode: i32| Some(pb::CollisionCheck { mode: Some(mode), ..Default::default() });
     let flagged =
         detect_with(&client, DetectOptions { collision: collision(1), ..DetectOptions::default() }).await.grasps;
     let filtered =
@@ -519,7 +520,7 @@ async fn colliding_grasps_are_flagged_or_dropped() {
         filtered.grasps.iter().all(|grasp| grasp.pose.translation.z >= TABLE + 0.01),
         "no grasp is below the table"
     );
-    let buried = Some(pb::CollisionCheck { mode: 1, table_height: Some(0.3), ..Default::default() });
+    let buried = Some(pb::CollisionCheck { mode: Some(1), table_height: Some(0.3), ..Default::default() });
     let buried = detect_with(&client, DetectOptions { collision: buried, ..DetectOptions::default() }).await.grasps;
     assert!(buried.iter().all(|grasp| grasp.collides == Some(true)), "the table is above all grasps");
 }
@@ -590,7 +591,7 @@ async fn wrong_geometry_is_reported_as_a_warning_and_counted() {
     // As DetectGrasps, and in a stream whose second view contradicts the first.
     let volume = fused(&[camera], RESOLUTION, Isometry3::identity());
     let lower = DetectOptions {
-        collision: Some(pb::CollisionCheck { mode: 0, table_height: Some(0.02), ..Default::default() }),
+        collision: Some(pb::CollisionCheck { mode: Some(0), table_height: Some(0.02), ..Default::default() }),
         ..low().detect
     };
     let detection = client.detect(&volume, with_options(lower)).await.unwrap();
@@ -598,7 +599,7 @@ async fn wrong_geometry_is_reported_as_a_warning_and_counted() {
     assert_eq!(warning.code(), pb::geometry_warning::Code::TableHeight);
     assert!((warning.figures["height_m"] - TABLE).abs() < 0.005 && warning.figures["expected_height_m"] == 0.02);
     let none = DetectOptions {
-        collision: Some(pb::CollisionCheck { mode: 0, table_height: Some(-1.0), ..Default::default() }),
+        collision: Some(pb::CollisionCheck { mode: Some(0), table_height: Some(-1.0), ..Default::default() }),
         ..low().detect
     };
     assert_eq!(client.detect(&volume, with_options(none)).await.unwrap().warnings, []);

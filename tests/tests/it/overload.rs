@@ -87,7 +87,7 @@ async fn the_retry_delay_includes_postprocessing() {
     // Decoding takes far longer than the network.
     let centres: Vec<[usize; 3]> = (0..343).map(|i| [i / 49, i / 7 % 7, i % 7].map(|c| 12 + 12 * c)).collect();
     let volume = blobs(96, Isometry3::identity(), &centres);
-    let flag = CollisionCheck { mode: collision_check::Mode::Flag.into(), ..Default::default() };
+    let flag = CollisionCheck { mode: Some(collision_check::Mode::Flag.into()), ..Default::default() };
     let detect = DetectOptions { collision: Some(flag), max_grasps: 1000, ..DetectOptions::default() };
     let options = || Options { detect: detect.clone(), ..Options::default() };
     let first = client.detect(&volume, options()).await.unwrap();
@@ -256,7 +256,7 @@ async fn one_caller_with_many_calls_leaves_room_for_another() {
             loop {
                 match client.detect_grasps(request.clone()).await {
                     Err(status) if status.code() == Code::ResourceExhausted => {
-                        tokio::time::sleep(Duration::from_millis(10)).await;
+                        tokio::time::sleep(Duration::from_millis(30)).await;
                     }
                     outcome => outcome.map(|_| ()).unwrap(),
                 }
@@ -265,7 +265,7 @@ async fn one_caller_with_many_calls_leaves_room_for_another() {
     }
     server.wait_for("graspd_queue_requests{model=\"slow 1\"}", 8.0).await;
     let client = server.client().await;
-    for _ in 0..10 {
+    for _ in 0..6 {
         let latency = client.detect(&volume(), Options::default()).await.unwrap().latency;
         // One inference is running, and at most one of the other caller's is taken first.
         assert!(latency.queue < 6.0 * latency.inference, "{latency:?}");

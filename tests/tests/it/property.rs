@@ -201,7 +201,7 @@ fn score_request() -> impl Strategy<Value = pb::ScoreGraspsRequest> {
         pb::Labels { data: data.into(), r#type }
     });
     let extent = proptest::option::weighted(0.05, (any::<f64>(), 0.1..1.0).prop_map(|(x, y)| pb::Extent { x, y }));
-    let mode = prop_oneof![12 => 0..3, 1 => any::<i32>()];
+    let mode = proptest::option::weighted(0.8, prop_oneof![12 => 0..3, 1 => any::<i32>()]);
     let options = (objects, margin(), margin(), any::<bool>(), mode, proptest::option::weighted(0.05, pose()));
     let candidates = prop_oneof![12 => vec(candidate, 1..4), 1 => Just(vec![])];
     (candidates, proptest::option::weighted(0.95, labels), extent, options).prop_map(

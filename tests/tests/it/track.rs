@@ -14,7 +14,11 @@ use tonic::Code;
 const TRACKED: &str = "graspd_tracked_volumes";
 
 fn low() -> Options {
-    Options { detect: DetectOptions { threshold: Some(0.6), ..DetectOptions::default() }, ..Options::default() }
+    let collision = grasp_tests::no_collision_check();
+    Options {
+        detect: DetectOptions { threshold: Some(0.6), collision, ..DetectOptions::default() },
+        ..Options::default()
+    }
 }
 
 fn code(outcome: Result<Detection, Error>) -> (Code, String) {

@@ -49,7 +49,7 @@ fn options(detect: DetectOptions) -> Options {
 }
 
 fn collision(mode: pb::collision_check::Mode, hidden: bool) -> Option<pb::CollisionCheck> {
-    Some(pb::CollisionCheck { mode: mode.into(), hidden, ..Default::default() })
+    Some(pb::CollisionCheck { mode: Some(mode.into()), hidden, ..Default::default() })
 }
 
 fn refusal<T: std::fmt::Debug>(outcome: Result<T, Error>) -> String {
@@ -152,6 +152,85 @@ async fn a_large_workspace_is_placed_over_the_table_that_was_found() {
     assert_eq!(found, [1, 2, 3, 4]);
     let in_task = Proposal { pose: camera.inverse() * detection.grasps[0].pose, ..detection.grasps[0] };
     assert_eq!(box_of(&in_task), detection.grasps[0].object);
+}
+
+/// The view of a camera whose pose is unknown, without labels.
+fn unlabelled(boxes: &[[[f64; 3]; 2]], camera: &Isometry3<f64>) -> DepthView {
+    let extrinsics = Extrinsics::FrameFromCamera(Isometry3::identity());
+    DepthView { extrinsics, labels: None, ..labelled(boxes, camera) }
+}
+
+#[tokio::test]
+async fn one_image_without_labels_has_the_grasps_of_all_objects_and_of_nothing_else() {
+    let (_server, client) = server(&[]).await;
+    let camera = camera_at(Point3::new(0.45, 0.25, 0.08), 0.8, 30.0, -90.0);
+    // A wall behind the table, as thick as a hand opens.
+    let wall = [[-0.6, 0.62, TABLE], [1.6, 0.66, TABLE + 0.15]];
+    let view = unlabelled(&[BOXES.as_slice(), &[wall]].concat(), &camera);
+    let workspace = Workspace { find_table: Some(FindTable::default()), ..Workspace::default() };
+    let detect = DetectOptions { max_grasps_per_object: 2, explain: true, ..DetectOptions::default() };
+    let detection = client.detect_from_depth(&[view], &workspace, options(detect)).await.unwrap();
+    let table = detection.table.unwrap();
+    let extent = table.extent.unwrap();
+    assert_eq!(table.objects, 4);
+    assert!(extent.x > 0.9 && extent.y > 0.5, "{extent:?}");
+    let in_task = |grasp: &Proposal| Proposal { pose: camera.inverse() * grasp.pose, ..*grasp };
+    let mut found = Vec::new();
+    for grasp in &detection.grasps {
+        let number = box_of(&in_task(grasp));
+        assert!(number.is_some(), "{grasp:?} is on no box");
+        assert!((1..=4).contains(&grasp.object.unwrap()));
+        found.push((number, grasp.object));
+    }
+    found.sort_unstable();
+    found.dedup();
+    assert_eq!(found.len(), 4, "each box has one number: {found:?}");
+    assert!(detection.dropped.unwrap().object > 0, "the wall has grasps, which are counted");
+    assert!(detection.warnings.iter().all(|warning| !warning.message.contains("table")), "{:?}", detection.warnings);
+}
+
+#[tokio::test]
+async fn objects_beyond_the_queue_are_left_out_with_a_warning() {
+    let (_server, client) = server(&["--queue", "2", "--workers", "1"]).await;
+    let camera = camera_at(Point3::new(0.45, 0.25, 0.08), 0.8, 30.0, -90.0);
+    let workspace = Workspace { find_table: Some(FindTable::default()), ..Workspace::default() };
+    let view = unlabelled(&BOXES, &camera);
+    let detection = client.detect_from_depth(&[view], &workspace, options(DetectOptions::default())).await.unwrap();
+    let warning = &detection.warnings[0];
+    assert_eq!(warning.code(), pb::geometry_warning::Code::ObjectsLeftOut);
+    assert!(warning.message.starts_with("2 of the 4 objects on the table are not in the workspace, which has 2 cubes"));
+}
+
+#[tokio::test]
+async fn collisions_are_checked_across_cubes_and_by_default_with_views() {
+    let (_server, client) = server(&[]).await;
+    // Too little room between the boxes for a finger.
+    let boxes: Vec<_> = (0..6).map(|index| block(0.1 + 0.05 * f64::from(index), 0.25)).collect();
+    let camera = camera_at(Point3::new(0.25, 0.25, 0.08), 0.7, 30.0, -90.0);
+    let views = [DepthView { extrinsics: Extrinsics::FrameFromCamera(camera.inverse()), ..labelled(&boxes, &camera) }];
+    // With this margin the voxels of all cubes are those of one grid.
+    let workspace = Workspace { extent: Some([0.45, 0.45]), ..Workspace::default() };
+    let detect = async |collision| {
+        let detect = DetectOptions { collision, margin: Some(0.075), ..DetectOptions::default() };
+        client.detect_from_depth(&views, &workspace, options(detect)).await.unwrap().grasps
+    };
+    use pb::collision_check::Mode;
+    let (by_default, filtered) = (detect(None).await, detect(collision(Mode::Filter, false)).await);
+    assert_eq!(by_default, filtered);
+    let flagged = detect(collision(Mode::Flag, false)).await;
+    assert!(flagged.iter().any(|grasp| grasp.collides == Some(true)), "{flagged:?}");
+    assert!(detect(collision(Mode::Off, false)).await.iter().all(|grasp| grasp.collides.is_none()));
+    // Scored in a cube around it, a grasp is as good as in the cube that it comes from, and free of collisions.
+    for grasp in by_default.iter().take(5) {
+        let at = grasp.pose * Point3::new(0.0, 0.0, 0.05);
+        let [x, y] = [at.x, at.y].map(|c| ((c - 0.15) / 0.0075).round() * 0.0075);
+        let corner = Isometry3::translation(x, y, 0.0);
+        let centred = Workspace { pose: corner, ..Workspace::default() };
+        let seen = Observation::Depth(&views, &centred);
+        let scores = client.score(seen, &[grasp.pose], options(DetectOptions::default())).await.unwrap().scores;
+        assert!(!scores[0].violations.contains(&Violation::Collision.into()), "{grasp:?}: {scores:?}");
+        assert!((scores[0].quality - grasp.quality).abs() < 0.05, "{grasp:?}: {scores:?}");
+    }
 }
 
 #[tokio::test]

@@ -131,6 +131,10 @@ class FoundTable:
     """Root mean square distance of these pixels from the plane, metres."""
     tilt: float | None
     """Angle between the normal of the table and the vertical, radians; None if gravity is unknown."""
+    extent: tuple[float, float]
+    """Lengths of the workspace along x and y, metres."""
+    objects: int
+    """Number of objects that stand on the table. Objects that touch each other may count as one."""
 
 
 @dataclass(frozen=True)

@@ -62,8 +62,9 @@ class CollisionCheck:
     """Checks whether the open hand would collide with the observed surface or the table, at the grasp or between
     pre-grasp and grasp."""
 
-    mode: Literal["off", "flag", "filter"]
-    """``off``: no check; ``flag``: set `Grasp.collides`; ``filter``: drop grasps that collide."""
+    mode: Literal["off", "flag", "filter"] | None = None
+    """``off``: no check; ``flag``: set `Grasp.collides`; ``filter``: drop grasps that collide. None: ``filter`` for depth images
+    and point clouds, ``off`` for a volume."""
     table_height: float | None = None
     """Height of the table above the bottom of the volume, metres; None: 0.05; negative: no table."""
     clearance: float | None = None
@@ -73,7 +74,8 @@ class CollisionCheck:
     depth images or point clouds."""
 
     def __post_init__(self) -> None:
-        check_choice("CollisionCheck.mode", self.mode, "off", "flag", "filter")
+        if self.mode is not None:
+            check_choice("CollisionCheck.mode", self.mode, "off", "flag", "filter")
 
 
 @dataclass(frozen=True)

@@ -311,7 +311,7 @@ def gripper_message(gripper: Gripper) -> pb.Gripper:
 
 def collision_message(check: CollisionCheck) -> pb.CollisionCheck:
     return pb.CollisionCheck(
-        mode=f"MODE_{check.mode.upper()}",
+        mode=None if check.mode is None else f"MODE_{check.mode.upper()}",
         table_height=check.table_height,
         clearance=check.clearance,
         hidden=check.hidden,
@@ -416,6 +416,8 @@ def table(message: pb.FoundTable) -> FoundTable:
         share=message.share,
         deviation=message.deviation,
         tilt=message.tilt if message.HasField("tilt") else None,
+        extent=(message.extent.x, message.extent.y),
+        objects=message.objects,
     )
 
 

@@ -74,9 +74,10 @@ pub(crate) struct DetectArgs {
     #[arg(long, value_name = "X,Y,Z,X,Y,Z", allow_hyphen_values = true, requires = "gripper")]
     palm: Option<Numbers<6>>,
 
-    /// Check of the open hand for collisions with the observed surface and the table.
-    #[arg(long, value_enum, default_value_t = Collision::Off)]
-    collision: Collision,
+    /// Check of the open hand for collisions with the observed surface and the table. Default: filter for depth images and
+    /// point clouds, off for a volume.
+    #[arg(long, value_enum)]
+    collision: Option<Collision>,
 
     /// Smallest distance between the hand and the obstacles in the collision check, metres. Default: 0.
     #[arg(long, value_name = "METRES")]
@@ -150,8 +151,8 @@ impl DetectArgs {
             "--parent-from-grasp needs --origin parent"
         );
         ensure!(
-            !matches!(self.collision, Collision::Off) || self.clearance.is_none() && !self.hidden,
-            "--clearance and --hidden need --collision flag or --collision filter"
+            !matches!(self.collision, Some(Collision::Off)) || self.clearance.is_none() && !self.hidden,
+            "--clearance and --hidden exclude --collision off"
         );
         let parent_from_grasp = self.parent_from_grasp.as_ref().map(Poses::one).transpose()?;
         let vector = |[x, y, z]: [f64; 3]| Some(pb::Vector3 { x, y, z });
@@ -179,7 +180,12 @@ impl DetectArgs {
             gripper: self.gripper.map(|Numbers([max_opening, finger_depth, finger_width, finger_breadth])| {
                 pb::Gripper { max_opening, finger_depth, finger_width, finger_breadth, palm: self.palm.map(corners) }
             }),
-            collision: Some(pb::CollisionCheck { mode: self.collision as i32, table_height, clearance, hidden }),
+            collision: Some(pb::CollisionCheck {
+                mode: self.collision.map(|mode| mode as i32),
+                table_height,
+                clearance,
+                hidden,
+            }),
             convention: Some(pb::Convention {
                 origin: self.origin as i32,
                 closing_axis: self.closing as i32,

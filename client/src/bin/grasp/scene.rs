@@ -290,11 +290,13 @@ impl Scene {
     }
 }
 
-/// The workspace, with the pose that the server found if it searched the table.
+/// The workspace, with the pose and the extent that the server found if it searched the table.
 fn found(workspace: &Workspace, detection: &Detection) -> anyhow::Result<Workspace> {
-    let found = detection.table.as_ref().and_then(|table| table.workspace.as_ref());
+    let table = detection.table.as_ref();
+    let found = table.and_then(|table| table.workspace.as_ref());
+    let extent = table.and_then(|table| table.extent).map(|extent| [extent.x, extent.y]);
     let pose = found.map(|pose| grasp_proto::pose(pose, "table.workspace")).transpose()?;
-    Ok(Workspace { pose: pose.unwrap_or(workspace.pose), ..*workspace })
+    Ok(Workspace { pose: pose.unwrap_or(workspace.pose), extent: workspace.extent.or(extent), ..*workspace })
 }
 
 /// By which the server multiplied the depths of a view.

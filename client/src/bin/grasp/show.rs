@@ -55,10 +55,14 @@ fn found(table: Option<&FoundTable>, depth_factors: &[f64]) -> String {
     let mut text = String::new();
     if let Some(table) = table {
         text += &format!(
-            "table: {:.3} m from the camera, {:.1}° from its optical axis, {:.0} % of the image\n",
+            "table: {:.3} m from the camera, {:.1}° from its optical axis, {:.0} % of the image, {}\n",
             table.distance,
             table.angle.to_degrees(),
-            table.share * 100.0
+            table.share * 100.0,
+            match table.objects {
+                1 => "1 object".to_owned(),
+                objects => format!("{objects} objects"),
+            }
         );
     }
     if !depth_factors.is_empty() {
@@ -155,6 +159,8 @@ fn table_json(table: &FoundTable) -> Value {
         "share": table.share,
         "deviation": table.deviation,
         "tilt": table.tilt,
+        "extent": table.extent.as_ref().map(|extent| [extent.x, extent.y]),
+        "objects": table.objects,
     })
 }
 

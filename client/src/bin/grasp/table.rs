@@ -67,7 +67,7 @@ impl Table {
         let gravity = gravity.transpose()?;
         let mut place = Workspace { find_table: true, gravity, ..Workspace::default() };
         let (found, view) = in_file(&self.file, |_| self.find(&mut place))?;
-        let FoundTable { frame_from_task, tabletop } = found;
+        let FoundTable { frame_from_task, tabletop, objects, .. } = found;
         let workspace = pose_json(&frame_from_task);
         if let Some(path) = &self.out {
             fs::write(path, format!("{workspace:#}\n")).with_context(|| path.display().to_string())?;
@@ -78,9 +78,9 @@ impl Table {
         }
         let frame = if self.camera_position.is_some() { "points" } else { "camera" };
         show::print(&if as_json {
-            format!("{:#}", json(&tabletop, workspace))
+            format!("{:#}", json(&tabletop, objects, workspace))
         } else {
-            text(&tabletop, &frame_from_task, frame)
+            text(&tabletop, objects, &frame_from_task, frame)
         })?;
         Ok(())
     }
@@ -111,7 +111,7 @@ fn pose_json(pose: &Isometry3<f64>) -> Value {
     json!({ "position": pose.translation.vector.as_slice(), "orientation": pose.rotation.coords.as_slice() })
 }
 
-fn json(table: &Tabletop, workspace: Value) -> Value {
+fn json(table: &Tabletop, objects: usize, workspace: Value) -> Value {
     json!({
         "workspace": workspace,
         "distance": table.distance,
@@ -119,13 +119,15 @@ fn json(table: &Tabletop, workspace: Value) -> Value {
         "share": table.share,
         "deviation": table.deviation,
         "tilt": table.tilt,
+        "objects": objects,
     })
 }
 
-fn text(table: &Tabletop, frame_from_task: &Isometry3<f64>, frame: &str) -> String {
+fn text(table: &Tabletop, objects: usize, frame_from_task: &Isometry3<f64>, frame: &str) -> String {
     let mut text = format!(
         "table: {:.3} m from the camera, whose optical axis is {:.1}° from the table's normal\n\
-         on the table: {:.0} % of the image, {:.1} mm from the plane (RMS)",
+         on the table: {:.0} % of the image, {:.1} mm from the plane (RMS)\n\
+         objects on it: {objects}",
         table.distance,
         table.angle.to_degrees(),
         table.share * 100.0,

@@ -100,7 +100,8 @@ impl Context {
         // Fits: there is at most one grasp per voxel.
         let over_limit = over_limit as u32;
         let dropped = (params.explain || grasps.is_empty()).then(|| pb::Dropped { over_limit, ..(&dropped).into() });
-        seen.warnings.extend(table);
+        // A table that was found is where it was found.
+        seen.warnings.extend(table.filter(|_| seen.table.is_none()));
         let warnings = call.warn(&seen.warnings);
         let messages = warnings.iter().map(|warning| warning.message.clone()).collect();
         let timings = StageTimings {
@@ -135,7 +136,8 @@ impl Context {
         stages: StageTimings,
     ) -> (pb::ScoreGraspsResponse, Option<Outcome>) {
         let Self { mut seen, origin, waited, preprocessing, .. } = self;
-        seen.warnings.extend(table_warning(scores.iter().map(|scores| scores.table)));
+        let table = table_warning(scores.iter().map(|scores| scores.table));
+        seen.warnings.extend(table.filter(|_| seen.table.is_none()));
         let warnings = call.warn(&seen.warnings);
         let timings = StageTimings {
             queue: waited + stages.queue,

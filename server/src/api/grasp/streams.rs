@@ -217,7 +217,7 @@ impl GraspApi {
             self.tracked_volumes.resize(volumes, needed)?;
         }
         let before = tracked.as_ref().map(|(track, _)| Arc::clone(track));
-        let (reader, params) = (Arc::clone(&model), Arc::new(params));
+        let (reader, params) = (Arc::clone(&model), Arc::new(params.with_views()));
         let asked = Arc::clone(&params);
         let added = blocking(permit, call.deadline, move |is_wanted| {
             let frames = Frames::Depth(frames(&views)?);
