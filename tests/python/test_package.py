@@ -80,6 +80,17 @@ class DetectTest(ServerTest):
         self.assertEqual(best.dropped.over_limit, len(found.grasps) - 1)
         self.assertEqual(sum(vars(best.dropped).values()) + 1, scene.RESOLUTION**3)
 
+    def test_results_are_sequences_with_a_short_repr(self):
+        volume = scene.volume(*CAMERAS)
+        found = self.client.detect(volume, LOW)
+        self.assertEqual((len(found), list(found), found[0]), (len(found.grasps), list(found.grasps), found.grasps[0]))
+        self.assertRegex(repr(found), r"^<Detection of \S+ \d: \d+ grasps?, the best with a quality of [01]\.\d\d, \d+ ms>$")
+        self.assertEqual(found._repr_html_().count("<tr>"), 1 + min(10, len(found)))
+        self.assertFalse(self.client.detect(volume, replace(LOW, threshold=1.0)))
+        scores = self.client.score(volume, found)
+        self.assertEqual((len(scores), list(scores)), (len(found), list(scores.scores)))
+        self.assertRegex(repr(scores), r"^<Scores of \S+ \d: [01]\.\d\d")
+
     def test_volumes_of_every_dtype_and_memory_order(self):
         values = scene.volume(*CAMERAS)
         steps = np.rint(values * 255).astype(np.uint8)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from graspd import grasp_pb2 as pb
 from graspd import methods, wire
 from graspd.connection import ChannelOptions, Connection
-from graspd.detection import Detection, FoundTable, Model, Scores
+from graspd.detection import Detection, FoundTable, Grasp, Model, Scores
 from graspd.errors import DeadlineExceeded, Error, Unavailable, from_status
 from graspd.geometry import PoseLike
 from graspd.methods import Answer, Method, Request, Response
@@ -100,7 +100,7 @@ class Client(Connection[grpc.aio.Channel]):
     async def score(
         self,
         observation: wire.Observation,
-        grasps: Iterable[PoseLike | Candidate],
+        grasps: Iterable[PoseLike | Candidate | Grasp],
         workspace: Workspace = Workspace(),
         options: Options | None = None,
         *,

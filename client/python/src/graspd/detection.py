@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import html
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from graspd.geometry import Pose
@@ -137,9 +138,9 @@ class FoundTable:
     """Number of objects that stand on the table. Objects that touch each other may count as one."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Detection:
-    """The result of a request."""
+    """The result of a request: a sequence of grasps, best first, with what else is in the reply."""
 
     grasps: tuple[Grasp, ...]
     """Best first."""
@@ -163,10 +164,40 @@ class Detection:
     depth_factors: tuple[float, ...] = ()
     """Factors by which the depths of the views were multiplied, if the workspace has `correct_depth_scale`."""
 
+    def __len__(self) -> int:
+        return len(self.grasps)
 
-@dataclass(frozen=True)
+    def __iter__(self) -> Iterator[Grasp]:
+        return iter(self.grasps)
+
+    def __getitem__(self, index: int) -> Grasp:
+        return self.grasps[index]
+
+    def __repr__(self) -> str:
+        best = f", the best with a quality of {self.grasps[0].quality:.2f}" if self.grasps else ""
+        warnings = "".join(f", {warning.code}" for warning in self.warnings)
+        seconds = f"{1e3 * self.latency.total:.0f} ms"
+        return f"<Detection of {self.model} {self.version}: {counted(len(self), 'grasp')}{best}, {seconds}{warnings}>"
+
+    def _repr_html_(self) -> str:
+        columns = ["quality", "width (mm)", "position (m)", "quaternion xyzw", "object"]
+        rows = [
+            [
+                f"{grasp.quality:.2f}",
+                f"{1e3 * grasp.width:.0f}",
+                ", ".join(f"{c:.3f}" for c in grasp.pose.position),
+                ", ".join(f"{c:.3f}" for c in grasp.pose.quaternion),
+                "" if grasp.object is None else str(grasp.object),
+            ]
+            for grasp in self.grasps[:SHOWN]
+        ]
+        more = f"<p>… {len(self) - SHOWN} more</p>" if len(self) > SHOWN else ""
+        return f"<p>{html.escape(repr(self)[1:-1])}</p>{html_table(columns, rows)}{more}"
+
+
+@dataclass(frozen=True, repr=False)
 class Scores:
-    """The scores of the caller's grasps."""
+    """The scores of the caller's grasps, in their order, with what else is in the reply."""
 
     scores: tuple[Score, ...]
     """One for each grasp, in their order."""
@@ -187,6 +218,35 @@ class Scores:
     """The table that was found, if the workspace has `find_table`."""
     depth_factors: tuple[float, ...]
     """Factors by which the depths of the views were multiplied, if the workspace has `correct_depth_scale`."""
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    def __iter__(self) -> Iterator[Score]:
+        return iter(self.scores)
+
+    def __getitem__(self, index: int) -> Score:
+        return self.scores[index]
+
+    def __repr__(self) -> str:
+        qualities = ", ".join(f"{score.quality:.2f}" for score in self.scores[:SHOWN])
+        more = f", … {len(self) - SHOWN} more" if len(self) > SHOWN else ""
+        return f"<Scores of {self.model} {self.version}: {qualities}{more}>"
+
+
+SHOWN = 10
+"""Rows and numbers that are shown of a result."""
+
+
+def counted(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def html_table(columns: list[str], rows: list[list[str]]) -> str:
+    def line(cell: str, texts: list[str]) -> str:
+        return f"<tr>{''.join(f'<{cell}>{html.escape(text)}</{cell}>' for text in texts)}</tr>"
+
+    return f"<table>{line('th', columns)}{''.join(line('td', row) for row in rows)}</table>"
 
 
 @dataclass(frozen=True)

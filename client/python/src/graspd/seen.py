@@ -134,14 +134,15 @@ class Workspace:
     stamp: int | None = None
     """Time of the observation, nanoseconds since 1970. The server returns it unchanged."""
     find_table: bool = False
-    """Find the table in the first depth image or point cloud, and place the cube over what stands on it near the middle
-    of the image. `pose` must be None; the pose that was found is in `Detection.table`."""
+    """Find the table in the first depth image or point cloud, and the objects on it: without an `extent` the workspace covers
+    all of them, with at most 12 cubes. With one view without labels, grasps are on these objects only. `pose` must be None;
+    what was found is in `Detection.table`."""
     gravity: Vector | None = None
     """For `find_table`: direction of gravity in `frame_id`, of any length above 0. An accelerometer at rest measures the
     opposite. None: unknown; a wall that fills the image is then taken for a table."""
     extent: tuple[float, float] | None = None
     """Lengths along x and y of a larger workspace, metres, at most 2. The server covers it with overlapping cubes. None:
-    one cube."""
+    one cube, or with `find_table` as many as the objects need."""
     correct_depth_scale: bool = False
     """Multiply the depths of each view by one factor, so that the table in it is at `CollisionCheck.table_height`: for
     cameras whose pose is known and whose depth has an error of scale. The factors are in `Detection.depth_factors`. Not

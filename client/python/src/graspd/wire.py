@@ -80,7 +80,7 @@ def cloud_request(
 
 def score_request(
     observation: Observation,
-    grasps: Iterable[PoseLike | Candidate],
+    grasps: Iterable[PoseLike | Candidate | Grasp],
     workspace: Workspace,
     options: Options | None,
     request_id: str,
@@ -107,8 +107,10 @@ def score_request(
     return request
 
 
-def candidate_message(candidate: PoseLike | Candidate) -> pb.Candidate:
-    if not isinstance(candidate, Candidate):
+def candidate_message(candidate: PoseLike | Candidate | Grasp) -> pb.Candidate:
+    if isinstance(candidate, Grasp):
+        candidate = Candidate(candidate.pose, candidate.width)
+    elif not isinstance(candidate, Candidate):
         candidate = Candidate(candidate)
     return pb.Candidate(pose=pose_message(candidate.pose), width=candidate.width)
 

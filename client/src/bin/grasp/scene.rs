@@ -62,7 +62,8 @@ pub(crate) struct SceneArgs {
     #[arg(long, value_name = "FILE|NUMBERS", requires = "intrinsics", allow_hyphen_values = true)]
     frame_from_camera: Option<Poses>,
 
-    /// Find the table in the first depth image or point cloud, and place the workspace over what stands on it.
+    /// Find the table in the first depth image or point cloud, and place the workspace over the objects on it: all of them,
+    /// if there is no --extent.
     #[arg(long, conflicts_with_all = ["workspace", "camera_from_task", "voxel_size"])]
     find_table: bool,
 

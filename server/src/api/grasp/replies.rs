@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use futures_util::future::try_join_all;
 use grasp::{Candidate, DetectParams, RequestError};
 use grasp_engine::{Detection, Model, Reply, Score, Scores, SessionOutput, StageTimings, Violation};
-use grasp_perception::{Scenes, table_warning};
+use grasp_perception::{Scenes, Warning, table_warning};
 use grasp_proto::{FrameStamp, pb};
 use tokio::task::spawn_blocking;
 
@@ -72,6 +72,23 @@ impl SceneRequest {
 }
 
 impl Context {
+    /// The warnings of the request, and the one about the table in its volumes. A table that was found is where it was found.
+    fn warnings(&self, call: &Call, table: Option<Warning>) -> Vec<pb::GeometryWarning> {
+        let table = table.filter(|_| self.seen.table.is_none());
+        call.warn(&self.seen.warnings.iter().copied().chain(table).collect::<Vec<_>>())
+    }
+
+    fn timings(&self, call: &Call, stages: StageTimings) -> StageTimings {
+        let Self { seen, waited, preprocessing, .. } = self;
+        StageTimings {
+            queue: *waited + stages.queue,
+            preprocessing: *preprocessing,
+            fusion: seen.fusion,
+            total: call.elapsed(),
+            ..stages
+        }
+    }
+
     fn detected(
         self,
         call: &Call,
@@ -79,12 +96,12 @@ impl Context {
         detection: Detection,
         stages: StageTimings,
     ) -> (pb::DetectGraspsResponse, Option<Outcome>) {
-        let Self { ref params, mut seen, ref origin, waited, preprocessing } = self;
         let Detection { grasps: found, dropped, over_limit, volumes, table } = detection;
+        let warnings = self.warnings(call, table);
         let grasps: Vec<_> = found
             .iter()
             .map(|detected| {
-                let [pose, pregrasp, retreat] = params.poses(&detected.grasp.pose).map(|pose| Some((&pose).into()));
+                let [pose, pregrasp, retreat] = self.params.poses(&detected.grasp.pose).map(|pose| Some((&pose).into()));
                 pb::Grasp {
                     pose,
                     width: detected.grasp.width,
@@ -99,22 +116,14 @@ impl Context {
             .collect();
         // Fits: there is at most one grasp per voxel.
         let over_limit = over_limit as u32;
+        let timings = self.timings(call, stages);
+        let Self { params, seen, origin, .. } = self;
         let dropped = (params.explain || grasps.is_empty()).then(|| pb::Dropped { over_limit, ..(&dropped).into() });
-        // A table that was found is where it was found.
-        seen.warnings.extend(table.filter(|_| seen.table.is_none()));
-        let warnings = call.warn(&seen.warnings);
         let messages = warnings.iter().map(|warning| warning.message.clone()).collect();
-        let timings = StageTimings {
-            queue: waited + stages.queue,
-            preprocessing,
-            fusion: seen.fusion,
-            total: call.elapsed(),
-            ..stages
-        };
         let shown = Shown::new(timings, volumes, found, params.finger_depth(), messages);
         let response = pb::DetectGraspsResponse {
             request_id: call.id.clone(),
-            frame_id: origin.frame_id.clone(),
+            frame_id: origin.frame_id,
             stamp: origin.stamp,
             grasps,
             model: model.spec.name().to_owned(),
@@ -135,17 +144,9 @@ impl Context {
         scores: &[Scores],
         stages: StageTimings,
     ) -> (pb::ScoreGraspsResponse, Option<Outcome>) {
-        let Self { mut seen, origin, waited, preprocessing, .. } = self;
-        let table = table_warning(scores.iter().map(|scores| scores.table));
-        seen.warnings.extend(table.filter(|_| seen.table.is_none()));
-        let warnings = call.warn(&seen.warnings);
-        let timings = StageTimings {
-            queue: waited + stages.queue,
-            preprocessing,
-            fusion: seen.fusion,
-            total: call.elapsed(),
-            ..stages
-        };
+        let warnings = self.warnings(call, table_warning(scores.iter().map(|scores| scores.table)));
+        let timings = self.timings(call, stages);
+        let Self { seen, origin, .. } = self;
         let response = pb::ScoreGraspsResponse {
             request_id: call.id.clone(),
             frame_id: origin.frame_id,
