@@ -101,7 +101,8 @@ impl Context {
         let grasps: Vec<_> = found
             .iter()
             .map(|detected| {
-                let [pose, pregrasp, retreat] = self.params.poses(&detected.grasp.pose).map(|pose| Some((&pose).into()));
+                let [pose, pregrasp, retreat] =
+                    self.params.poses(&detected.grasp.pose).map(|pose| Some((&pose).into()));
                 pb::Grasp {
                     pose,
                     width: detected.grasp.width,
