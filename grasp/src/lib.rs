@@ -42,7 +42,7 @@ pub use object_map::ObjectMap;
 pub use obstacles::{Clearance, Obstacles};
 pub use params::{Candidate, Collision, DetectParams, Priority, TABLE_HEIGHT};
 pub use patch::Patch;
-pub use selection::{Decoded, Dropped, Selection, select};
+pub use selection::{Decoded, Dropped, Selection};
 pub use surface::{SurfaceMesh, SurfacePoint};
 pub use volume::{Volume, VolumeError};
 

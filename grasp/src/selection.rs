@@ -46,7 +46,7 @@ impl AddAssign for Dropped {
     }
 }
 
-/// Result of [`decode`](crate::decode) or [`select`].
+/// Result of [`decode`](crate::decode) or [`Selection::select`].
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Decoded {
     /// Grasps in the frame of the volume's pose, best first.
@@ -90,6 +90,28 @@ impl<'a> Selection<'a> {
         self.keeps(pose, &mut Dropped::default())
     }
 
+    /// The grasps that reach the threshold of `params` and pass all checks, for grasps that are not decoded from maps. `grasps`
+    /// are in the frame of the volume's pose, best first, and already planned for the hand of `params`.
+    #[must_use]
+    pub fn select(&self, grasps: &[Grasp], params: &DecodeParams) -> Decoded {
+        let above = |threshold: f32| {
+            let mut decoded = Decoded::default();
+            for grasp in grasps {
+                if grasp.quality < threshold {
+                    decoded.dropped.below_threshold += 1;
+                } else if self.keeps(&grasp.pose, &mut decoded.dropped) {
+                    decoded.grasps.push(*grasp);
+                }
+            }
+            decoded
+        };
+        let decoded = above(params.threshold);
+        match params.floor() {
+            Some(floor) if decoded.grasps.is_empty() => above(floor).best_alone(),
+            _ => decoded,
+        }
+    }
+
     /// Whether a grasp passes all checks. Otherwise counts the reason in `dropped`.
     pub(crate) fn keeps(&self, pose: &Isometry3<f64>, dropped: &mut Dropped) -> bool {
         let count = match self.constraints.violation(pose, &self.hand) {
@@ -102,28 +124,5 @@ impl<'a> Selection<'a> {
         };
         *count += 1;
         false
-    }
-}
-
-/// Filters grasps that are not decoded from maps by threshold, constraints and clearance. `grasps` are in the frame
-/// of `volume`'s pose, best first, and already planned for the hand of `params`.
-#[must_use]
-pub fn select(grasps: &[Grasp], volume: &Volume, params: &DecodeParams) -> Decoded {
-    let selection = Selection::new(volume, params);
-    let above = |threshold: f32| {
-        let mut decoded = Decoded::default();
-        for grasp in grasps {
-            if grasp.quality < threshold {
-                decoded.dropped.below_threshold += 1;
-            } else if selection.keeps(&grasp.pose, &mut decoded.dropped) {
-                decoded.grasps.push(*grasp);
-            }
-        }
-        decoded
-    };
-    let decoded = above(params.threshold);
-    match params.floor() {
-        Some(floor) if decoded.grasps.is_empty() => above(floor).best_alone(),
-        _ => decoded,
     }
 }

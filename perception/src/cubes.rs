@@ -1,5 +1,6 @@
 use std::collections::BTreeSet;
 use std::fmt::Display;
+use std::sync::Arc;
 use std::time::Instant;
 
 use grasp::{DetectParams, Fusion, Region, RequestError, SurfacePoint, TABLE_HEIGHT};
@@ -201,7 +202,13 @@ impl Cubes {
         let (depth_factors, mut warnings) = self.correct_depth_scale(&mut observation, params.table)?;
         warnings.extend(self.left_out);
         let wanted = self.found.as_ref().or(Some(&params.objects).filter(|wanted| !wanted.is_empty()));
-        let objects = observation.objects(&self.frame_from_task, wanted)?;
+        let objects = observation.objects(&self.frame_from_task, wanted).map(Arc::new);
+        // Of small objects that were found, other pixels in the same cells may be more.
+        let missing = objects.as_ref().filter(|_| !are_found).and_then(|objects| objects.missing());
+        if let Some(label) = missing {
+            let needed = "must have labels of the views only; no pixel or point with a depth has this one";
+            return Err(RequestError::invalid("options.objects", format_args!("[…, {label}, …]"), needed));
+        }
         let scenes = self.integrate(&observation, params.margin, &mut warnings, is_wanted)?;
         let of_objects = |scene: Scene| Scene { volume: scene.volume.with_objects(objects.clone()), ..scene };
         let scenes = with_objects(scenes, params.table).into_iter().map(of_objects).collect();

@@ -1,6 +1,5 @@
 use std::borrow::Cow;
 use std::collections::BTreeSet;
-use std::sync::Arc;
 
 use grasp::{DepthImage, ObjectMap, RequestError};
 use nalgebra::{Isometry3, Point3};
@@ -123,9 +122,9 @@ impl Observation {
         &self,
         frame_from_task: &Isometry3<f64>,
         wanted: Option<&BTreeSet<u16>>,
-    ) -> Result<Option<Arc<ObjectMap>>, RequestError> {
+    ) -> Option<ObjectMap> {
         if !self.is_labelled() {
-            return Ok(None);
+            return None;
         }
         let points: Box<dyn Iterator<Item = (Point3<f64>, u16)>> = match self {
             Self::Depth(views) => Box::new(views.iter().flat_map(labelled)),
@@ -134,14 +133,7 @@ impl Observation {
                 cloud.points.iter().copied().zip(labels)
             })),
         };
-        let map = ObjectMap::new(points, frame_from_task, wanted.cloned());
-        match map.missing() {
-            None => Ok(Some(Arc::new(map))),
-            Some(label) => {
-                let needed = "must have labels of the views only; no pixel or point with a depth has this one";
-                Err(RequestError::invalid("options.objects", format_args!("[…, {label}, …]"), needed))
-            }
-        }
+        Some(ObjectMap::new(points, frame_from_task, wanted.cloned()))
     }
 }
 

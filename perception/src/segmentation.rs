@@ -45,6 +45,11 @@ const AREA: f64 = 3e-4;
 const FEWEST: usize = 15;
 const HEIGHT: f64 = 0.01;
 
+/// A thing with a smaller visible area, m², this near to other things in the image, metres, is a fragment of them: depth cameras
+/// have holes at edges.
+const FRAGMENT: f64 = 6e-4;
+const BESIDE_OTHERS: f64 = 0.02;
+
 /// Things longer than this, metres, may be a bin with objects that touch its walls.
 const LONGEST: f64 = 0.5;
 
@@ -123,6 +128,11 @@ impl Segmentation {
             objects.extend(whole);
             others.extend(cut);
         }
+        let mut is_other = vec![false; grid.points.len()];
+        others.iter().flatten().for_each(|&index| is_other[index] = true);
+        let (objects, fragments): (Vec<_>, Vec<_>) =
+            objects.into_iter().partition(|thing| grid.area(thing) >= FRAGMENT || !grid.is_near(thing, &is_other));
+        others.extend(fragments);
         let mut labels = vec![0; grid.points.len()];
         for (pixels, label) in objects.iter().chain(&others).zip(1..=u16::MAX) {
             pixels.iter().for_each(|&index| labels[index] = label);
@@ -314,6 +324,21 @@ impl Grid {
             && below.take(HANGING).count() < HANGING
             && edge <= EDGE * count.sqrt()
             && beside <= BESIDE * count
+    }
+
+    /// Whether a thing is beside pixels of other things in the image.
+    fn is_near(&self, thing: &[usize], is_other: &[bool]) -> bool {
+        let (width, height) = (self.width as isize, (self.points.len() / self.width) as isize);
+        thing.iter().any(|&index| {
+            let depth = self.points[index].map_or(f64::INFINITY, |point| point.z);
+            let reach = ((BESIDE_OTHERS / (self.pixel * depth)) as isize).min(40);
+            let (u, v) = ((index % self.width) as isize, (index / self.width) as isize);
+            let directions = [(1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)];
+            directions
+                .iter()
+                .flat_map(|(x, y)| (1..=reach).map(move |step| (u + x * step, v + y * step)))
+                .any(|(u, v)| (0..width).contains(&u) && (0..height).contains(&v) && is_other[(v * width + u) as usize])
+        })
     }
 
     /// Takes the walls and rims of bins off a thing. Returns them and the rest.

@@ -1,7 +1,7 @@
 use std::f64::consts::PI;
 use std::path::Path;
 
-use grasp::{DecodeParams, Decoded, FINGER_DEPTH, Grasp, Patch, Selection, Volume, select};
+use grasp::{DecodeParams, Decoded, FINGER_DEPTH, Grasp, Patch, Selection, Volume};
 use grasp_models::{Classifier, LoadError, Metadata, Options, RuntimeError};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
@@ -95,7 +95,7 @@ impl Evaluator {
             moving = better.into_iter().map(|(index, _)| index).collect();
         }
         sort(&mut grasps);
-        let mut decoded = select(&grasps, volume, params);
+        let mut decoded = selection.select(&grasps, params);
         decoded.dropped += dropped;
         Ok(decoded)
     }

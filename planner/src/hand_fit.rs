@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use grasp::gpd::{Candidate, Cloud, Params, by_sample, is_on_an_object};
-use grasp::{DecodeParams, Decoded, Fusion, Grasp, Hand, SurfacePoint, select};
+use grasp::{DecodeParams, Decoded, Fusion, Grasp, Hand, Selection, SurfacePoint};
 use grasp_perception::Scene;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -76,7 +76,7 @@ impl HandFit {
     pub(crate) fn select(&self, grasps: Vec<Grasp>, scene: &Scene, params: &DecodeParams) -> Decoded {
         let pose = scene.volume.pose();
         let in_frame: Vec<Grasp> = grasps.into_iter().map(|grasp| Grasp { pose: pose * grasp.pose, ..grasp }).collect();
-        let mut decoded = select(&in_frame, &scene.volume, params);
+        let mut decoded = Selection::new(&scene.volume, params).select(&in_frame, params);
         decoded.dropped.mask += self.other_points;
         decoded.dropped.collision += self.misfits;
         decoded

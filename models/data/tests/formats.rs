@@ -191,6 +191,22 @@ fn errors_name_the_damaged_file() {
 }
 
 #[test]
+fn a_header_with_an_edge_that_overflows_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    pack(folder.path(), [0]);
+    let file = folder.path().join("scenes-00000.pack");
+    let whole = fs::read(&file).unwrap();
+    // Their third powers do not fit u32 and u64.
+    for edge in [257_u32, 2000, 3_000_000, u32::MAX] {
+        let mut bytes = whole.clone();
+        bytes[12..16].copy_from_slice(&edge.to_le_bytes());
+        fs::write(&file, bytes).unwrap();
+        let error = Dataset::open(&[folder.path().to_owned()]).err().unwrap().to_string();
+        assert!(error.contains(&format!("the edge of a volume is {edge} voxels, must be at most 256")), "{error}");
+    }
+}
+
+#[test]
 fn ranges_of_scenes_are_merged() {
     let folder = tempfile::tempdir().unwrap();
     let [a, b, all] = ["a", "b", "all"].map(|name| folder.path().join(name));

@@ -186,7 +186,7 @@ async fn a_reload_that_takes_too_long_is_reported_and_does_not_delay_the_next() 
     let server = Server::run(&[TestModel::new("mirror")], &["--watch", "0", "--reload-timeout", "0.2"]);
     let client = server.client().await;
     // Its warm-up takes seconds.
-    TestModel::new("slow").convolutions(300).write(server.models());
+    TestModel::new("slow").convolutions(40).write(server.models());
     server.reload().unwrap();
     server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 1.0).await;
     assert_eq!(served(&client).await, ["mirror 1"]);
