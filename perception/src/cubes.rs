@@ -89,7 +89,7 @@ impl Cubes {
         let cover = workspace.cover(&mut table, &standing.objects, edge, params.margin);
         let observation = frames.in_task(&workspace.frame_from_task)?;
         let cubes = Self::new(input, &workspace, cover.as_ref(), &observation.eyes(), params.margin);
-        let left_out = cover.filter(|cover| cover.left_out > 0).map(|Cover { left_out, corners }| {
+        let left_out = cover.filter(|cover| cover.left_out > 0).map(|Cover { left_out, corners, .. }| {
             Warning::ObjectsLeftOut { left_out, objects: table.objects, cubes: corners.len() }
         });
         // If nothing was found, everything may be grasped: objects may be too low to be found.
@@ -122,7 +122,7 @@ impl Cubes {
                 parts.iter().map(|part| cube(part.corner, Some(part.inner))).collect()
             }
         };
-        let extent = extent.unwrap_or([edge; 2]);
+        let extent = extent.or(cover.map(|cover| cover.extent)).unwrap_or([edge; 2]);
         Self {
             cubes,
             frame_from_task,

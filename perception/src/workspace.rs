@@ -49,10 +49,13 @@ pub(crate) struct Standing {
     pub labels: Option<BTreeSet<u16>>,
 }
 
-/// Corners of the cubes that hold the objects on a table, in the frame of the workspace, metres.
+/// The cubes that hold the objects on a table, in the frame of the workspace.
 #[derive(Clone, Debug)]
 pub(crate) struct Cover {
+    /// Corners of the cubes, metres.
     pub corners: Vec<[f64; 2]>,
+    /// Lengths of the workspace around them along x and y, metres.
+    pub extent: [f64; 2],
     /// Number of objects that are in none of them.
     pub left_out: usize,
 }
@@ -205,7 +208,7 @@ impl Workspace {
     }
 
     /// Places cubes with this `edge` over all objects on the table, and the workspace around them. `None` if that was not
-    /// requested, or there are no objects.
+    /// requested, there are no objects, or a cube has no room between its margins.
     pub(crate) fn cover(
         &mut self,
         table: &mut FoundTable,
@@ -214,12 +217,16 @@ impl Workspace {
         margin: f64,
     ) -> Option<Cover> {
         let limit = self.find_objects.filter(|_| self.extent.is_none())?.min(MAX_FOUND_CUBES);
-        let (corners, left_out) = cover_objects(objects, edge, margin.max(OBJECT_MARGIN), limit);
+        let margin = margin.max(OBJECT_MARGIN);
+        if edge <= 2.0 * margin {
+            return None;
+        }
+        let (corners, left_out) = cover_objects(objects, edge, margin, limit);
         if let [corner] = corners[..]
             && corner.iter().all(|c| c.abs() < 1e-9)
         {
             // The cube of the workspace, without another rounding.
-            return Some(Cover { corners: vec![[0.0; 2]], left_out });
+            return Some(Cover { corners: vec![[0.0; 2]], extent: table.extent, left_out });
         }
         let lowest = [0, 1].map(|axis| corners.iter().map(|corner| corner[axis]).fold(f64::INFINITY, f64::min));
         let highest = [0, 1].map(|axis| corners.iter().map(|corner| corner[axis]).fold(f64::NEG_INFINITY, f64::max));
@@ -228,7 +235,8 @@ impl Workspace {
         }
         table.extent = [0, 1].map(|axis| highest[axis] - lowest[axis] + edge);
         let [x, y] = self.moved(table, lowest);
-        Some(Cover { corners: corners.iter().map(|corner| [corner[0] + x, corner[1] + y]).collect(), left_out })
+        let corners = corners.iter().map(|corner| [corner[0] + x, corner[1] + y]).collect();
+        Some(Cover { corners, extent: table.extent, left_out })
     }
 }
 

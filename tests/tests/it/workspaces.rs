@@ -186,7 +186,16 @@ async fn one_image_without_labels_has_the_grasps_of_all_objects_and_of_nothing_e
     found.dedup();
     assert_eq!(found.len(), 4, "each box has one number: {found:?}");
     assert!(detection.dropped.unwrap().object > 0, "the wall has grasps, which are counted");
-    assert!(detection.warnings.iter().all(|warning| !warning.message.contains("table")), "{:?}", detection.warnings);
+    // The camera is 0.8 m from the middle of the whole workspace.
+    let warnings = &detection.warnings;
+    assert_eq!(warnings.len(), 1, "{warnings:?}");
+    assert!((warnings[0].figures["distance_m"] - 0.8).abs() < 0.1, "{warnings:?}");
+
+    // Cubes without room between the margins stay one.
+    let small = Workspace { size: Some(0.09), ..workspace };
+    let shaf = DetectOptions { model: "shaf".to_owned(), ..DetectOptions::default() };
+    let found = client.detect_from_depth(&[unlabelled(&BOXES, &camera)], &small, options(shaf)).await.unwrap();
+    assert_eq!(found.table.unwrap().extent, Some(pb::Extent { x: 0.09, y: 0.09 }));
 }
 
 #[tokio::test]
