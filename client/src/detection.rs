@@ -123,9 +123,9 @@ pub struct Workspace {
     pub extent: Option<[f64; 2]>,
     /// Find the table in the first depth image or point cloud instead of using `pose`.
     pub find_table: Option<FindTable>,
-    /// Multiply the depths of each view by one factor, so that the table is at its height: for cameras whose pose is
-    /// known and whose depth has an error of scale. Not with `find_table`.
-    pub correct_depth_scale: bool,
+    /// Multiply the depths of each view by one factor, so that the table is at its height. `None`: in depth images whose
+    /// table is level and at most 3 cm from its height. `Some(true)` is an error with `find_table`.
+    pub correct_depth_scale: Option<bool>,
 }
 
 /// A search for the table in an observation: the workspace is placed over what stands on it.
@@ -159,7 +159,7 @@ pub struct Detection {
     pub warnings: Vec<pb::GeometryWarning>,
     /// The table that was found, with [`Workspace::find_table`].
     pub table: Option<pb::FoundTable>,
-    /// Factors by which the depths of the views were multiplied, with [`Workspace::correct_depth_scale`].
+    /// Factors by which the depths of the views were multiplied ([`Workspace::correct_depth_scale`]).
     pub depth_factors: Vec<f64>,
 }
 
@@ -206,7 +206,7 @@ pub struct Scores {
     pub warnings: Vec<pb::GeometryWarning>,
     /// The table that was found, with [`Workspace::find_table`].
     pub table: Option<pb::FoundTable>,
-    /// Factors by which the depths of the views were multiplied, with [`Workspace::correct_depth_scale`].
+    /// Factors by which the depths of the views were multiplied ([`Workspace::correct_depth_scale`]).
     pub depth_factors: Vec<f64>,
 }
 
@@ -316,7 +316,7 @@ impl Options {
         use pb::find_table_request::Observation as Message;
         // The server refuses a pose and a correction of depths here.
         let find_table = Some(workspace.find_table.unwrap_or_default());
-        let workspace = Workspace { find_table, correct_depth_scale: false, ..*workspace };
+        let workspace = Workspace { find_table, correct_depth_scale: None, ..*workspace };
         pb::FindTableRequest {
             observation: Some(match view {
                 AnyView::Depth(view) => Message::View(view.into()),
@@ -477,13 +477,13 @@ mod tests {
             camera_position: [0.0; 3],
             labels: None,
         };
-        let workspace = Workspace { extent: Some([0.9, 0.6]), correct_depth_scale: true, ..Workspace::default() };
+        let workspace = Workspace { extent: Some([0.9, 0.6]), correct_depth_scale: Some(true), ..Workspace::default() };
         let options = Options { request_id: "shelf 7".to_owned(), frame_id: "base".to_owned(), ..Options::default() };
         let request = options.table_request(AnyView::Cloud(&cloud), &workspace, Some(0.1));
         assert_eq!((request.request_id.as_str(), request.table_height), ("shelf 7", Some(0.1)));
         assert!(matches!(request.observation, Some(pb::find_table_request::Observation::Cloud(_))));
         let workspace = request.workspace.unwrap();
-        assert!(workspace.find_table && workspace.pose.is_none() && !workspace.correct_depth_scale);
+        assert!(workspace.find_table && workspace.pose.is_none() && workspace.correct_depth_scale.is_none());
         assert_eq!((workspace.frame_id.as_str(), workspace.extent), ("base", Some(pb::Extent { x: 0.9, y: 0.6 })));
     }
 }

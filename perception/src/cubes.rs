@@ -10,7 +10,7 @@ use crate::grid::FusionGrid;
 use crate::layout::{OBJECT_MARGIN, Part};
 use crate::point_sampler::PointSampler;
 use crate::workspace::Cover;
-use crate::{FoundTable, Frames, InputGrid, Observation, Scene, Scenes, Warning, Workspace, check_margin};
+use crate::{DepthScale, FoundTable, Frames, InputGrid, Observation, Scene, Scenes, Warning, Workspace, check_margin};
 
 /// The scenes of a request with views: places the workspace, and fuses the views into its cubes. Stops when `is_wanted`
 /// returns false.
@@ -41,7 +41,7 @@ pub(crate) struct Cubes {
     /// Lengths of the workspace along x and y, metres.
     extent: [f64; 2],
     /// Whether to correct the scale of the depths.
-    corrects_depth_scale: bool,
+    depth_scale: DepthScale,
     /// Whether views of several requests are integrated.
     is_tracked: bool,
     /// The half-life of the measurements of tracked cubes, views.
@@ -100,7 +100,7 @@ impl Cubes {
     /// The cubes that a planner requires for a workspace, or those that `cover` the objects on a table. `eyes` are the camera
     /// positions in the task frame, metres.
     fn new(input: &InputGrid, workspace: &Workspace, cover: Option<&Cover>, eyes: &[Point3<f64>], margin: f64) -> Self {
-        let Workspace { frame_from_task, size, extent, correct_depth_scale, .. } = *workspace;
+        let Workspace { frame_from_task, size, extent, depth_scale, .. } = *workspace;
         let edge = input.edge(size);
         // Where the cube was placed by the caller, the volume is what the networks were trained with.
         let is_padded = workspace.find_table || extent.is_some();
@@ -128,7 +128,7 @@ impl Cubes {
             frame_from_task,
             middle: extent.map(|length| length / 2.0),
             extent,
-            corrects_depth_scale: correct_depth_scale,
+            depth_scale,
             is_tracked: false,
             half_life: None,
             found: None,
@@ -215,17 +215,18 @@ impl Cubes {
         Ok(Scenes { scenes, warnings, depth_factors, ..Scenes::default() })
     }
 
-    /// Corrects the scale of the depths if `correct_depth_scale` is set, so that the table is at the height `table`, metres.
-    /// Returns the factor of each view, and warnings.
+    /// Corrects the scale of the depths, so that the table is at the height `table`, metres. Returns the factor of each
+    /// view, and warnings.
     fn correct_depth_scale(
         &self,
         observation: &mut Observation,
         table: Option<f64>,
     ) -> Result<(Vec<f64>, Vec<Warning>), RequestError> {
-        match (self.corrects_depth_scale, table) {
-            (false, _) => Ok(Default::default()),
-            (true, Some(table)) => Ok(observation.correct_depth_scale(table, self.extent)),
-            (true, None) => {
+        match (self.depth_scale, table) {
+            (DepthScale::Keep, _) | (DepthScale::Auto, None) => Ok(Default::default()),
+            (DepthScale::Auto, Some(table)) => Ok(observation.correct_plausible_depth_scale(table, self.extent)),
+            (DepthScale::Correct, Some(table)) => Ok(observation.correct_depth_scale(table, self.extent)),
+            (DepthScale::Correct, None) => {
                 let needed = "must be false without a table, which a negative collision.table_height means";
                 Err(RequestError::invalid("workspace.correct_depth_scale", true, needed))
             }

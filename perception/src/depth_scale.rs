@@ -1,5 +1,5 @@
 use grasp::DepthImage;
-use nalgebra::{Isometry3, Point3};
+use nalgebra::{Isometry3, Matrix2, Point3, Vector2, Vector3};
 
 /// Factors that are searched. The benchmark's noise has a standard deviation of 3.2 %, so three of it are within.
 const RANGE: [f64; 2] = [0.9, 1.1];
@@ -12,6 +12,9 @@ const SPREAD: usize = 2;
 
 /// The factor is the mean of those within this distance of it.
 const NEAR: f64 = 0.01;
+
+/// Points this near to the factor are those of the table, with its tilt.
+const NEAR_PLANE: f64 = 0.025;
 
 /// Share of the largest peak from which a smaller factor is preferred: nothing lies below the table, and the tops of
 /// objects may cover more of the image.
@@ -27,6 +30,72 @@ const AROUND: f64 = 0.15;
 /// Pixels of an image that are used, about.
 const PIXELS: usize = 20_000;
 
+/// Whether to correct the scale of the depths of a request, so that the table is at its height.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum DepthScale {
+    /// Of each depth image whose table is level and at most 3 cm above or below its height. Without a table nothing is
+    /// corrected.
+    #[default]
+    Auto,
+    /// Of each depth image and point cloud whose table is within 10 % of its distance.
+    Correct,
+    /// Of none.
+    Keep,
+}
+
+/// Changes of the scale that are left out in [`DepthScale::Auto`]: 1.5 mm at 0.6 m, less than a measurement's noise.
+const NEGLIGIBLE: f64 = 0.0025;
+
+/// Largest distance of the table from its height in [`DepthScale::Auto`], metres. A table farther away is more likely at
+/// another height than the caller said.
+const LARGEST_SHIFT: f64 = 0.03;
+
+/// Largest tilt of the table in [`DepthScale::Auto`], radians: 1.5°. A larger one is an error of the camera's pose or of its
+/// intrinsics, and so is its height.
+const LARGEST_TILT: f64 = 1.5 * std::f64::consts::PI / 180.0;
+
+/// The [`image_depth_factor`] for [`DepthScale::Auto`]: 1 if the change is negligible, `None` if the error is none of
+/// the scale.
+#[must_use]
+pub fn plausible_depth_factor(
+    image: &DepthImage,
+    camera_from_task: &Isometry3<f64>,
+    table: f64,
+    extent: [f64; 2],
+) -> Option<f64> {
+    let factor = image_depth_factor(image, camera_from_task, table, extent)?;
+    if (factor - 1.0).abs() < NEGLIGIBLE {
+        return Some(1.0);
+    }
+    let eye = Point3::from(camera_from_task.inverse().translation.vector);
+    let is_near = measured_shift(factor, &eye, table).abs() <= LARGEST_SHIFT;
+    let on_table = sampled(image, camera_from_task).filter(|point| {
+        let at_factor = (table - eye.z) / (point.z - eye.z);
+        is_around(&(eye + factor * (point - eye)), extent) && (at_factor - factor).abs() <= NEAR_PLANE
+    });
+    (is_near && tilt(on_table)? <= LARGEST_TILT).then_some(factor)
+}
+
+/// How far above its height the table was measured by a camera at `eye` whose depths need `factor`, metres.
+#[must_use]
+pub fn measured_shift(factor: f64, eye: &Point3<f64>, table: f64) -> f64 {
+    (eye.z - table) * (1.0 - 1.0 / factor)
+}
+
+/// The angle between the z axis and the plane that fits points best along z, radians; `None` for fewer than three.
+fn tilt(points: impl Iterator<Item = Point3<f64>>) -> Option<f64> {
+    let points: Vec<_> = points.collect();
+    let mean = points.iter().map(|point| point.coords).sum::<Vector3<f64>>() / points.len() as f64;
+    let (mut squares, mut products) = (Matrix2::zeros(), Vector2::zeros());
+    for point in &points {
+        let from_mean = point.coords - mean;
+        squares += from_mean.xy() * from_mean.xy().transpose();
+        products += from_mean.xy() * from_mean.z;
+    }
+    let slope = squares.try_inverse()? * products;
+    Some(slope.norm().atan())
+}
+
 /// The [`depth_factor`] of an image. `camera_from_task` is `T_camera_task`; `table` and `extent` as there.
 #[must_use]
 pub fn image_depth_factor(
@@ -35,11 +104,20 @@ pub fn image_depth_factor(
     table: f64,
     extent: [f64; 2],
 ) -> Option<f64> {
+    let eye = Point3::from(camera_from_task.inverse().translation.vector);
+    depth_factor(sampled(image, camera_from_task), &eye, table, extent)
+}
+
+/// Points of an image, task frame.
+fn sampled(image: &DepthImage, camera_from_task: &Isometry3<f64>) -> impl Iterator<Item = Point3<f64>> {
     // Odd, so that the pixels are not in few columns.
     let every = (image.depth().len() / PIXELS) | 1;
-    let points = image.points_of_every(every, camera_from_task).map(|point| point.position);
-    let eye = Point3::from(camera_from_task.inverse().translation.vector);
-    depth_factor(points, &eye, table, extent)
+    image.points_of_every(every, camera_from_task).map(|point| point.position)
+}
+
+/// Whether a point is in or around the workspace.
+fn is_around(point: &Point3<f64>, extent: [f64; 2]) -> bool {
+    [point.x, point.y].into_iter().zip(extent).all(|(at, length)| (-AROUND..=length + AROUND).contains(&at))
 }
 
 /// The factor by which the distances that a camera has measured must be multiplied, so that the table is at its height;
@@ -54,14 +132,11 @@ pub fn depth_factor(
     table: f64,
     extent: [f64; 2],
 ) -> Option<f64> {
-    let is_around = |q: Point3<f64>| {
-        [q.x, q.y].into_iter().zip(extent).all(|(at, length)| (-AROUND..=length + AROUND).contains(&at))
-    };
     let factors = points.filter_map(|point| {
         let ray = point - eye;
         let factor = (table - eye.z) / ray.z;
         // Written so that NaN fails.
-        (factor > 0.0 && is_around(eye + factor * ray)).then_some(factor)
+        (factor > 0.0 && is_around(&(eye + factor * ray), extent)).then_some(factor)
     });
     let factors: Vec<f64> = factors.collect();
     let mut factor = lowest_peak(&factors)?;
@@ -99,7 +174,7 @@ fn lowest_peak(factors: &[f64]) -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Vector3;
+    use nalgebra::UnitQuaternion;
 
     use super::*;
 
@@ -165,5 +240,16 @@ mod tests {
         assert_eq!(found(&seen(-0.3, block, 1.0, 0.0)), None, "the floor");
         assert_eq!(found(&[]), None);
         assert_eq!(found(&[Point3::new(f64::NAN, 0.1, 0.05), EYE, EYE + Vector3::x()]), None);
+    }
+
+    #[test]
+    fn the_tilt_of_a_plane_is_measured() {
+        let level = (0..400).map(|i| Point3::new(f64::from(i % 20) * 0.03, f64::from(i / 20) * 0.03, 0.05));
+        let tilted = |degrees: f64| {
+            let turn = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), degrees.to_radians());
+            tilt(level.clone().map(move |point| turn * point)).unwrap().to_degrees()
+        };
+        assert!(tilted(0.0) < 1e-6 && (tilted(2.0) - 2.0).abs() < 1e-6);
+        assert_eq!(tilt(level.take(2)), None);
     }
 }

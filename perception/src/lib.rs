@@ -24,7 +24,7 @@ mod warning;
 mod workspace;
 
 pub use cubes::perceive;
-pub use depth_scale::{depth_factor, image_depth_factor};
+pub use depth_scale::{DepthScale, depth_factor, image_depth_factor, measured_shift, plausible_depth_factor};
 pub use frame::{CameraPose, Cloud, Frame, View};
 pub use grid::{InputGrid, NetworkGrid, check_margin};
 pub use observation::{Frames, Observation};

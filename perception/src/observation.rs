@@ -5,7 +5,7 @@ use grasp::{DepthImage, ObjectMap, RequestError};
 use nalgebra::{Isometry3, Point3};
 
 use crate::cubes::sees_nothing;
-use crate::{Cloud, Frame, View, Warning, depth_factor, image_depth_factor, seen_from};
+use crate::{Cloud, Frame, View, Warning, depth_factor, image_depth_factor, plausible_depth_factor, seen_from};
 
 /// What the cameras of a request saw, as it was sent.
 #[derive(Clone, Debug)]
@@ -56,6 +56,23 @@ impl Observation {
             Self::Depth(views) => views.iter().map(View::eye).collect(),
             Self::Clouds(clouds) => clouds.iter().map(|cloud| cloud.eye).collect(),
         }
+    }
+
+    /// Corrects the scale of the distances in each depth image where the table shows that it is wrong. Returns the factors,
+    /// and warnings about those that moved the table visibly. Point clouds may be merged from several cameras, so theirs is
+    /// not corrected. `extent` is that of the workspace, metres.
+    pub(crate) fn correct_plausible_depth_scale(&mut self, table: f64, extent: [f64; 2]) -> (Vec<f64>, Vec<Warning>) {
+        let Self::Depth(views) = self else { return Default::default() };
+        let (mut factors, mut warnings) = (Vec::new(), Vec::new());
+        for (index, view) in views.iter_mut().enumerate() {
+            let factor = plausible_depth_factor(&view.image, &view.camera_from_task, table, extent).unwrap_or(1.0);
+            if factor != 1.0 {
+                view.image.scale(factor);
+            }
+            warnings.extend(Warning::of_depth_factor(index, factor, &view.eye(), table));
+            factors.push(factor);
+        }
+        (factors, warnings)
     }
 
     /// Corrects the scale of the distances in each view, so that the table is at its height. Returns the factors, and

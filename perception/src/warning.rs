@@ -2,7 +2,7 @@ use grasp::{DepthImage, Fusion, Volume};
 use nalgebra::{Isometry3, Point3, Vector3};
 use thiserror::Error;
 
-use crate::Table;
+use crate::{Table, measured_shift};
 
 /// A sign that the geometry of an observation is wrong, or that a network was not trained for it. Grasps are detected
 /// all the same.
@@ -99,6 +99,22 @@ pub enum Warning {
         /// Index of the view.
         view: usize,
     },
+    /// The scale of the depths of a view was corrected without a request for it.
+    #[error(
+        "the depths of views[{view}] were multiplied by {factor:.4}, because its table is at z = {height:.3} m, expected at \
+         {expected:.3} m; if a pose is wrong instead, grasps are beside the objects: check the camera pose, workspace.pose \
+         and collision.table_height, or set workspace.correct_depth_scale to false"
+    )]
+    DepthsCorrected {
+        /// Index of the view.
+        view: usize,
+        /// The factor.
+        factor: f64,
+        /// Height at which the table was measured, metres.
+        height: f64,
+        /// Its expected height, metres.
+        expected: f64,
+    },
     /// There are more objects on the table than cubes may cover.
     #[error(
         "{left_out} of the {objects} objects on the table are not in the workspace, which has {cubes} cubes; for a \
@@ -153,6 +169,14 @@ impl Warning {
             (!is_within(angle.to_degrees(), TRAINED_ANGLE, Self::ANGLE_MARGIN))
                 .then_some(Self::CameraAngle { view, angle })
         }
+    }
+
+    /// Tells of a correction of the depths of a view from `eye` that moved the table by as much as a wrong height of it.
+    #[must_use]
+    pub fn of_depth_factor(view: usize, factor: f64, eye: &Point3<f64>, expected: f64) -> Option<Warning> {
+        let shift = measured_shift(factor, eye, expected);
+        let height = expected + shift;
+        (shift.abs() > Self::HEIGHT).then_some(Self::DepthsCorrected { view, factor, height, expected })
     }
 
     /// Compares a view with those that are fused already.

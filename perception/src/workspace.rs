@@ -5,7 +5,7 @@ use nalgebra::{Isometry3, Translation3, Unit, Vector3};
 
 use crate::layout::{OBJECT_MARGIN, cover_objects};
 use crate::segmentation::{Object, Segmentation};
-use crate::{CameraPose, Cloud, Frame, Frames, NoTabletop, Tabletop, View, overview};
+use crate::{CameraPose, Cloud, DepthScale, Frame, Frames, NoTabletop, Tabletop, View, overview};
 
 /// Where grasps are wanted.
 #[derive(Clone, Debug, PartialEq)]
@@ -24,7 +24,7 @@ pub struct Workspace {
     /// Lengths along x and y, metres; `None` means one cube.
     pub extent: Option<[f64; 2]>,
     /// Whether to multiply the depths of each view by a factor that puts the table at its height.
-    pub correct_depth_scale: bool,
+    pub depth_scale: DepthScale,
 }
 
 /// The table that determined the pose of a workspace.
@@ -250,7 +250,7 @@ impl Default for Workspace {
             find_objects: None,
             gravity: None,
             extent: None,
-            correct_depth_scale: false,
+            depth_scale: DepthScale::default(),
         }
     }
 }

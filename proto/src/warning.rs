@@ -25,6 +25,11 @@ impl From<&Warning> for pb::GeometryWarning {
                 (Code::CameraAngle, Some(view), &[("angle_degrees", degrees(angle))])
             }
             Warning::DepthScale { view } => (Code::DepthScale, Some(view), &[]),
+            Warning::DepthsCorrected { view, factor, height, expected } => (
+                Code::DepthsCorrected,
+                Some(view),
+                &[("factor", factor), ("height_m", height), ("expected_height_m", expected)],
+            ),
             Warning::ObjectsLeftOut { left_out, objects, .. } => {
                 (Code::ObjectsLeftOut, None, &[("left_out", left_out as f64), ("objects", objects as f64)])
             }

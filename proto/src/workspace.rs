@@ -1,5 +1,5 @@
 use grasp::RequestError;
-use grasp_perception::{FoundTable, Tabletop, Workspace};
+use grasp_perception::{DepthScale, FoundTable, Tabletop, Workspace};
 use nalgebra::Isometry3;
 
 use crate::options::direction;
@@ -63,7 +63,12 @@ impl TryFrom<pb::Workspace> for Workspace {
         if find_table && pose.is_some() {
             return Err(RequestError::invalid("workspace.pose", "given", "must be absent with workspace.find_table"));
         }
-        if find_table && correct_depth_scale {
+        let depth_scale = match correct_depth_scale {
+            Some(true) => DepthScale::Correct,
+            None if !find_table => DepthScale::Auto,
+            None | Some(false) => DepthScale::Keep,
+        };
+        if find_table && depth_scale == DepthScale::Correct {
             let needed = "must be false with workspace.find_table, which takes the table where the depths show it";
             return Err(RequestError::invalid("workspace.correct_depth_scale", true, needed));
         }
@@ -71,7 +76,7 @@ impl TryFrom<pb::Workspace> for Workspace {
         let gravity = gravity.map(|gravity| direction(Some(gravity), "workspace.gravity")).transpose()?;
         let size = Some(size).filter(|size| *size > 0.0);
         let extent = extent.map(checked_extent).transpose()?;
-        Ok(Self { frame_from_task, size, find_table, find_objects: None, gravity, extent, correct_depth_scale })
+        Ok(Self { frame_from_task, size, find_table, find_objects: None, gravity, extent, depth_scale })
     }
 }
 

@@ -9,6 +9,7 @@ use grasp_client::{
     Observation, Options, Proposal, Workspace,
 };
 use grasp_proto::pb;
+use grasp_proto::pb::geometry_warning::Code as WarningCode;
 use grasp_tests::scene::{BLOCK, CAMERA, TABLE, camera, depth, view};
 use grasp_tests::{RESOLUTION, Server, TestModel, graspd, no_collision_check};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
@@ -234,18 +235,28 @@ async fn the_scale_of_depths_is_corrected_by_the_table() {
     };
     let good = cameras.map(|camera| view(&camera));
     let wrong: Vec<_> = cameras.iter().zip(factors).map(|(camera, factor)| scaled(camera, factor)).collect();
-    let corrected = Workspace { correct_depth_scale: true, ..Workspace::default() };
+    let corrected = Workspace { correct_depth_scale: Some(true), ..Workspace::default() };
+    let kept = Workspace { correct_depth_scale: Some(false), ..Workspace::default() };
     let detect = async |views: &[DepthView], workspace: &Workspace| {
         client.detect_from_depth(views, workspace, low()).await.unwrap()
     };
     let expected = detect(&good, &Workspace::default()).await;
-    assert_eq!(expected.depth_factors, [0.0; 0], "not asked for");
+    assert_eq!(expected.depth_factors, [1.0, 1.0], "nothing to correct");
     let codes = |warnings: &[pb::GeometryWarning]| warnings.iter().map(|warning| warning.code()).collect::<Vec<_>>();
-    let uncorrected = detect(&wrong, &Workspace::default()).await;
+    let uncorrected = detect(&wrong, &kept).await;
+    assert_eq!(uncorrected.depth_factors, [0.0; 0]);
     assert!(!codes(&uncorrected.warnings).is_empty(), "the views disagree");
 
     let found = detect(&wrong, &corrected).await;
     assert_eq!(codes(&found.warnings), []);
+    let by_default = detect(&wrong, &Workspace::default()).await;
+    assert_eq!((&by_default.depth_factors, &by_default.grasps), (&found.depth_factors, &found.grasps));
+    let told = codes(&by_default.warnings);
+    assert!(
+        !told.is_empty() && told.iter().all(|code| *code == WarningCode::DepthsCorrected),
+        "{:?}",
+        by_default.warnings
+    );
     let is_close =
         |found: &[f64]| found.len() == 2 && found.iter().zip(factors).all(|(a, b)| (a - f64::from(b)).abs() < 2e-3);
     assert!(is_close(&found.depth_factors), "{:?}", found.depth_factors);
@@ -272,17 +283,29 @@ async fn the_scale_of_depths_is_corrected_by_the_table() {
     let found = tracking.add(&wrong, low()).await.unwrap();
     assert!(is_close(&found.depth_factors), "{:?}", found.depth_factors);
 
-    // Without a table at about its height the depths stay as they are, with a warning.
-    let low = Workspace { pose: Isometry3::translation(0.0, 0.0, -0.1), ..corrected };
-    let hand_eye = |view: &DepthView, camera: &Isometry3<f64>| DepthView {
-        extrinsics: Extrinsics::FrameFromCamera(camera.inverse()),
+    // By default a table that is 4 cm or 3° off is an error of a pose, and nothing is corrected. Neither are clouds.
+    let hand_eye = |view: &DepthView, frame_from_camera: Isometry3<f64>| DepthView {
+        extrinsics: Extrinsics::FrameFromCamera(frame_from_camera),
         ..view.clone()
     };
-    let found = detect(&[hand_eye(&good[0], &cameras[0])], &low).await;
+    let from_camera = cameras[0].inverse();
+    let lowered = Isometry3::translation(0.0, 0.0, -0.04) * from_camera;
+    let turned = Isometry3::rotation(Vector3::x() * 0.06) * from_camera;
+    for (pose, code) in [(lowered, WarningCode::TableHeight), (turned, WarningCode::TableTilted)] {
+        let found = detect(&[hand_eye(&good[0], pose)], &Workspace::default()).await;
+        assert_eq!(found.depth_factors, [1.0]);
+        assert!(codes(&found.warnings).contains(&code), "{:?}", found.warnings);
+    }
+    let found = client.detect_from_cloud(&clouds, &Workspace::default(), low()).await.unwrap();
+    assert_eq!(found.depth_factors, [0.0; 0]);
+
+    // Without a table at about its height the depths stay as they are, with a warning.
+    let low = Workspace { pose: Isometry3::translation(0.0, 0.0, -0.1), ..corrected };
+    let found = detect(&[hand_eye(&good[0], from_camera)], &low).await;
     assert_eq!(found.depth_factors, [1.0]);
-    assert!(codes(&found.warnings).contains(&pb::geometry_warning::Code::DepthScale), "{:?}", found.warnings);
+    assert!(codes(&found.warnings).contains(&WarningCode::DepthScale), "{:?}", found.warnings);
     let both = Workspace { find_table: Some(FindTable::default()), ..corrected };
-    let hand_eye = [hand_eye(&good[0], &cameras[0])];
+    let hand_eye = [hand_eye(&good[0], from_camera)];
     let (code, message) =
         refusal(client.detect_from_depth(&hand_eye, &both, with_options(DetectOptions::default())).await);
     assert!(code == Code::InvalidArgument && message.starts_with("workspace.correct_depth_scale is true"), "{message}");
@@ -584,7 +607,7 @@ async fn wrong_geometry_is_reported_as_a_warning_and_counted() {
     let tilted = DepthView { extrinsics: Extrinsics::CameraFromTask(tilted), ..view(&camera) };
     let detection = client.detect_from_depth(std::slice::from_ref(&tilted), &workspace, low()).await.unwrap();
     let [warning] = &detection.warnings[..] else { panic!("{:?}", detection.warnings) };
-    assert_eq!(warning.code(), pb::geometry_warning::Code::TableTilted);
+    assert_eq!(warning.code(), WarningCode::TableTilted);
     assert!(warning.message.starts_with("the table is tilted by 11."), "{}", warning.message);
     assert!((warning.figures["tilt_degrees"] - 0.2_f64.to_degrees()).abs() < 1.0, "{warning:?}");
 
@@ -596,7 +619,7 @@ async fn wrong_geometry_is_reported_as_a_warning_and_counted() {
     };
     let detection = client.detect(&volume, with_options(lower)).await.unwrap();
     let [warning] = &detection.warnings[..] else { panic!("{:?}", detection.warnings) };
-    assert_eq!(warning.code(), pb::geometry_warning::Code::TableHeight);
+    assert_eq!(warning.code(), WarningCode::TableHeight);
     assert!((warning.figures["height_m"] - TABLE).abs() < 0.005 && warning.figures["expected_height_m"] == 0.02);
     let none = DetectOptions {
         collision: Some(pb::CollisionCheck { mode: Some(0), table_height: Some(-1.0), ..Default::default() }),
@@ -610,7 +633,7 @@ async fn wrong_geometry_is_reported_as_a_warning_and_counted() {
     let moved = DepthView { extrinsics: Extrinsics::CameraFromTask(higher), ..view(&camera) };
     let detection = track.add(&[moved], low()).await.unwrap();
     let codes: Vec<_> = detection.warnings.iter().map(pb::GeometryWarning::code).collect();
-    assert!(codes.contains(&pb::geometry_warning::Code::ViewsDisagree), "{codes:?}");
+    assert!(codes.contains(&WarningCode::ViewsDisagree), "{codes:?}");
 
     let counted = |code: &str| server.metric(&format!("graspd_warnings_total{{code=\"{code}\",model=\"mirror 1\"}}"));
     assert_eq!(["TABLE_TILTED", "VIEWS_DISAGREE", "NO_TABLE"].map(counted), [1.0, 1.0, 0.0]);

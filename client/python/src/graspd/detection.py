@@ -162,7 +162,7 @@ class Detection:
     table: FoundTable | None = None
     """The table that was found, if the workspace has `find_table`."""
     depth_factors: tuple[float, ...] = ()
-    """Factors by which the depths of the views were multiplied, if the workspace has `correct_depth_scale`."""
+    """Factors by which the depths of the views were multiplied (`Workspace.correct_depth_scale`)."""
 
     def __len__(self) -> int:
         return len(self.grasps)
@@ -217,7 +217,7 @@ class Scores:
     table: FoundTable | None
     """The table that was found, if the workspace has `find_table`."""
     depth_factors: tuple[float, ...]
-    """Factors by which the depths of the views were multiplied, if the workspace has `correct_depth_scale`."""
+    """Factors by which the depths of the views were multiplied (`Workspace.correct_depth_scale`)."""
 
     def __len__(self) -> int:
         return len(self.scores)

@@ -143,7 +143,7 @@ class Workspace:
     extent: tuple[float, float] | None = None
     """Lengths along x and y of a larger workspace, metres, at most 2. The server covers it with overlapping cubes. None:
     one cube, or with `find_table` as many as the objects need."""
-    correct_depth_scale: bool = False
-    """Multiply the depths of each view by one factor, so that the table in it is at `CollisionCheck.table_height`: for
-    cameras whose pose is known and whose depth has an error of scale. The factors are in `Detection.depth_factors`. Not
-    with `find_table`."""
+    correct_depth_scale: bool | None = None
+    """Multiply the depths of each view by one factor, so that the table in it is at `CollisionCheck.table_height`. None: in
+    depth images whose table is level and at most 3 cm from its height. True is an error with `find_table`. The factors are
+    in `Detection.depth_factors`."""

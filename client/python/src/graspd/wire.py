@@ -141,7 +141,7 @@ def table_request(
         view=None if isinstance(view, CloudView) else depth_message(view),
         cloud=cloud_message(view) if isinstance(view, CloudView) else None,
         # The server refuses both with a search.
-        workspace=workspace_message(replace(workspace, pose=None, correct_depth_scale=False)),
+        workspace=workspace_message(replace(workspace, pose=None, correct_depth_scale=None)),
         table_height=table_height,
     )
 

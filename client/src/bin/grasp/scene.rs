@@ -98,10 +98,17 @@ pub(crate) struct SceneArgs {
     #[arg(long, value_name = "FILE|NUMBERS", allow_hyphen_values = true)]
     workspace: Option<Poses>,
 
-    /// Multiply the depths of each image or point cloud by one factor, so that the table is at its height: for cameras
-    /// whose pose is known and whose depth has an error of scale.
-    #[arg(long, conflicts_with = "find_table")]
-    correct_depth_scale: bool,
+    /// Multiply the depths of each image or point cloud by one factor, so that the table is at its height; `=false`: of none.
+    /// Default: of depth images whose table is level and at most 3 cm from its height.
+    #[arg(
+        long,
+        value_name = "BOOL",
+        num_args = 0..=1,
+        require_equals = true,
+        default_missing_value = "true",
+        conflicts_with = "find_table"
+    )]
+    correct_depth_scale: Option<bool>,
 
     /// Name of the frame of the grasps.
     #[arg(long, default_value = "", hide_default_value = true)]
@@ -143,7 +150,7 @@ impl SceneArgs {
             return Ok(Scene::Clouds(self.clouds()?, workspace));
         }
         ensure!(
-            find_table.is_none() && !correct_depth_scale,
+            find_table.is_none() && correct_depth_scale.is_none(),
             "--find-table and --correct-depth-scale need depth images (--intrinsics) or point clouds (--camera-position)"
         );
         let [file] = &self.files[..] else {
