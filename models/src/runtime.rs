@@ -9,6 +9,7 @@ mod loading;
 mod model_file;
 mod network;
 mod reference_check;
+mod search;
 
 pub use backend::{Backend, BackendError, Choice, NameError, Precision, Provider};
 pub use batch_session::batch_sizes;

@@ -18,8 +18,8 @@ use crate::transport::request_body::Limits;
 use crate::transport::tls::Tls;
 use crate::transport::tokens::Tokens;
 use errors::ConfigErrors;
-use flags::Flags;
 pub(crate) use flags::LogFormat;
+use flags::{Flags, own_models};
 
 /// The validated configuration.
 pub(crate) struct Config {
@@ -95,10 +95,17 @@ impl Config {
             let needed = format_args!("is `{}`: must be at most --queue, {}", flags.max_batch, flags.queue);
             errors.add::<Flags>("max_batch", needed);
         }
-        let fingerprints = fingerprints(&flags.models);
-        let store = Store::open_limited(&flags.models, flags.max_model_bytes);
+        let Some(models) = flags.models.clone().or_else(own_models) else {
+            errors.add::<Flags>(
+                "models",
+                "is missing, and no models come with this program: give a folder of .onnx files",
+            );
+            return Err(errors);
+        };
+        let fingerprints = fingerprints(&models);
+        let store = Store::open_limited(&models, flags.max_model_bytes);
         let store = store.inspect_err(|error| {
-            errors.add::<Flags>("models", format_args!("is `{}`: {error}", flags.models.display()));
+            errors.add::<Flags>("models", format_args!("is `{}`: {error}", models.display()));
         });
         // clap requires the certificate and the key to be given together.
         let tls = flags.tls_cert.as_ref().zip(flags.tls_key.as_ref()).map(|(cert, key)| {

@@ -10,8 +10,8 @@ use crate::MetadataError;
 pub enum RuntimeError {
     /// The shared library cannot be loaded or is too old.
     #[error(
-        "ONNX Runtime (at least 1.{}): {reason}; download it with `python3 deploy/native.py onnxruntime` and \
-         set ORT_DYLIB_PATH to the printed path",
+        "ONNX Runtime (at least 1.{}): {reason}; install it with `pip install onnxruntime-openvino` \
+         or `python3 deploy/native.py onnxruntime`, or set ORT_DYLIB_PATH to its library",
         ort::MINOR_VERSION
     )]
     Library {

@@ -1,6 +1,5 @@
 //! ONNX Runtime's shared library.
 
-use std::env::consts::{DLL_PREFIX, DLL_SUFFIX};
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
@@ -8,18 +7,19 @@ use ort::LoadDynamicError;
 use ort::environment::Environment;
 use ort::logging::LogLevel;
 
-use super::RuntimeError;
+use super::{RuntimeError, search};
 
 /// The loaded ONNX Runtime.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RuntimeInfo {
-    /// Path of the shared library, as configured.
+    /// Path of the shared library.
     pub library: PathBuf,
     /// Version, such as `1.24.1`.
     pub version: String,
 }
 
-/// Loads ONNX Runtime once: the library that `ORT_DYLIB_PATH` names, or else the system's library.
+/// Loads ONNX Runtime once: the library that `ORT_DYLIB_PATH` names; or that of the Python environment in which the program
+/// is installed; or the one that `deploy/native.py` has downloaded; or that of the system.
 ///
 /// Disables telemetry, which official builds enable. ONNX Runtime logs to `tracing`.
 ///
@@ -41,8 +41,7 @@ pub(super) fn runtime() -> Result<&'static Runtime, RuntimeError> {
 }
 
 fn load_library() -> Result<Runtime, RuntimeError> {
-    let library = std::env::var_os("ORT_DYLIB_PATH").filter(|path| !path.is_empty());
-    let library = library.map_or_else(|| PathBuf::from(format!("{DLL_PREFIX}onnxruntime{DLL_SUFFIX}")), PathBuf::from);
+    let library = search::library();
     let library_error = |error: &dyn std::fmt::Display| RuntimeError::Library { reason: error.to_string() };
     let builder = ort::init_from(&library).map_err(|error| library_error(&with_reason(&error)))?;
     let environment =

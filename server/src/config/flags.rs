@@ -16,18 +16,19 @@ use crate::transport::tokens::Tokens;
 
 /// Detects 6-DoF grasps in depth images, point clouds and TSDF volumes, over gRPC.
 ///
-/// Each flag can also be set by an environment variable. ORT_DYLIB_PATH is the path of ONNX Runtime's shared library.
+/// Each flag can also be set by an environment variable. ORT_DYLIB_PATH is the path of ONNX Runtime's shared library;
+/// without it graspd takes that of its Python environment, the downloaded one, or that of the system.
 #[derive(Parser)]
 #[command(name = "graspd", version, max_term_width = 100, allow_negative_numbers = true)]
 pub(super) struct Flags {
-    /// Model folder. All .onnx files in it are served.
+    /// Model folder. All .onnx files in it are served. Default: the models that come with graspd.
     #[arg(
         long,
         env = "GRASPD_MODELS",
         value_name = "DIR",
         value_parser = PathBufValueParser::new().try_map(model_folder),
     )]
-    pub models: PathBuf,
+    pub models: Option<PathBuf>,
 
     /// Maximum size of a model file, bytes. Larger files, and files that are not regular, are not opened.
     #[arg(long, env = "GRASPD_MAX_MODEL_BYTES", value_name = "N", default_value_t = MAX_MODEL_BYTES)]
@@ -276,6 +277,15 @@ pub(crate) enum LogFormat {
 }
 
 /// A folder that can be read. Its files are read after the other flags.
+/// The models that come with graspd: in the prefix in which it is installed, or in the checkout from which it was built.
+pub(super) fn own_models() -> Option<PathBuf> {
+    let program = std::env::current_exe().ok().and_then(|program| program.canonicalize().ok());
+    let installed =
+        program.as_deref().and_then(|program| Some(program.parent()?.parent()?.join("share/graspd/models")));
+    let of_checkout = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo"));
+    [installed, of_checkout.canonicalize().ok()].into_iter().flatten().find(|folder| folder.is_dir())
+}
+
 fn model_folder(folder: PathBuf) -> Result<PathBuf, StoreError> {
     match fs::read_dir(&folder) {
         Ok(_) => Ok(folder),

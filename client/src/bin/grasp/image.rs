@@ -1,5 +1,5 @@
 use std::fs::File;
-use std::io::BufReader;
+use std::io::{BufRead, BufReader, Seek};
 use std::path::Path;
 
 use anyhow::{Context, bail, ensure};
@@ -145,7 +145,12 @@ fn exr(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
 }
 
 fn png(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
-    let mut reader = png::Decoder::new(BufReader::new(File::open(path)?)).read_info().context("not a PNG file")?;
+    decode_png(BufReader::new(File::open(path)?))
+}
+
+/// The depth image of a PNG file, with its width and height.
+pub(crate) fn decode_png(file: impl BufRead + Seek) -> anyhow::Result<(Depth, u32, u32)> {
+    let mut reader = png::Decoder::new(file).read_info().context("not a PNG file")?;
     let png::Info { width, height, bit_depth, color_type, .. } = *reader.info();
     ensure!(
         (color_type, bit_depth) == (png::ColorType::Grayscale, png::BitDepth::Sixteen),

@@ -2,6 +2,7 @@
 
 mod camera;
 mod cloud;
+mod demo;
 mod detect_args;
 mod distortion;
 mod document;
@@ -40,6 +41,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 use tonic::Code;
 
+use crate::demo::Demo;
 use crate::detect_args::DetectArgs;
 use crate::pose::Poses;
 use crate::replay::Replay;
@@ -117,6 +119,8 @@ struct AccessArgs {
 
 #[derive(Subcommand)]
 enum Command {
+    /// Detect grasps in a depth image that comes with the program. Starts a server for it if none runs.
+    Demo(Demo),
     /// Detect grasps in a volume, depth images or point clouds.
     Detect(Detect),
     /// Detect grasps again whenever an input file changes.
@@ -275,6 +279,7 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
         show::print(&if json { show::detection_json(detection) } else { show::detection(detection) })
     };
     match command {
+        Command::Demo(demo) => demo.run(server, access.read()?, json).await?,
         Command::Detect(Detect { scene: args, detect, csv, moveit, isaac }) => {
             // Files are read first, so that an invalid file is reported without a server.
             let (scene, detect) = (args.read()?, detect.read()?);
