@@ -1,0 +1,62 @@
+"""Tracking: while the parameter `track` is set, each image is added to a volume that the server keeps."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import graspd
+from graspd_msgs.msg import Options, Workspace
+
+from graspd_ros import parameters
+from graspd_ros.detector import Detector, Query, message
+from graspd_ros.images import Images
+from graspd_ros.refusal import Refusal
+from graspd_ros.results import Results
+
+PAUSE = 1.0
+"""After a failure, seconds; also the period in which `track` is read while it is not set."""
+
+
+class Tracker:
+    def __init__(
+        self, client: graspd.aio.Client, detector: Detector, images: Images, results: Results,
+        values: Callable[[], dict[str, Any]], report: Callable[[str], None],
+    ) -> None:
+        self._client = client
+        self._detector = detector
+        self._images = images
+        self._results = results
+        self._values = values
+        self._report = report
+        self._failure = ""
+
+    async def run(self) -> None:
+        while True:
+            if self._values()["track"]:
+                try:
+                    await self._track()
+                except Refusal as refusal:
+                    # Once, not every second.
+                    if refusal.message != self._failure:
+                        self._report(f"tracking: {refusal}")
+                    self._failure = refusal.message
+            await asyncio.sleep(PAUSE)
+
+    async def _track(self) -> None:
+        """Until `track` is no longer set. Images that arrive while the server computes are left out."""
+        query = self._query()
+        seen = await self._images.next(query.values["image_timeout"])
+        workspace = await self._detector.workspace(query, seen)
+        async with self._client.track(workspace, half_life=parameters.number(query.values, "half_life")) as tracking:
+            while query.values["track"]:
+                view = await self._detector.view(query, seen)
+                found = await self._detector.answer(tracking.add(view, query.options, stamp=seen.stamp))
+                self._results.publish(message(query, seen, found), query.options)
+                self._failure = ""
+                seen = await self._images.next(query.values["image_timeout"])
+                query = self._query()
+
+    def _query(self) -> Query:
+        return Query("", Workspace(), Options(), self._values())

@@ -1,0 +1,614 @@
+"""Tests ros2/graspd_ros: the node as a process, with rclpy and Fast DDS on this machine, against graspd. `make test-ros2` runs
+them; tests/ros2/run.py, which builds the packages, has the command for a single test.
+"""
+
+import array
+import json
+import math
+import os
+import signal
+import subprocess
+import tempfile
+import threading
+import time
+import unittest
+from pathlib import Path
+
+import numpy as np
+
+# Before rclpy reads them: apart from other programs, and only on this machine.
+os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+import graspd
+import rclpy
+import yaml
+from action_msgs.msg import GoalStatus
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Pose, PoseArray, Quaternion, Transform, TransformStamped, Vector3
+from graspd_msgs import action, msg, srv
+from graspd_ros import camera, markers, messages, moveit
+from graspd_ros.refusal import Refusal
+from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
+from rclpy.action import ActionClient
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
+from server import Server
+from std_msgs.msg import Header
+from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import Marker, MarkerArray
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+OPTICAL = "camera_depth_optical_frame"
+PERIOD = 0.1
+# Far more than anything takes: only a lost message runs into it.
+LIMIT = 60
+
+
+class Scene:
+    """A simulated table, seen by one camera."""
+
+    def __init__(self):
+        with tempfile.TemporaryDirectory() as folder:
+            label = [os.environ["GRASP_SIM"], "label", "--scenes", "1", "--points", "5", "--format", "raw"]
+            subprocess.run([*label, "--views", "circle", "--noise", "0", "--out", folder], check=True, stdout=subprocess.DEVNULL)
+            seen = np.load(Path(folder, "scenes/s00000000.npz"))
+            setup = json.loads(Path(folder, "setup.json").read_text())
+            self.depth = np.rint(seen["depth_imgs"][0] * 1000).astype(np.uint16)
+            *turn, x, y, z = seen["extrinsics"][0].tolist()
+        self.k = np.reshape(setup["intrinsic"]["K"], (3, 3))
+        self.corner = graspd.Pose((0.3, -0.05, -0.03)).matrix()  # T_base_task
+        self.camera = self.corner @ np.linalg.inv(graspd.Pose((x, y, z), tuple(turn)).matrix())  # T_base_camera
+        v, u = np.indices(self.depth.shape)
+        rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(self.k).T
+        self.points = (rays * (self.depth / 1000)[..., None]).astype(np.float32)
+        height = (np.linalg.inv(self.corner) @ self.camera @ np.append(self.points, np.ones((*self.depth.shape, 1)), axis=-1)[..., None])
+        self.labels = np.where(height[..., 2, 0] > 0.06, 7, 0).astype(np.uint16)
+
+    def view(self, pose, **fields):
+        return graspd.DepthView(self.depth, self.k, frame_from_camera=pose, **fields)
+
+
+class Robot(rclpy.node.Node):
+    """The camera, the joints, and what calls the node."""
+
+    def __init__(self, scene):
+        super().__init__("robot")
+        self.scene = scene
+        self.stamps = set()
+        self._topics = {}
+        self.depth_message = image(scene.depth, "16UC1")
+        self.info = camera_info(scene.k, scene.depth.shape)
+        self.cloud = cloud(scene.points)
+        self.labels = image(scene.labels, "16UC1")
+        self.on("/tf_static", TFMessage, LATCHED).publish(
+            TFMessage(transforms=[
+                transform("flange", OPTICAL, FLANGE_FROM_CAMERA, Time()),
+                transform("base", "workspace", scene.corner, Time()),
+            ])
+        )
+        self.create_timer(PERIOD, self._see)
+
+    def on(self, topic, kind, qos=qos_profile_sensor_data):
+        if topic not in self._topics:
+            self._topics[topic] = self.create_publisher(kind, topic, qos)
+        return self._topics[topic]
+
+    def _see(self):
+        now = self.get_clock().now()
+        stamp = now.to_msg()
+        self.stamps.add((stamp.sec, stamp.nanosec))
+        # The arm moves. At the time of the image it is in the middle between two messages.
+        for share in (-1, 1):
+            flange = self.scene.camera @ np.linalg.inv(FLANGE_FROM_CAMERA) @ step(share)
+            at = (now + rclpy.duration.Duration(seconds=share * PERIOD / 4)).to_msg()
+            self.on("/tf", TFMessage, QoSProfile(depth=10)).publish(TFMessage(transforms=[transform("base", "flange", flange, at)]))
+        header = Header(stamp=stamp, frame_id=OPTICAL)
+        for topic, message in [
+            ("/camera/depth", self.depth_message),
+            ("/camera/info", self.info),
+            ("/camera/points", self.cloud),
+            ("/camera/labels", self.labels),
+        ]:
+            message.header = header
+            self.on(topic, type(message)).publish(message)
+        rgb = Image(header=header, width=2, height=1, step=6, encoding="rgb8", data=[0] * 6)
+        self.on("/camera/color", Image).publish(rgb)
+
+
+FLANGE_FROM_CAMERA = graspd.Pose((0.05, 0.0, 0.08), (0.0, 0.0, math.sin(0.4), math.cos(0.4))).matrix()
+
+
+def step(share):
+    """The motion of the arm, forwards or backwards."""
+    return graspd.Pose((0.0, 0.0, 0.0), (0.0, 0.0, math.sin(0.01 * share), math.cos(0.01 * share))).matrix()
+
+
+def transform(parent, child, matrix, stamp):
+    pose = graspd.Pose.from_matrix(matrix)
+    moved = Transform(
+        translation=Vector3(**dict(zip("xyz", pose.position))), rotation=Quaternion(**dict(zip("xyzw", pose.quaternion)))
+    )
+    return TransformStamped(header=Header(frame_id=parent, stamp=stamp), child_frame_id=child, transform=moved)
+
+
+def image(pixels, encoding):
+    height, width = pixels.shape
+    data = array.array("B", pixels.tobytes())
+    return Image(width=width, height=height, step=width * pixels.itemsize, encoding=encoding, data=data)
+
+
+def camera_info(k, shape):
+    p = np.hstack([k, np.zeros((3, 1))])
+    return CameraInfo(width=shape[1], height=shape[0], k=k.ravel().tolist(), p=p.ravel().tolist())
+
+
+def cloud(points):
+    """With a colour behind each point, as from RealSense."""
+    height, width, _ = points.shape
+    fields = [PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1) for i, name in enumerate(["x", "y", "z", "rgb"])]
+    data = np.append(points, np.zeros((height, width, 1), np.float32), axis=-1)
+    return PointCloud2(
+        width=width, height=height, fields=fields, point_step=16, row_step=16 * width, data=array.array("B", data.tobytes())
+    )
+
+
+class GraspNode:
+    """The node as a process. `topics` remaps, `parameters` are those of the command line."""
+
+    def __init__(self, name, address, topics=None, **parameters):
+        self.name = name
+        topics = topics or {"depth/image": "/camera/depth", "depth/camera_info": "/camera/info"}
+        topics = {**topics, "points": "/camera/points", "labels": "/camera/labels"}
+        remaps = [f"{name}:={topic}" for name, topic in {"__node": name, **topics}.items()]
+        values = [f"{key.replace('__', '.')}:={json.dumps(value)}" for key, value in {"address": address, **parameters}.items()]
+        [program] = [
+            path for prefix in os.environ["AMENT_PREFIX_PATH"].split(":")
+            if (path := Path(prefix, "lib/graspd_ros/graspd_node")).exists()
+        ]
+        arguments = [word for flag, words in [("-r", remaps), ("-p", values)] for each in words for word in (flag, each)]
+        self.log = tempfile.TemporaryFile("w+")
+        self.process = subprocess.Popen([program, "--ros-args", *arguments], stderr=self.log, stdout=self.log)
+        self.action = ActionClient(ROBOT, action.DetectGrasps, f"/{name}/detect_grasps")
+        self.service = ROBOT.create_client(srv.DetectGrasps, f"/{name}/detect_grasps")
+        while not (self.action.wait_for_server(1.0) and self.service.wait_for_service(1.0)):
+            if self.process.poll() is not None:
+                raise AssertionError(f"{name} does not start: {self.printed()}")
+
+    def printed(self):
+        self.log.seek(0)
+        return self.log.read()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.terminate()
+        self.process.wait()
+        self.log.close()
+        self.action.destroy()
+        ROBOT.destroy_client(self.service)
+
+    def send(self, feedback=None, **fields):
+        """The handle of an accepted goal."""
+        told = (lambda message: feedback(message.feedback.stage)) if feedback else None
+        handle = wait(self.action.send_goal_async(action.DetectGrasps.Goal(**fields), told))
+        assert handle.accepted
+        return handle
+
+    def detect(self, **fields):
+        """Status and result of a goal."""
+        return ended(self.send(**fields))
+
+    def call(self, **fields):
+        return wait(self.service.call_async(srv.DetectGrasps.Request(**fields)))
+
+    def set(self, name, value):
+        client = ROBOT.create_client(SetParameters, f"/{self.name}/set_parameters")
+        client.wait_for_service(LIMIT)
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+        [answer] = wait(client.call_async(request)).results
+        ROBOT.destroy_client(client)
+        return answer
+
+
+def ended(handle):
+    answer = wait(handle.get_result_async())
+    return answer.status, answer.result
+
+
+def wait(future):
+    done = threading.Event()
+    future.add_done_callback(lambda _: done.set())
+    if not done.wait(LIMIT):
+        raise AssertionError("no answer")
+    return future.result()
+
+
+class Listener:
+    """Collects the messages of a topic."""
+
+    def __init__(self, kind, topic, qos=LATCHED):
+        self.messages = []
+        self._changed = threading.Condition()
+        self._subscription = ROBOT.create_subscription(kind, topic, self._add, qos)
+
+    def _add(self, message):
+        with self._changed:
+            self.messages.append(message)
+            self._changed.notify_all()
+
+    def first(self, condition=lambda message: True):
+        """The first message for which the condition holds."""
+        with self._changed:
+            found = self._changed.wait_for(lambda: [each for each in self.messages if condition(each)], LIMIT)
+        if not found:
+            raise AssertionError("no such message")
+        return found[0]
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        ROBOT.destroy_subscription(self._subscription)
+
+
+def setUpModule():
+    global SCENE, SERVER, CLIENT, ROBOT, NODE
+    SCENE = Scene()
+    SERVER = unittest.enterModuleContext(Server(log=subprocess.DEVNULL))
+    CLIENT = unittest.enterModuleContext(graspd.Client(SERVER.grpc))
+    rclpy.init()
+    unittest.addModuleCleanup(rclpy.try_shutdown)
+    ROBOT = Robot(SCENE)
+    executor = MultiThreadedExecutor(4)
+    executor.add_node(ROBOT)
+    spinning = threading.Thread(target=executor.spin)
+    spinning.start()
+    unittest.addModuleCleanup(spinning.join)
+    unittest.addModuleCleanup(executor.shutdown)
+    NODE = unittest.enterModuleContext(GraspNode("graspd", SERVER.grpc))
+
+
+def low(**fields):
+    return msg.Options(threshold=[0.5], **fields)
+
+
+LOW = graspd.Options(threshold=0.5)
+
+
+class RosTest(unittest.TestCase):
+    def assert_same_grasps(self, detection, expected):
+        self.assertGreater(len(expected.grasps), 0)
+        self.assertEqual(len(detection.grasps), len(expected.grasps))
+        for own, other in zip(detection.grasps, expected.grasps):
+            for name in ["pose", "pregrasp", "retreat"]:
+                own_pose, other_pose = messages.pose(getattr(own, name)), getattr(other, name)
+                np.testing.assert_allclose(own_pose.position, other_pose.position, atol=2e-3)
+                self.assertGreater(abs(np.dot(own_pose.quaternion, other_pose.quaternion)), 0.999)
+            self.assertAlmostEqual(own.quality, other.quality, delta=0.02)
+            self.assertAlmostEqual(own.width, other.width, delta=2e-3)
+
+    def assert_of_an_image(self, header, frame):
+        self.assertEqual(header.frame_id, frame)
+        self.assertIn((header.stamp.sec, header.stamp.nanosec), ROBOT.stamps)
+
+    def assert_error(self, answer, error, *words):
+        self.assertEqual(answer.error, error, answer.message)
+        for word in words:
+            self.assertIn(word, answer.message)
+        self.assertEqual(len(answer.detection.grasps), 0)
+
+
+class DetectTest(RosTest):
+    def test_an_action_finds_the_table_and_grasps_in_the_frame_of_the_image(self):
+        stages = []
+        status, result = ended(NODE.send(stages.append, options=low()))
+        self.assertEqual((status, result.error), (GoalStatus.STATUS_SUCCEEDED, ""), result.message)
+        feedback = action.DetectGrasps.Feedback
+        self.assertEqual(stages, [feedback.WAITING_FOR_IMAGE, feedback.LOOKING_UP_TRANSFORM, feedback.DETECTING])
+        found = result.detection
+        self.assert_of_an_image(found.header, OPTICAL)
+        expected = CLIENT.detect_from_depth(SCENE.view(np.eye(4)), graspd.Workspace(find_table=True), LOW)
+        self.assert_same_grasps(found, expected)
+        self.assertEqual((found.model, found.version), (expected.model, expected.version))
+        self.assertTrue(found.latency.total > found.latency.inference > 0)
+        [table] = found.table
+        self.assertAlmostEqual(table.distance, expected.table.distance, places=3)
+        self.assertEqual(table.objects, expected.table.objects)
+
+    def test_the_service_uses_the_pose_of_a_moving_camera(self):
+        answer = NODE.call(frame_id="base", workspace=msg.Workspace(frame_id="workspace"), options=low(max_grasps=5))
+        self.assertEqual(answer.error, "", answer.message)
+        self.assert_of_an_image(answer.detection.header, "base")
+        options = graspd.Options(threshold=0.5, max_grasps=5)
+        expected = CLIENT.detect_from_depth(SCENE.view(SCENE.camera), graspd.Workspace(SCENE.corner), options)
+        self.assert_same_grasps(answer.detection, expected)
+        self.assertFalse(answer.detection.table)
+        # The corner as a pose, and the table found in the frame of the robot.
+        corner = messages.pose_message(graspd.Pose.from_matrix(SCENE.corner))
+        answer = NODE.call(frame_id="base", workspace=msg.Workspace(pose=[corner]), options=low(max_grasps=5))
+        self.assert_same_grasps(answer.detection, expected)
+        answer = NODE.call(frame_id="base", options=low())
+        expected = CLIENT.detect_from_depth(SCENE.view(SCENE.camera), graspd.Workspace(find_table=True), LOW)
+        self.assert_same_grasps(answer.detection, expected)
+
+    def test_results_are_published_also_for_subscribers_that_come_later(self):
+        answer = NODE.call(options=low())
+        with (
+            Listener(msg.Detection, "/graspd/detection") as detections,
+            Listener(PoseArray, "/graspd/grasps") as poses,
+            Listener(MarkerArray, "/graspd/markers") as drawn,
+        ):
+            self.assertEqual(str(detections.first()), str(answer.detection))  # NaN is not equal to itself
+            self.assertEqual(poses.first().header, answer.detection.header)
+            self.assertEqual(list(poses.first().poses), [grasp.pose for grasp in answer.detection.grasps])
+            hands, best, table = drawn.first().markers
+        self.assertEqual({marker.header.frame_id for marker in (hands, best, table)}, {OPTICAL})
+        self.assertEqual((len(hands.points), len(hands.colors)), (8 * len(answer.detection.grasps),) * 2)
+        self.assertEqual(best.points[1], answer.detection.grasps[0].pose.position)
+        self.assertEqual((len(table.points), table.action), (5, Marker.ADD))
+        # The second point is a fingertip.
+        first = answer.detection.grasps[0]
+        tip = messages.pose(first.pose).matrix() @ [0, -first.width / 2, 0.05, 1]
+        np.testing.assert_allclose([hands.points[1].x, hands.points[1].y, hands.points[1].z], tip[:3], atol=1e-9)
+
+    def test_options_of_the_request_replace_parameters(self):
+        with GraspNode("careful", SERVER.grpc, threshold=0.5, max_grasps=3, convention__origin="tcp") as node:
+            three, one = node.call().detection, node.call(options=msg.Options(max_grasps=1)).detection
+            self.assertEqual((len(three.grasps), len(one.grasps)), (3, 1))
+            expected = CLIENT.detect_from_depth(
+                SCENE.view(np.eye(4)), graspd.Workspace(find_table=True),
+                graspd.Options(threshold=0.5, max_grasps=3, convention=graspd.Convention("tcp")),
+            )
+            self.assert_same_grasps(three, expected)
+            # Hands are drawn where they are in any convention.
+            with Listener(MarkerArray, "/careful/markers") as drawn:
+                hands = drawn.first(lambda array: len(array.markers[0].points) == 8).markers[0]
+            tips = [np.array([hands.points[i].x, hands.points[i].y, hands.points[i].z]) for i in (1, 3)]
+            np.testing.assert_allclose(np.mean(tips, axis=0), expected.grasps[0].pose.position, atol=2e-3)
+
+    def test_a_point_cloud_and_labels(self):
+        with GraspNode("cloud", SERVER.grpc, input="points", labels=True) as node:
+            workspace = msg.Workspace(frame_id="workspace")
+            answer = node.call(frame_id="base", workspace=workspace, options=low(objects=[7]))
+            self.assertEqual(answer.error, "", answer.message)
+            self.assert_of_an_image(answer.detection.header, "base")
+            view = graspd.CloudView(SCENE.points, (0, 0, 0), frame_from_cloud=SCENE.camera, labels=SCENE.labels)
+            options = graspd.Options(threshold=0.5, objects=[7])
+            self.assert_same_grasps(answer.detection, CLIENT.detect_from_cloud(view, graspd.Workspace(SCENE.corner), options))
+            self.assertEqual({grasp.object for grasp in answer.detection.grasps}, {7})
+            other = node.call(frame_id="base", workspace=workspace, options=low(objects=[8]))
+            self.assert_error(other, "INVALID_ARGUMENT", "objects")
+
+    def test_a_depth_image_with_labels(self):
+        with GraspNode("labelled", SERVER.grpc, labels=True) as node:
+            answer = node.call(frame_id="base", workspace=msg.Workspace(frame_id="workspace"), options=low(objects=[7]))
+            self.assertEqual((answer.error, {grasp.object for grasp in answer.detection.grasps}), ("", {7}), answer.message)
+
+
+class ErrorsTest(RosTest):
+    def test_invalid_requests(self):
+        for fields, error, words in [
+            ({"options": msg.Options(threshold=[2.0])}, "INVALID_ARGUMENT", ["options.threshold", "2"]),
+            ({"options": msg.Options(model="missing")}, "NOT_FOUND", ["missing", "vgn-packed"]),
+            ({"options": msg.Options(priority="soon")}, "INVALID_ARGUMENT", ["priority", "soon"]),
+            ({"frame_id": "moon"}, "NO_TRANSFORM", ["'moon'", "base", OPTICAL]),
+            ({"workspace": msg.Workspace(correct_depth_scale=[True])}, "INVALID_ARGUMENT", ["correct_depth_scale"]),
+        ]:
+            with self.subTest(error=error, words=words):
+                self.assert_error(NODE.call(**fields), error, *words)
+                status, result = NODE.detect(**fields)
+                self.assertEqual(status, GoalStatus.STATUS_ABORTED)
+                self.assert_error(result, error, *words)
+
+    def test_topics_that_are_silent_or_wrong(self):
+        for depth, info, error, words in [
+            ("/nothing", "/camera/info", "NO_IMAGE", ["no image on /nothing", "no publisher"]),
+            ("/silent", "/camera/info", "NO_IMAGE", ["no image on /silent", "1 publishers"]),
+            ("/camera/depth", "/nothing", "NO_IMAGE", ["no CameraInfo on /nothing", "no publisher"]),
+            ("/camera/color", "/camera/info", "INVALID_IMAGE", ["/camera/color", "'rgb8'", "16UC1"]),
+        ]:
+            with self.subTest(depth=depth, info=info):
+                ROBOT.on("/silent", Image)
+                topics = {"depth/image": depth, "depth/camera_info": info}
+                with GraspNode("wrong", SERVER.grpc, topics, image_timeout=0.5) as node:
+                    self.assert_error(node.call(), error, *words)
+
+    def test_parameters_are_described_and_checked(self):
+        names = wait_for(ListParameters, "/graspd/list_parameters", ListParameters.Request()).result.names
+        own = [name for name in names if not name.startswith(("qos_overrides", "use_sim_time", "start_type"))]
+        self.assertIn("collision.clearance", own)
+        described = wait_for(DescribeParameters, "/graspd/describe_parameters", DescribeParameters.Request(names=own))
+        self.assertEqual([each.name for each in described.descriptors if not each.description], [])
+        for name, value, reason in [
+            ("region", [0.0, 1.0], "region is [0.0, 1.0], must be numbers, 6: min x, y, z"),
+            ("threshold", "high", "threshold is 'high', must be a number"),
+            ("convention.origin", "elbow", "'elbow'"),
+            ("workspace.correct_depth_scale", "maybe", "auto, on, off"),
+            ("address", "localhost:1", "read-only"),
+        ]:
+            with self.subTest(name=name):
+                answer = NODE.set(name, value)
+                self.assertFalse(answer.successful)
+                self.assertIn(reason, answer.reason)
+        for value in (1, 0.5, math.nan):  # also whole numbers
+            self.assertTrue(NODE.set("threshold", value).successful)
+
+
+def wait_for(kind, name, request):
+    client = ROBOT.create_client(kind, name)
+    client.wait_for_service(LIMIT)
+    answer = wait(client.call_async(request))
+    ROBOT.destroy_client(client)
+    return answer
+
+
+class EndTest(RosTest):
+    """Every goal ends with a result or an error."""
+
+    def test_cancellation_while_the_node_waits_for_an_image(self):
+        topics = {"depth/image": "/nothing", "depth/camera_info": "/camera/info"}
+        with GraspNode("waiting", SERVER.grpc, topics, image_timeout=1000.0) as node:
+            handle = node.send()
+            self.assertEqual(len(wait(handle.cancel_goal_async()).goals_canceling), 1)
+            status, result = ended(handle)
+            self.assertEqual(status, GoalStatus.STATUS_CANCELED)
+            self.assert_error(result, "CANCELLED")
+
+    def test_cancellation_while_the_server_works(self):
+        with Server(log=subprocess.DEVNULL) as server, GraspNode("working", server.grpc) as node:
+            # Not before graspd and the channel to it work.
+            self.assertEqual(node.call(options=low()).error, "")
+            server.process.send_signal(signal.SIGSTOP)
+            try:
+                detecting = threading.Event()
+                handle = node.send(lambda stage: stage == action.DetectGrasps.Feedback.DETECTING and detecting.set())
+                self.assertTrue(detecting.wait(LIMIT))
+                wait(handle.cancel_goal_async())
+                self.assertEqual(ended(handle)[0], GoalStatus.STATUS_CANCELED)
+            finally:
+                server.process.send_signal(signal.SIGCONT)
+            status, result = node.detect(options=low())
+            self.assertEqual(status, GoalStatus.STATUS_SUCCEEDED, result.message)
+
+    def test_requests_beyond_the_limit_are_refused_and_none_is_lost_when_the_server_is_killed(self):
+        server = Server(log=subprocess.DEVNULL)
+        with GraspNode("patient", server.grpc, max_goals=4) as node, Listener(DiagnosticArray, "/diagnostics", 10) as diagnostics:
+            self.assertEqual(node.call(options=low()).error, "")
+            server.process.send_signal(signal.SIGSTOP)
+            goals = [node.send() for _ in range(6)]
+            statuses = [status for status, result in map(ended, goals[4:])]
+            self.assertEqual(statuses, [GoalStatus.STATUS_ABORTED] * 2)
+            self.assert_error(node.call(), "RESOURCE_EXHAUSTED", "4 requests", "max_goals")
+            server.process.kill()
+            server.process.communicate()
+            for status, result in map(ended, goals[:4]):
+                self.assertEqual(status, GoalStatus.STATUS_ABORTED)
+                self.assert_error(result, "UNAVAILABLE", server.grpc, "start it")
+            self.assert_error(node.call(), "UNAVAILABLE", server.grpc)
+            is_down = lambda array: state(array, "patient: server") == DiagnosticStatus.ERROR
+            is_up = lambda array: state(array, "patient: server") == DiagnosticStatus.OK
+            diagnostics.first(is_up)
+            diagnostics.first(is_down)
+            diagnostics.messages.clear()
+            with Server(listen=server.grpc, log=subprocess.DEVNULL):
+                status, result = node.detect(options=low())
+                self.assertEqual(status, GoalStatus.STATUS_SUCCEEDED, result.message)
+                diagnostics.first(is_up)
+                requests = diagnostics.first(lambda array: state(array, "patient: requests") == DiagnosticStatus.OK)
+            [counts] = [{each.key: each.value for each in status.values} for status in requests.status if status.name == "patient: requests"]
+            self.assertEqual(counts, {"running": "0", "succeeded": "2", "cancelled": "0", "failed": "8"})
+
+    def test_goals_end_when_the_node_stops(self):
+        topics = {"depth/image": "/nothing", "depth/camera_info": "/camera/info"}
+        with GraspNode("stopping", SERVER.grpc, topics, image_timeout=1000.0) as node:
+            goals = [node.send() for _ in range(3)]
+            results = [goal.get_result_async() for goal in goals]
+            time.sleep(0.5)  # the node has no sign of having received a request for a result
+            node.process.terminate()
+            for answer in map(wait, results):
+                self.assertEqual(answer.status, GoalStatus.STATUS_ABORTED)
+                self.assert_error(answer.result, "SHUTTING_DOWN")
+            self.assertEqual(node.process.wait(LIMIT), 0, node.printed())
+
+
+def state(array, name):
+    return next((status.level for status in array.status if status.name == name), None)
+
+
+class TrackingTest(RosTest):
+    def test_images_are_tracked_while_the_parameter_is_set(self):
+        own = {"frame_id": "base", "workspace__frame_id": "workspace", "threshold": 0.5}
+        with GraspNode("tracking", SERVER.grpc, **own) as node, Listener(msg.Detection, "/tracking/detection") as detections:
+            self.assertTrue(node.set("track", True).successful)
+            detections.first(lambda _: len(detections.messages) >= 3)
+            found = detections.messages[:3]
+            self.assertEqual(len({(each.header.stamp.sec, each.header.stamp.nanosec) for each in found}), 3)
+            for each in found:
+                self.assert_of_an_image(each.header, "base")
+                self.assertGreater(len(each.grasps), 0)
+            self.assertEqual(SERVER.metric("graspd_tracked_volumes"), 1)
+            self.assertTrue(node.set("track", False).successful)
+            end = time.monotonic() + LIMIT
+            while SERVER.metric("graspd_tracked_volumes") and time.monotonic() < end:
+                time.sleep(0.05)
+            self.assertEqual(SERVER.metric("graspd_tracked_volumes"), 0)
+
+
+class ConversionTest(unittest.TestCase):
+    def test_images_of_all_kinds(self):
+        depth = np.array([[500, 600, 700], [800, 900, 1000]])
+        for encoding, kind, big in [("16UC1", "<u2", 0), ("mono16", ">u2", 1), ("32FC1", "<f4", 0), ("32FC1", ">f4", 1)]:
+            with self.subTest(encoding=encoding, big=big):
+                message = image(depth.astype(kind), encoding)
+                message.is_bigendian = big
+                self.assertEqual(camera.depth(message, "/d").tolist(), depth.tolist())
+                # Rows with padding.
+                padded = np.pad(np.frombuffer(message.data, np.uint8).reshape(2, -1), [(0, 0), (0, 5)])
+                message.step, message.data = padded.shape[1], array.array("B", padded.tobytes())
+                self.assertEqual(camera.depth(message, "/d").tolist(), depth.tolist())
+                message.height = 3
+                with self.assertRaisesRegex(Refusal, "/d has .* bytes, must have 3 rows"):
+                    camera.depth(message, "/d")
+
+    def test_intrinsics_of_a_part_of_the_sensor(self):
+        k = np.array([[540.0, 0, 319.5], [0, 541.0, 239.5], [0, 0, 1]])
+        info = camera_info(k, (480, 640))
+        whole, half = Image(width=640, height=480), Image(width=320, height=240)
+        np.testing.assert_array_equal(camera.intrinsics(info, whole, "/i"), k)
+        with self.assertRaisesRegex(Refusal, "640 × 480 pixels, must be of the image, 320 × 240"):
+            camera.intrinsics(info, half, "/i")
+        info.binning_x = info.binning_y = 2
+        np.testing.assert_array_equal(camera.intrinsics(info, half, "/i"), [[270, 0, 159.5], [0, 270.5, 119.5], [0, 0, 1]])
+        info.binning_x = info.binning_y = 1
+        info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height = 100, 50, 320, 240
+        np.testing.assert_array_equal(camera.intrinsics(info, half, "/i"), [[540, 0, 219.5], [0, 541, 189.5], [0, 0, 1]])
+        with self.assertRaisesRegex(Refusal, "not calibrated"):
+            camera.intrinsics(CameraInfo(width=320, height=240), half, "/i")
+
+    def test_moveit_grasps(self):
+        [grasp] = moveit.grasps(
+            msg.Detection(
+                header=Header(frame_id="base"),
+                grasps=[msg.Grasp(quality=0.75, width=0.05, pregrasp=at(0, 0, 0.3), pose=at(0, 0, 0.2), retreat=at(0.3, 0, 0.2))],
+            ),
+            ["left", "right"],
+        )
+        self.assertEqual((grasp.id, grasp.grasp_pose.header.frame_id, grasp.grasp_quality), ("grasp_0", "base", 0.75))
+        approach, retreat = grasp.pre_grasp_approach, grasp.post_grasp_retreat
+        self.assertEqual((approach.direction.vector, retreat.direction.vector), (Vector3(z=-1.0), Vector3(x=1.0)))
+        np.testing.assert_allclose([approach.desired_distance, retreat.desired_distance], [0.1, 0.3], atol=1e-6)
+        self.assertEqual(list(grasp.pre_grasp_posture.points[0].positions), [0.04, 0.04])
+        self.assertEqual(list(grasp.grasp_posture.points[0].positions), [0.025, 0.025])
+
+    def test_a_hand_is_drawn_at_its_fingers_in_each_convention(self):
+        link = graspd.Pose((0.0, 0.0, 0.06)).matrix()
+        turn = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+        for convention, expected in [
+            (None, np.eye(4)),
+            (graspd.Convention("tcp"), graspd.Pose((0, 0, -0.05)).matrix()),
+            (graspd.Convention("parent", parent_from_grasp=graspd.Pose((0.0, 0.0, 0.06))), link),
+            (graspd.Convention(closing_axis="x"), turn),
+        ]:
+            np.testing.assert_allclose(markers.finger_base(convention, 0.05), expected, atol=1e-12)
+
+    def test_rviz_shows_topics_of_the_node(self):
+        share = Path(__file__).resolve().parents[2] / "ros2/graspd_ros"
+        displays = yaml.safe_load((share / "rviz/graspd.rviz").read_text())["Visualization Manager"]["Displays"]
+        published = {name for name, _ in ROBOT.get_publisher_names_and_types_by_node("graspd", "/")}
+        shown = {each["Topic"]["Value"] for each in displays if "Topic" in each}
+        self.assertEqual({topic for topic in shown if topic.startswith("/graspd/")} - published, set())
+
+
+def at(x, y, z):
+    pose = Pose()
+    pose.position.x, pose.position.y, pose.position.z = map(float, (x, y, z))
+    return pose
+
+
+if __name__ == "__main__":
+    unittest.main()
