@@ -328,7 +328,7 @@ class DetectTest(RosTest):
         expected = CLIENT.detect_from_depth(SCENE.view(SCENE.camera), graspd.Workspace(SCENE.corner), options)
         self.assert_same_grasps(answer.detection, expected)
         self.assertFalse(answer.detection.table)
-        # The corner as a pose, and the table found in the frame of the robot.
+        # The corner as a pose, and the table that is found in the frame of the robot.
         corner = messages.pose_message(graspd.Pose.from_matrix(SCENE.corner))
         answer = NODE.call(frame_id="base", workspace=msg.Workspace(pose=[corner]), options=low(max_grasps=5))
         self.assert_same_grasps(answer.detection, expected)
@@ -360,6 +360,11 @@ class DetectTest(RosTest):
         with GraspNode("careful", SERVER.grpc, threshold=0.5, max_grasps=3, convention__origin="tcp") as node:
             three, one = node.call().detection, node.call(options=msg.Options(max_grasps=1)).detection
             self.assertEqual((len(three.grasps), len(one.grasps)), (3, 1))
+            self.assertTrue(NODE.set("frame_id", "base").successful and NODE.set("workspace.frame_id", "workspace").successful)
+            self.addCleanup(NODE.set, "frame_id", "")
+            self.addCleanup(NODE.set, "workspace.frame_id", "")
+            placed, found = NODE.call().detection, NODE.call(workspace=msg.Workspace(find_table=True)).detection
+            self.assertEqual((placed.header.frame_id, len(placed.table), len(found.table)), ("base", 0, 1))
             expected = CLIENT.detect_from_depth(
                 SCENE.view(np.eye(4)), graspd.Workspace(find_table=True),
                 graspd.Options(threshold=0.5, max_grasps=3, convention=graspd.Convention("tcp")),
@@ -502,6 +507,33 @@ class EndTest(RosTest):
                 requests = diagnostics.first(lambda array: state(array, "patient: requests") == DiagnosticStatus.OK)
             [counts] = [{each.key: each.value for each in status.values} for status in requests.status if status.name == "patient: requests"]
             self.assertEqual(counts, {"running": "0", "succeeded": "2", "cancelled": "0", "failed": "8"})
+
+    def test_no_goal_is_lost_while_clients_cancel_and_the_server_restarts(self):
+        server = Server(log=subprocess.DEVNULL)
+        with GraspNode("busy", server.grpc, max_goals=16, image_timeout=60.0) as node:
+            self.assertEqual(node.call(options=low()).error, "")
+            goals, calls = [], []
+            for number in range(24):
+                goals.append(node.send(options=low()))
+                if number % 4 == 0:
+                    calls.append(node.service.call_async(srv.DetectGrasps.Request(options=low())))
+                if number % 3 == 0:
+                    goals[-1].cancel_goal_async()
+                if number == 12:
+                    server.process.kill()
+                    server.process.communicate()
+            outcomes = [(status, result.error) for status, result in map(ended, goals)]
+            answers = [answer.error for answer in map(wait, calls)]
+            with Server(listen=server.grpc, log=subprocess.DEVNULL):
+                outcomes += [(status, result.error) for status, result in [node.detect(options=low())]]
+        self.assertEqual((len(outcomes), len(answers)), (25, 6))
+        self.assertEqual(outcomes[-1], (GoalStatus.STATUS_SUCCEEDED, ""))
+        self.assertIn((GoalStatus.STATUS_ABORTED, "UNAVAILABLE"), outcomes)
+        for status, error in outcomes:
+            self.assertEqual(status == GoalStatus.STATUS_SUCCEEDED, error == "")
+        errors = {"UNAVAILABLE", "RESOURCE_EXHAUSTED"}
+        self.assertLessEqual({error for _, error in outcomes}, errors | {"", "CANCELLED"})
+        self.assertLessEqual(set(answers), errors | {""})
 
     def test_goals_end_when_the_node_stops(self):
         topics = {"depth/image": "/nothing", "depth/camera_info": "/camera/info"}

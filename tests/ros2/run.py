@@ -2,8 +2,8 @@
 
     $(python3 tests/tools.py ros2) tests/ros2/run.py [-k NAME]
 
-Needs GRASPD, GRASP_SIM, GRASPD_MODELS and ORT_DYLIB_PATH; `make test-ros2` sets them. The messages, whose compilation takes
-a minute, are kept in the cache.
+Needs GRASPD, GRASP_SIM and ORT_DYLIB_PATH; `make test-ros2` sets them. The messages, whose compilation takes a minute or two,
+are kept in the cache.
 """
 
 import hashlib
@@ -61,13 +61,16 @@ def main() -> int:
     os.environ.update(environment)
     environment = sourced(messages(), environment)
     with tempfile.TemporaryDirectory() as folder:
-        install, client = Path(folder, "install"), Path(folder, "client")
+        install, client, models = (Path(folder, name) for name in ["install", "client", "models"])
         colcon([ROOT / "ros2/graspd_ros"], install, environment)
         environment = sourced(install, environment)
         pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-build-isolation"]
         subprocess.run([*pip, "--target", client, ROOT / "client/python"], check=True)
         environment["PYTHONPATH"] = os.pathsep.join([str(client), environment["PYTHONPATH"]])
         environment["PYTHONDONTWRITEBYTECODE"] = "1"
+        models.mkdir()
+        (models / "vgn-packed.onnx").symlink_to(ROOT / "models/zoo/vgn-packed.onnx")
+        environment["GRASPD_MODELS"] = str(models)
         command = [sys.executable, "-m", "unittest", "discover", "--verbose", "--start-directory", str(ROOT / "tests/python")]
         return subprocess.run([*command, "--pattern", "test_ros2.py", *sys.argv[1:]], env=environment).returncode
 

@@ -16,6 +16,8 @@ from graspd_ros.refusal import Refusal
 from graspd_ros.transforms import Transforms
 
 STAGE = DetectGrasps.Feedback
+PLACE = {"frame_id", "pose"}
+"""The fields that place the workspace: a request that sets one of them replaces both parameters."""
 
 
 class Query:
@@ -24,7 +26,10 @@ class Query:
     def __init__(self, frame_id: str, workspace: Workspace, options: Options, values: dict[str, Any]) -> None:
         self.values = values
         self.frame_id = frame_id or values["frame_id"]
-        self.workspace = {**parameters.workspace(values), **messages.workspace(workspace)}
+        default, own = parameters.workspace(values), messages.workspace(workspace)
+        if workspace.find_table or own.keys() & PLACE:
+            default = {name: value for name, value in default.items() if name not in PLACE}
+        self.workspace = {**default, **own}
         try:
             self.options = graspd.Options(**{**parameters.options(values), **messages.options(options)})
         except ValueError as error:
@@ -40,7 +45,7 @@ class Detector:
         self._images = images
         self._transforms = transforms
 
-    async def detect(self, query: Query, report: Callable[[str], None]) -> tuple[Detection, graspd.Options]:
+    async def detect(self, query: Query, report: Callable[[str], None]) -> Detection:
         report(STAGE.WAITING_FOR_IMAGE)
         seen = await self._images.next(query.values["image_timeout"], query.values["image_age"])
         report(STAGE.LOOKING_UP_TRANSFORM)
@@ -49,7 +54,7 @@ class Detector:
         report(STAGE.DETECTING)
         call = self._client.detect_from_cloud if seen.is_cloud else self._client.detect_from_depth
         found = await self.answer(call(view, workspace, query.options))
-        return message(query, seen, found), query.options
+        return message(query, seen, found)
 
     async def view(self, query: Query, seen: Seen) -> graspd.DepthView | graspd.CloudView:
         timeout, stamp = query.values["transform_timeout"], seen.stamp
@@ -61,18 +66,15 @@ class Detector:
         return seen.cloud_view(frame_from_cloud, cloud_from_camera[:3, 3])
 
     async def workspace(self, query: Query, seen: Seen) -> graspd.Workspace:
-        """In the frame of the grasps. Without a frame and a pose graspd finds the table."""
-        fields = dict(query.workspace)
+        """In the frame of the grasps. Without a place graspd finds the table."""
         frame = query.frame_id or seen.frame_id
-        own_frame, pose = fields.pop("frame_id", None), fields.pop("pose", None)
-        if own_frame is None and pose is None:
+        fields = {name: value for name, value in query.workspace.items() if name not in PLACE}
+        if not query.workspace.keys() & PLACE:
             return graspd.Workspace(find_table=True, frame_id=frame, **fields)
-        timeout = query.values["transform_timeout"]
-        corner = await self._transforms.lookup(frame, own_frame or frame, seen.stamp, timeout)
-        if pose is not None:
-            corner = corner @ pose.matrix()
-        # Only for searching the table.
-        fields.pop("gravity", None)
+        own_frame, timeout = query.workspace.get("frame_id", frame), query.values["transform_timeout"]
+        pose = query.workspace.get("pose", graspd.Pose())
+        corner = await self._transforms.lookup(frame, own_frame, seen.stamp, timeout) @ pose.matrix()
+        fields.pop("gravity", None)  # only of use for finding the table
         return graspd.Workspace(corner, frame_id=frame, **fields)
 
     async def answer(self, call: Any) -> Any:

@@ -4,28 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import time
-from dataclasses import dataclass, field
 
 import graspd
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from graspd_ros.calls import Counts
 from graspd_ros.images import Images
 
 PERIOD = 1.0
 """Seconds."""
-
-
-@dataclass
-class Counts:
-    """Of requests since the start of the node."""
-
-    running: int = 0
-    succeeded: int = 0
-    cancelled: int = 0
-    failed: int = 0
-    last_error: str = ""
-    failed_last: bool = field(default=False, repr=False)
 
 
 class Diagnostics:
@@ -64,9 +52,9 @@ class Diagnostics:
 
     def _request_status(self) -> DiagnosticStatus:
         counts = self._counts
-        level = DiagnosticStatus.WARN if counts.failed_last else DiagnosticStatus.OK
+        level = DiagnosticStatus.WARN if counts.error else DiagnosticStatus.OK
         numbers = {name: str(getattr(counts, name)) for name in ["running", "succeeded", "cancelled", "failed"]}
-        return self._status("requests", level, counts.last_error if counts.failed_last else "the last one succeeded", **numbers)
+        return self._status("requests", level, counts.error or "no error", **numbers)
 
     def _status(self, name: str, level: bytes, text: str, **values: str) -> DiagnosticStatus:
         return DiagnosticStatus(

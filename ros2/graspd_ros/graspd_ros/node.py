@@ -7,13 +7,11 @@ own, so that a request is cancelled, by its client or at the end, by cancelling 
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import CancelledError, Future, TimeoutError
-from typing import Any
 
 import graspd
 import rclpy
@@ -26,8 +24,9 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from graspd_ros import parameters
-from graspd_ros.detector import Detector, Query
-from graspd_ros.diagnostics import Counts, Diagnostics
+from graspd_ros.calls import Calls
+from graspd_ros.detector import Detector
+from graspd_ros.diagnostics import Diagnostics
 from graspd_ros.images import Images
 from graspd_ros.parameters import Parameters
 from graspd_ros.refusal import Refusal
@@ -37,8 +36,8 @@ from graspd_ros.transforms import Transforms
 
 SPARE_THREADS = 4
 """For images, transforms, cancellation and refusals while all other threads wait for the answers to requests."""
-POLL = 0.02
-"""Between two looks for the cancellation of a goal, seconds."""
+RESULTS_KEPT = 60
+"""How long the results of goals can be requested, seconds."""
 GRACE = 0.2
 """For the transport of the last results, which ROS does not confirm, seconds."""
 
@@ -46,27 +45,26 @@ GRACE = 0.2
 class GraspNode:
     def __init__(self, node: Node) -> None:
         self._logger = node.get_logger()
-        self._parameters = Parameters(node)
-        values = self._parameters.values()
-        self._limit = int(values["max_goals"])
-        self._lock = threading.Lock()
-        self._running: set[Future] = set()
-        self._is_stopping = False
-        self._counts = Counts()
+        settings = Parameters(node)
+        values = settings.values()
+        self.threads = int(values["max_goals"]) + SPARE_THREADS
 
         self._loop = asyncio.new_event_loop()
-        address = values["address"]
-        client = graspd.aio.Client(**parameters.address(values))
+        self._client = graspd.aio.Client(**parameters.connection(values))
         images = Images(node, MutuallyExclusiveCallbackGroup(), self._loop, values["input"], values["labels"])
-        self._results = Results(node)
-        self._detector = Detector(client, address, images, Transforms(node, MutuallyExclusiveCallbackGroup()))
-        tracker = Tracker(client, self._detector, images, self._results, self._parameters.values, self._warn)
-        diagnostics = Diagnostics(node, client, address, images, self._counts)
+        transforms = Transforms(node, MutuallyExclusiveCallbackGroup())
+        detector = Detector(self._client, values["address"], images, transforms)
+        results = Results(node)
+        self._calls = Calls(int(values["max_goals"]), self._loop, detector, results, settings.values, self._logger)
+        tracker = Tracker(self._client, detector, images, results, settings.values, self._logger)
+        diagnostics = Diagnostics(node, self._client, values["address"], images, self._calls.counts)
         self._background = [self._loop.create_task(each.run()) for each in (tracker, diagnostics)]
+        for task in self._background:
+            task.add_done_callback(self._ended)
         self._thread = threading.Thread(target=self._loop.run_forever, name="graspd client")
         self._thread.start()
 
-        # rclpy does not support an action server in several threads; its goals have tasks of their own.
+        # An action server of rclpy must not run in several threads at the same time; its goals are tasks of their own.
         self._action = ActionServer(
             node,
             action.DetectGrasps,
@@ -74,33 +72,33 @@ class GraspNode:
             self._execute,
             callback_group=MutuallyExclusiveCallbackGroup(),
             cancel_callback=lambda _: CancelResponse.ACCEPT,
-            result_timeout=60,
+            result_timeout=RESULTS_KEPT,
         )
         self._service = node.create_service(
             srv.DetectGrasps, "~/detect_grasps", self._serve, callback_group=ReentrantCallbackGroup()
         )
 
-    @property
-    def threads(self) -> int:
-        return self._limit + SPARE_THREADS
-
     def finish(self) -> None:
-        """Ends all requests with an error, and the client."""
-        with self._lock:
-            self._is_stopping = True
-            running = list(self._running)
-        for task in running:
-            task.cancel()
-        while self._running:
-            time.sleep(POLL)
+        """Ends all requests, then the client."""
+        self._calls.finish()
         time.sleep(GRACE)
-        for task in self._background:
-            self._loop.call_soon_threadsafe(task.cancel)
+        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
 
+    async def _close(self) -> None:
+        for task in self._background:
+            task.cancel()
+        await asyncio.gather(*self._background, return_exceptions=True)
+        await self._client.close()
+
+    def _ended(self, task: asyncio.Task) -> None:
+        if not task.cancelled():
+            self._logger.fatal(f"internal error, please report it: {task.exception()!r}")
+            stop()
+
     def _serve(self, request: srv.DetectGrasps.Request, response: srv.DetectGrasps.Response) -> srv.DetectGrasps.Response:
-        self._answer(request, response, lambda stage: None, lambda: False)
+        self._calls.answer(request, response)
         return response
 
     def _execute(self, goal: ServerGoalHandle) -> action.DetectGrasps.Result:
@@ -109,7 +107,7 @@ class GraspNode:
         def report(stage: str) -> None:
             goal.publish_feedback(action.DetectGrasps.Feedback(stage=stage))
 
-        self._answer(goal.request, result, report, lambda: goal.is_cancel_requested)
+        self._calls.answer(goal.request, result, report, lambda: goal.is_cancel_requested)
         if not result.error:
             goal.succeed()
         elif goal.is_cancel_requested:
@@ -118,85 +116,23 @@ class GraspNode:
             goal.abort()
         return result
 
-    def _answer(self, request: Any, answer: Any, report: Callable[[str], None], is_cancelled: Callable[[], bool]) -> None:
-        """Fills the answer, which always has an error or a detection."""
-        try:
-            query = Query(request.frame_id, request.workspace, request.options, self._parameters.values())
-            task = self._start(query, report)
-            try:
-                answer.detection, options = result(task, is_cancelled)
-            finally:
-                self._end(task)
-            self._results.publish(answer.detection, options)
-        except CancelledError:
-            answer.error, answer.message = "CANCELLED", "cancelled by the client"
-            if self._is_stopping:
-                answer.error, answer.message = "SHUTTING_DOWN", "the node is shutting down"
-        except Refusal as refusal:
-            answer.error, answer.message = refusal.error, refusal.message
-        except Exception as error:  # a request never ends without an answer
-            self._logger.error(f"internal error: {error!r}")
-            answer.error, answer.message = "INTERNAL", f"error of the node: {error!r}"
-        self._count(answer)
 
-    def _start(self, query: Query, report: Callable[[str], None]) -> Future:
-        with self._lock:
-            if self._is_stopping:
-                raise Refusal("SHUTTING_DOWN", "the node is shutting down")
-            if len(self._running) >= self._limit:
-                raise Refusal(
-                    "RESOURCE_EXHAUSTED", f"{self._limit} requests are running: wait for one, or raise the parameter max_goals"
-                )
-            task = asyncio.run_coroutine_threadsafe(self._detector.detect(query, report), self._loop)
-            self._running.add(task)
-            self._counts.running = len(self._running)
-        return task
-
-    def _end(self, task: Future) -> None:
-        with self._lock:
-            self._running.discard(task)
-            self._counts.running = len(self._running)
-
-    def _count(self, answer: Any) -> None:
-        with self._lock:
-            counts = self._counts
-            counts.failed_last = answer.error not in ("", "CANCELLED")
-            if counts.failed_last:
-                counts.failed += 1
-                counts.last_error = f"{answer.error}: {answer.message}"
-            elif answer.error:
-                counts.cancelled += 1
-            else:
-                counts.succeeded += 1
-        if answer.error:
-            self._warn(f"{answer.error}: {answer.message}")
-
-    def _warn(self, text: str) -> None:
-        self._logger.warning(text)
-
-
-def result(task: Future, is_cancelled: Callable[[], bool]) -> Any:
-    while True:
-        try:
-            return task.result(POLL)
-        except TimeoutError:
-            if task.done():
-                raise
-            if is_cancelled():
-                task.cancel()
+def stop() -> None:
+    """Ends the node as a signal does."""
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def main() -> None:
-    # Not rclpy's handlers, which end the communication before running goals have their results.
+    # Not rclpy's handlers, which end the communication before running goals have their results. Blocked in all threads,
+    # the signals wait for `sigwait`.
+    signals = {signal.SIGINT, signal.SIGTERM}
+    signal.pthread_sigmask(signal.SIG_BLOCK, signals)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    stopped = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stopped.set())
     node = rclpy.create_node("graspd")
     try:
         grasps = GraspNode(node)
-    except Refusal as refusal:
-        sys.exit(f"graspd_node: {refusal.message}")
+    except (OSError, Refusal) as refusal:
+        sys.exit(f"graspd_node: {refusal}")
     executor = MultiThreadedExecutor(grasps.threads)
     executor.add_node(node)
     failures: list[BaseException] = []
@@ -208,11 +144,11 @@ def main() -> None:
             pass
         except BaseException as failure:
             failures.append(failure)
-        stopped.set()
+            stop()
 
     spinning = threading.Thread(target=spin, name="executor")
     spinning.start()
-    stopped.wait()
+    signal.sigwait(signals)
     grasps.finish()
     executor.shutdown()
     spinning.join()

@@ -113,9 +113,11 @@ class Parameters:
 
 
 def check(values: Mapping[str, Any]) -> None:
-    for name in ["timeout", "image_timeout", "image_age", "transform_timeout", "max_goals"]:
-        if not number(values, name, required=True) >= 0:
+    for name in ["timeout", "image_timeout", "image_age", "transform_timeout", "max_grasps", "max_grasps_per_object"]:
+        if number(values, name, required=True) < 0:
             raise invalid(name, values[name], "at least 0")
+    if number(values, "max_goals", required=True) < 1:
+        raise invalid("max_goals", values["max_goals"], "at least 1")
     choice(values, "input", depth=None, points=None)
     if values["track"] and values["input"] != "depth":
         raise invalid("track", True, "false for points: graspd tracks depth images only")
@@ -127,7 +129,7 @@ def check(values: Mapping[str, Any]) -> None:
         raise Refusal("INVALID_ARGUMENT", str(error)) from None
 
 
-def address(values: Mapping[str, Any]) -> dict[str, Any]:
+def connection(values: Mapping[str, Any]) -> dict[str, Any]:
     """The arguments of `graspd.aio.Client`."""
     token = values["token_file"] and Path(values["token_file"]).expanduser().read_text()
     files = {name: values[name] or None for name in ["tls_ca", "tls_cert", "tls_key"]}
