@@ -2,8 +2,8 @@
 
     $(python3 tests/tools.py ros2) tests/ros2/run.py [-k NAME]
 
-Needs GRASPD, GRASP_SIM and ORT_DYLIB_PATH; `make test-ros2` sets them. The messages, whose compilation takes a minute or two,
-are kept in the cache.
+Needs GRASPD, GRASP_SIM and ORT_DYLIB_PATH; `make test-ros2` sets them. The messages, whose compilation takes a minute or
+two, are kept in the cache.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ import native  # noqa: E402
 
 
 def messages() -> Path:
-    """An install space with graspd_msgs and with the messages that PyPI does not have, built once per state of their sources."""
+    """An install space with graspd_msgs and with the messages that PyPI lacks, built once per state of their sources."""
     folders = [ROOT / "ros2/graspd_msgs", HERE / "interfaces"]
     sources = sorted(path for folder in folders for path in folder.rglob("*") if path.is_file())
     contents = [sys.prefix.encode(), *(part for path in sources for part in (path.name.encode(), path.read_bytes()))]
@@ -39,7 +39,8 @@ def colcon(folders, install: Path, environment) -> None:
         spaces = ["--build-base", build, "--install-base", install, "--merge-install", "--base-paths", *folders]
         command = [sys.executable, "-m", "colcon", "--log-base", f"{build}/log", "build", *spaces]
         command += ["--cmake-args", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={sys.executable}"]
-        output = subprocess.run(list(map(str, command)), env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        output = subprocess.run(list(map(str, command)), env=environment, text=True, **pipes)
     if output.returncode:
         sys.exit(f"colcon failed:\n{output.stdout}")
 
@@ -71,8 +72,9 @@ def main() -> int:
         models.mkdir()
         (models / "vgn-packed.onnx").symlink_to(ROOT / "models/zoo/vgn-packed.onnx")
         environment["GRASPD_MODELS"] = str(models)
-        command = [sys.executable, "-m", "unittest", "discover", "--verbose", "--start-directory", str(ROOT / "tests/python")]
-        return subprocess.run([*command, "--pattern", "test_ros2.py", *sys.argv[1:]], env=environment).returncode
+        command = [sys.executable, "-m", "unittest", "discover", "--verbose", "--pattern", "test_ros2.py"]
+        command += ["--start-directory", str(ROOT / "tests/python"), *sys.argv[1:]]
+        return subprocess.run(command, env=environment).returncode
 
 
 if __name__ == "__main__":

@@ -96,9 +96,8 @@ class Calls:
             if self._is_stopping:
                 raise Refusal(*stopping())
             if len(self._running) >= self._limit:
-                raise Refusal(
-                    "RESOURCE_EXHAUSTED", f"{self._limit} requests are running: wait for one, or raise the parameter max_goals"
-                )
+                text = f"{self._limit} requests are running: wait for one, or raise the parameter max_goals"
+                raise Refusal("RESOURCE_EXHAUSTED", text)
             task = asyncio.run_coroutine_threadsafe(self._detector.detect(query, report), self._loop)
             self._running.add(task)
             self.counts.running = len(self._running)

@@ -14,7 +14,6 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from graspd_ros import camera
@@ -65,7 +64,8 @@ class Seen:
         sizes = [(message.width, message.height) for message in (self.labels, self.message)]
         if sizes[0] != sizes[1]:
             own, needed = (f"{width} × {height} pixels" for width, height in sizes)
-            raise Refusal("INVALID_IMAGE", f"the labels on {self.topics.labels} have {own}, must have {needed}, as the input")
+            text = f"the labels on {self.topics.labels} have {own}, must have {needed}, as the input"
+            raise Refusal("INVALID_IMAGE", text)
         return camera.labels(self.labels, self.topics.labels)
 
 
@@ -81,7 +81,9 @@ class Topics:
 class Images:
     """Subscribes. Its other methods are called in `loop`."""
 
-    def __init__(self, node: Node, group: CallbackGroup, loop: asyncio.AbstractEventLoop, kind: str, labels: bool) -> None:
+    def __init__(
+        self, node: Node, group: CallbackGroup, loop: asyncio.AbstractEventLoop, kind: str, labels: bool
+    ) -> None:
         self._node = node
         self._loop = loop
         self._group = group
@@ -93,14 +95,16 @@ class Images:
         self._messages: dict[int, Image | PointCloud2] = {}
         self._labels: dict[int, Image] = {}
         self._next: asyncio.Future[Seen] | None = None
-        is_depth = kind == "depth"
-        image = self._subscribe(Image, "depth/image", self._add) if is_depth else self._subscribe(PointCloud2, "points", self._add)
-        info = self._subscribe(CameraInfo, "depth/camera_info", self._add_info) if is_depth else None
-        labelling = self._subscribe(Image, "labels", self._add_labels) if labels else None
-        self.topics = Topics(*("" if each is None else each.topic_name for each in (image, info, labelling)))
+        if kind == "depth":
+            input = self._subscribe(Image, "depth/image", self._add)
+            info = self._subscribe(CameraInfo, "depth/camera_info", self._add_info)
+        else:
+            input, info = self._subscribe(PointCloud2, "points", self._add), ""
+        self.topics = Topics(input, info, self._subscribe(Image, "labels", self._add_labels) if labels else "")
 
-    def _subscribe(self, kind: type, topic: str, add: Callable[[Any], None]) -> Subscription:
-        return self._node.create_subscription(
+    def _subscribe(self, kind: type, topic: str, add: Callable[[Any], None]) -> str:
+        """Returns the name of the topic after remapping."""
+        subscription = self._node.create_subscription(
             kind,
             topic,
             lambda message: self._loop.call_soon_threadsafe(add, message),
@@ -108,6 +112,7 @@ class Images:
             callback_group=self._group,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
+        return subscription.topic_name
 
     @property
     def latest(self) -> Seen | None:
@@ -136,8 +141,9 @@ class Images:
 
     def _missing(self, what: str, topic: str) -> str:
         publishers = self._node.count_publishers(topic)
-        cause = f"{publishers} publishers, but no message: check the camera" if publishers else "no publisher: remap the topic"
-        return f"no {what} on {topic} ({cause})"
+        if not publishers:
+            return f"no {what} on {topic} (no publisher: remap the topic, or start the camera)"
+        return f"no {what} on {topic} ({publishers} publishers, but no message: check the camera, and ROS_DOMAIN_ID)"
 
     def _add(self, message: Image | PointCloud2) -> None:
         self.count += 1

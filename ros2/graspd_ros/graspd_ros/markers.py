@@ -56,10 +56,10 @@ def finger_base(convention: graspd.Convention | None, depth: float) -> NDArray[n
 
 
 def best(detection: Detection) -> Marker:
-    ends = [(each.position.x, each.position.y, each.position.z) for grasp in detection.grasps[:1] for each in (grasp.pregrasp, grasp.pose)]
-    found = marker(detection, BEST, Marker.ARROW, placed(np.eye(4), ends), 0.004, color=ColorRGBA(r=0.2, g=0.6, b=1.0, a=1.0))
-    found.scale = Vector3(x=0.004, y=0.012, z=0.0)
-    return found
+    ends = [each.position for grasp in detection.grasps[:1] for each in (grasp.pregrasp, grasp.pose)]
+    arrow = marker(detection, BEST, Marker.ARROW, ends, 0.004, color=ColorRGBA(r=0.2, g=0.6, b=1.0, a=1.0))
+    arrow.scale.y = 0.012  # of its head
+    return arrow
 
 
 def table(detection: Detection) -> Marker:

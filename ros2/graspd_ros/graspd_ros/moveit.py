@@ -1,4 +1,4 @@
-"""`moveit_msgs/Grasp` from detections, for MoveIt's pick and for the task constructor. Needs the package moveit_msgs.
+"""`moveit_msgs/Grasp` from detections. Needs the package moveit_msgs.
 
 MoveIt plans for the link that carries the hand: request grasps with `Convention.PARENT`, and that link's
 `parent_from_grasp`.
