@@ -52,7 +52,7 @@ test-some: ## compile, and run the tests whose names contain NAME: make test-som
 test-ros2: ## test the ROS 2 packages of ros2/ with ROS 2 from PyPI; TEST="-k NAME" selects tests
 	$(with_libtorch) $(CARGO) build --workspace --locked --bins
 	$(with_onnxruntime) GRASPD_ROS2="$$($(PYTHON) tests/tools.py ros2)" && \
-		GRASPD=$(CARGO_TARGET_DIR)/debug/graspd GRASP_SIM=$(CARGO_TARGET_DIR)/debug/grasp-sim \
+		GRASPD="$(CARGO_TARGET_DIR)/debug/graspd" GRASP_SIM="$(CARGO_TARGET_DIR)/debug/grasp-sim" \
 		"$$GRASPD_ROS2" tests/ros2/run.py $(TEST)
 
 test-faults: ## run the test that `test` excludes: ten thousand connections

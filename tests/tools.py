@@ -126,7 +126,7 @@ def ros2() -> Path:
             if built != text:
                 file.write_text(built)
 
-    return interpreter("ros2", sys.executable, "ROS 2 Jazzy", 200, "GRASPD_ROS2", finish)
+    return interpreter("ros2", sys.executable, "ROS 2 Jazzy", 104, "GRASPD_ROS2", finish)
 
 
 def cpp() -> Path:

@@ -174,7 +174,8 @@ class GraspNode:
         topics = topics or {"depth/image": "/camera/depth", "depth/camera_info": "/camera/info"}
         topics = {**topics, "points": "/camera/points", "labels": "/camera/labels"}
         remaps = [f"{name}:={topic}" for name, topic in {"__node": name, **topics}.items()]
-        parameters = {"address": address, **parameters}
+        # Longer than anything takes on a busy machine.
+        parameters = {"address": address, "image_timeout": 20.0, "transform_timeout": 5.0, **parameters}
         values = [f"{key.replace('__', '.')}:={json.dumps(value)}" for key, value in parameters.items()]
         [program] = [
             path for prefix in os.environ["AMENT_PREFIX_PATH"].split(":")
@@ -202,8 +203,7 @@ class GraspNode:
         self.process.terminate()
         self.process.wait()
         self.log.close()
-        self.action.destroy()
-        ROBOT.destroy_client(self.service)
+        # Its clients stay: rclpy does not support their destruction while another thread spins.
 
     def send(self, feedback=None, **fields):
         """The handle of an accepted goal."""
@@ -218,6 +218,12 @@ class GraspNode:
 
     def call(self, **fields):
         return wait(self.service.call_async(srv.DetectGrasps.Request(**fields)))
+
+    def call_with_transforms(self, **fields):
+        """Like `call`. A node that has just started may receive images before the transforms of their time."""
+        while (answer := self.call(**fields)).error == "NO_TRANSFORM":
+            pass
+        return answer
 
     def set(self, name, value):
         client = ROBOT.create_client(SetParameters, f"/{self.name}/set_parameters")
@@ -283,7 +289,7 @@ def setUpModule():
     spinning.start()
     unittest.addModuleCleanup(spinning.join)
     unittest.addModuleCleanup(executor.shutdown)
-    NODE = unittest.enterModuleContext(GraspNode("graspd", SERVER.grpc))
+    NODE = unittest.enterModuleContext(GraspNode("graspd", SERVER.grpc, transform_timeout=0.5))
 
 
 def low(**fields):
@@ -334,7 +340,8 @@ class DetectTest(RosTest):
         self.assertEqual(table.objects, expected.table.objects)
 
     def test_the_service_uses_the_pose_of_a_moving_camera(self):
-        answer = NODE.call(frame_id="base", workspace=msg.Workspace(frame_id="workspace"), options=low(max_grasps=5))
+        workspace = msg.Workspace(frame_id="workspace")
+        answer = NODE.call_with_transforms(frame_id="base", workspace=workspace, options=low(max_grasps=5))
         self.assertEqual(answer.error, "", answer.message)
         self.assert_of_an_image(answer.detection.header, "base")
         options = graspd.Options(threshold=0.5, max_grasps=5)
@@ -350,11 +357,13 @@ class DetectTest(RosTest):
         self.assert_same_grasps(answer.detection, expected)
 
     def test_results_are_published_also_for_subscribers_that_come_later(self):
+        config = yaml.safe_load((ROOT / "ros2/graspd_ros/rviz/graspd.rviz").read_text())
+        displays = {each["Name"]: each for each in config["Visualization Manager"]["Displays"]}
         answer = NODE.call(options=low())
         with (
             Listener(msg.Detection, "/graspd/detection") as detections,
-            Listener(PoseArray, "/graspd/grasps") as poses,
-            Listener(MarkerArray, "/graspd/markers") as drawn,
+            Listener(PoseArray, displays["Grasps"]["Topic"]["Value"]) as poses,
+            Listener(MarkerArray, displays["Hands"]["Topic"]["Value"]) as drawn,
         ):
             self.assertEqual(str(detections.first()), str(answer.detection))  # NaN is not equal to itself
             self.assertEqual(poses.first().header, answer.detection.header)
@@ -394,7 +403,7 @@ class DetectTest(RosTest):
         reliable = {"qos_overrides./camera/points.subscription.reliability": "reliable"}
         with GraspNode("cloud", SERVER.grpc, input="points", labels=True, **reliable) as node:
             workspace = msg.Workspace(frame_id="workspace")
-            answer = node.call(frame_id="base", workspace=workspace, options=low(objects=[7]))
+            answer = node.call_with_transforms(frame_id="base", workspace=workspace, options=low(objects=[7]))
             self.assertEqual(answer.error, "", answer.message)
             self.assert_of_an_image(answer.detection.header, "base")
             view = graspd.CloudView(SCENE.points, (0, 0, 0), frame_from_cloud=SCENE.camera, labels=SCENE.labels)
@@ -407,7 +416,8 @@ class DetectTest(RosTest):
 
     def test_a_depth_image_with_labels(self):
         with GraspNode("labelled", SERVER.grpc, labels=True) as node:
-            answer = node.call(frame_id="base", workspace=msg.Workspace(frame_id="workspace"), options=low(objects=[7]))
+            workspace = msg.Workspace(frame_id="workspace")
+            answer = node.call_with_transforms(frame_id="base", workspace=workspace, options=low(objects=[7]))
             self.assertEqual((answer.error, {grasp.object for grasp in answer.detection.grasps}), ("", {7}), answer.message)
 
 
@@ -441,7 +451,7 @@ class DocumentTest(RosTest):
                 file.flush()
                 written = yaml.safe_load(text)["graspd"]["ros__parameters"]
                 with GraspNode("filed", SERVER.grpc, file=file.name) as node:
-                    self.assertEqual(node.call(options=low()).error, "")
+                    self.assertEqual(node.call_with_transforms(options=low()).error, "")
                     values = wait_for(GetParameters, "/filed/get_parameters", GetParameters.Request(names=list(written))).values
                 for value, expected in zip(map(parameter_value_to_python, values), written.values()):
                     self.assertEqual(list(value) if isinstance(expected, list) else value, expected)
@@ -464,16 +474,20 @@ class ErrorsTest(RosTest):
 
     def test_topics_that_are_silent_or_wrong(self):
         for depth, info, error, words in [
-            ("/nothing", "/camera/info", "NO_IMAGE", ["no image on /nothing", "no publisher"]),
-            ("/silent", "/camera/info", "NO_IMAGE", ["no image on /silent", "1 publishers"]),
-            ("/camera/depth", "/nothing", "NO_IMAGE", ["no CameraInfo on /nothing", "no publisher"]),
+            ("/nothing", "/camera/info", "NO_IMAGE", ["no image on /nothing", "publishers: 0"]),
+            ("/silent", "/camera/info", "NO_IMAGE", ["no image on /silent", "publishers: 1"]),
+            ("/camera/depth", "/nothing", "NO_IMAGE", ["no CameraInfo on /nothing", "publishers: 0"]),
             ("/camera/color", "/camera/info", "INVALID_IMAGE", ["/camera/color", "'rgb8'", "16UC1"]),
         ]:
             with self.subTest(depth=depth, info=info):
+                end = time.monotonic() + LIMIT
                 ROBOT.on("/silent", Image)
                 topics = {"depth/image": depth, "depth/camera_info": info}
                 with GraspNode("wrong", SERVER.grpc, topics, image_timeout=0.5) as node:
-                    self.assert_error(node.call(), error, *words)
+                    # The topics that are not silent need a moment after the start of the node.
+                    answers = iter(node.call, None)
+                    first = next(answer for answer in answers if words[0] in answer.message or time.monotonic() > end)
+                    self.assert_error(first, error, *words)
 
     def test_parameters_are_described_and_checked(self):
         names = wait_for(ListParameters, "/graspd/list_parameters", ListParameters.Request()).result.names
@@ -485,15 +499,16 @@ class ErrorsTest(RosTest):
             ("region", [0.0, 1.0], "region is [0.0, 1.0], must be numbers, 6: min x, y, z"),
             ("threshold", "high", "threshold is 'high', must be a number"),
             ("convention.origin", "elbow", "'elbow'"),
-            ("workspace.correct_depth_scale", "maybe", "auto, on, off"),
+            ("workspace.correct_depth_scale", "maybe", "auto, always, never"),
             ("address", "localhost:1", "read-only"),
         ]:
             with self.subTest(name=name):
                 answer = NODE.set(name, value)
                 self.assertFalse(answer.successful)
                 self.assertIn(reason, answer.reason)
-        for value in (1, 0.5, math.nan):  # also whole numbers
-            self.assertTrue(NODE.set("threshold", value).successful)
+        # YAML reads 1.0 as a whole number if it is written as 1, and off as false.
+        for name, value in [("threshold", 1), ("threshold", math.nan), ("collision.mode", False), ("collision.mode", "")]:
+            self.assertTrue(NODE.set(name, value).successful)
 
 
 def wait_for(kind, name, request):
@@ -589,7 +604,7 @@ class EndTest(RosTest):
         with GraspNode("stopping", SERVER.grpc, topics, image_timeout=1000.0) as node:
             goals = [node.send() for _ in range(3)]
             results = [goal.get_result_async() for goal in goals]
-            time.sleep(0.5)  # the node has no sign of having received a request for a result
+            node.send()  # after its acceptance, the node has the requests for the results
             node.process.terminate()
             for answer in map(wait, results):
                 self.assertEqual(answer.status, GoalStatus.STATUS_ABORTED)
@@ -677,13 +692,6 @@ class ConversionTest(unittest.TestCase):
             (graspd.Convention(closing_axis="x"), turn),
         ]:
             np.testing.assert_allclose(markers.finger_base(convention, 0.05), expected, atol=1e-12)
-
-    def test_rviz_shows_topics_of_the_node(self):
-        config = yaml.safe_load((ROOT / "ros2/graspd_ros/rviz/graspd.rviz").read_text())
-        displays = config["Visualization Manager"]["Displays"]
-        published = {name for name, _ in ROBOT.get_publisher_names_and_types_by_node("graspd", "/")}
-        shown = {each["Topic"]["Value"] for each in displays if "Topic" in each}
-        self.assertEqual({topic for topic in shown if topic.startswith("/graspd/")} - published, set())
 
 
 def at(x, y, z):

@@ -95,16 +95,16 @@ class Images:
         self._messages: dict[int, Image | PointCloud2] = {}
         self._labels: dict[int, Image] = {}
         self._next: asyncio.Future[Seen] | None = None
-        if kind == "depth":
-            input = self._subscribe(Image, "depth/image", self._add)
-            info = self._subscribe(CameraInfo, "depth/camera_info", self._add_info)
-        else:
-            input, info = self._subscribe(PointCloud2, "points", self._add), ""
-        self.topics = Topics(input, info, self._subscribe(Image, "labels", self._add_labels) if labels else "")
+        is_depth = kind == "depth"
+        self.topics = Topics(
+            input=self._subscribe(*((Image, "depth/image") if is_depth else (PointCloud2, "points")), self._add),
+            info=self._subscribe(CameraInfo, "depth/camera_info", self._add_info) if is_depth else "",
+            labels=self._subscribe(Image, "labels", self._add_labels) if labels else "",
+        )
 
     def _subscribe(self, kind: type, topic: str, add: Callable[[Any], None]) -> str:
         """Returns the name of the topic after remapping."""
-        subscription = self._node.create_subscription(
+        self._node.create_subscription(
             kind,
             topic,
             lambda message: self._loop.call_soon_threadsafe(add, message),
@@ -112,11 +112,7 @@ class Images:
             callback_group=self._group,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
-        return subscription.topic_name
-
-    @property
-    def latest(self) -> Seen | None:
-        return self._latest
+        return self._node.resolve_topic_name(topic)
 
     async def next(self, timeout: float, age: float = 0.0) -> Seen:
         """The next image, or one that arrived up to `age` seconds ago."""
@@ -141,9 +137,8 @@ class Images:
 
     def _missing(self, what: str, topic: str) -> str:
         publishers = self._node.count_publishers(topic)
-        if not publishers:
-            return f"no {what} on {topic} (no publisher: remap the topic, or start the camera)"
-        return f"no {what} on {topic} ({publishers} publishers, but no message: check the camera, and ROS_DOMAIN_ID)"
+        hint = "check the camera and the network" if publishers else "start the camera, or remap the topic"
+        return f"no {what} on {topic} (publishers: {publishers}; {hint})"
 
     def _add(self, message: Image | PointCloud2) -> None:
         self.count += 1

@@ -53,7 +53,7 @@ WORKSPACE = [
     Declaration("workspace.size", NOT_SET, "Edge of the cube, metres; only for planners without a network"),
     Declaration("workspace.extent", [NOT_SET], "Lengths along x and y of a larger workspace, metres"),
     Declaration("workspace.gravity", [NOT_SET], "To find the table: direction of gravity in the frame of the grasps"),
-    Declaration("workspace.correct_depth_scale", "auto", "Correct the depths by the height of the table: auto, on or off"),
+    Declaration("workspace.correct_depth_scale", "auto", "Correct the depths by the table: auto, always or never"),
 ]
 OPTIONS = [
     Declaration("model", "", "Name of the model; empty: the server's default"),
@@ -95,7 +95,9 @@ class Parameters:
             # With a dynamic type, a number may be written as 1 instead of 1.0. `number` and `numbers` check it.
             is_number = isinstance(default, (int, float, list)) and not isinstance(default, bool)
             descriptor = ParameterDescriptor(
-                description=description, dynamic_typing=is_number, read_only=any(name == fixed.name for fixed in FIXED)
+                description=description,
+                dynamic_typing=is_number or name == "collision.mode",
+                read_only=any(name == fixed.name for fixed in FIXED),
             )
             node.declare_parameter(name, default, descriptor)
         check(self.values())
@@ -145,7 +147,7 @@ def workspace(values: Mapping[str, Any]) -> dict[str, Any]:
         size=number(values, "workspace.size"),
         extent=None if extent is None else tuple(extent),
         gravity=numbers(values, "workspace.gravity", "3: x, y, z"),
-        correct_depth_scale=choice(values, "workspace.correct_depth_scale", auto=None, on=True, off=False),
+        correct_depth_scale=choice(values, "workspace.correct_depth_scale", auto=None, always=True, never=False),
     )
 
 
@@ -170,7 +172,8 @@ def options(values: Mapping[str, Any]) -> dict[str, Any]:
         retreat=retreat(values),
         gripper=gripper(values),
         collision=graspd.CollisionCheck(
-            values["collision.mode"] or None,
+            # YAML reads `off` as false.
+            "off" if values["collision.mode"] is False else values["collision.mode"] or None,
             number(values, "collision.table_height"),
             number(values, "collision.clearance"),
             values["collision.hidden"],
