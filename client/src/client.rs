@@ -94,7 +94,7 @@ impl Client {
                 .connect()
                 .await
         };
-        let channel = connect().await.map_err(|source| Error::Connect { address, source })?;
+        let channel = connect().await.map_err(|error| Error::connect(address, &error))?;
         Ok(Self { channel, bearer: Bearer(access.token), retry: access.retry, timeout: access.timeout })
     }
 

@@ -10,12 +10,12 @@ use tonic_types::StatusExt;
 #[derive(Debug, Error)]
 pub enum Error {
     /// The server cannot be reached.
-    #[error("cannot connect to graspd at {address}: {}; check the address and that graspd runs there", root(source))]
+    #[error("cannot connect to graspd at {address}: {reason}")]
     Connect {
         /// The address as given.
         address: String,
-        /// The transport's error.
-        source: tonic::transport::Error,
+        /// What happened, and what to check.
+        reason: String,
     },
     /// The server was not ready in time.
     #[error("graspd at {address} was not ready within {timeout:?}: {last}")]
@@ -101,8 +101,33 @@ impl Error {
     }
 }
 
+impl Error {
+    pub(crate) fn connect(address: String, error: &tonic::transport::Error) -> Self {
+        let error = root(error).to_string();
+        let known = CONNECTION_ERRORS.iter().find(|(part, _)| error.contains(part));
+        let advice = known.map_or("check the address and that graspd runs there", |(_, advice)| advice);
+        Self::Connect { address, reason: format!("{error}; {advice}") }
+    }
+}
+
+/// Parts of the transport's errors, and what to do.
+const CONNECTION_ERRORS: [(&str, &str); 4] = [
+    ("InvalidContentType", "the server does not use TLS: give an address without https://, and no CA or certificate"),
+    (
+        "CaUsedAsEndEntity",
+        "its certificate is that of a CA, which no server may use: make one that a CA signed, as in docs/operations.md",
+    ),
+    ("UnknownIssuer", "its certificate is signed by an unknown CA: give the file of that CA (tls_ca)"),
+    ("NotValidForName", "its certificate is for another name: use that name in the address, or another certificate"),
+];
+
+/// Messages of calls to something that is not gRPC, by the transport.
+const NOT_GRPC: [&str; 2] = ["transport error", "h2 protocol error: http2 error"];
+
 impl From<Status> for Error {
     fn from(status: Status) -> Self {
+        // The server's statuses have no source.
+        let is_not_grpc = std::error::Error::source(&status).is_some() && NOT_GRPC.contains(&status.message());
         let milliseconds = status.metadata().get("grpc-retry-pushback-ms");
         let milliseconds = milliseconds.and_then(|value| value.to_str().ok()?.parse().ok());
         let violation =
@@ -110,7 +135,14 @@ impl From<Status> for Error {
         let request_id = status.get_details_request_info().map(|info| info.request_id);
         Self::Refused {
             code: status.code(),
-            message: status.message().to_owned(),
+            message: if is_not_grpc {
+                format!(
+                    "{}; if no call succeeds, the address may be the port for HTTP, or need https:// and a CA",
+                    std::error::Error::source(&status).map_or_else(String::new, |source| root(source).to_string())
+                )
+            } else {
+                status.message().to_owned()
+            },
             retry_after: milliseconds.map(Duration::from_millis),
             field: violation.map(|violation| violation.field),
             request_id: request_id.filter(|id| !id.is_empty()),

@@ -179,7 +179,8 @@ fn infer(network: &mut NetworkPlanner, defaults: DecodeParams, jobs: Vec<Job>, m
                     caught(|| {
                         let is_wanted = || !reply.is_closed() && !has_passed(deadline);
                         let decode = params.decode_params(defaults, scene.region);
-                        Ok(output.decode(index, &scene.volume, &decode, &is_wanted)?)
+                        let params = PlanParams { decode, table: params.table };
+                        Ok(output.decode(index, &scene, &params, &is_wanted)?)
                     })
                 });
                 let detection = || Ok(Detection::new(decoded?, scene.volume, &params));

@@ -5,13 +5,20 @@ use grasp::{DecodeParams, Decoded, FINGER_DEPTH, Grasp, Patch, Selection, Volume
 use grasp_models::{Classifier, LoadError, Metadata, Options, RuntimeError};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
-use crate::PlanError;
+use crate::{HandFit, PlanError, PlanParams};
+use grasp_perception::Scene;
 
 /// Smallest quality of a network's grasp that is evaluated.
 const PROPOSAL_THRESHOLD: f32 = 0.2;
 
 /// Largest number of a network's grasps that are evaluated.
 const PROPOSALS: usize = 32;
+
+/// Quality from which a grasp makes further proposals needless.
+const SURE: f32 = 0.9;
+
+/// Largest number of proposals where the hand fits around the surface.
+const FITTED: usize = 96;
 
 /// Number of the best of them that are moved.
 const REFINED: usize = 6;
@@ -63,17 +70,39 @@ impl Evaluator {
     pub fn refine(
         &mut self,
         proposals: Decoded,
-        volume: &Volume,
-        params: &DecodeParams,
+        scene: &Scene,
+        params: &PlanParams,
         is_wanted: &dyn Fn() -> bool,
     ) -> Result<Decoded, PlanError> {
         let Decoded { mut grasps, mut dropped } = proposals;
         dropped.suppressed += grasps.len().saturating_sub(PROPOSALS);
         grasps.truncate(PROPOSALS);
-        let depth = depth(params);
-        self.evaluate(&mut grasps, volume, depth)?;
-        sort(&mut grasps);
-        let selection = Selection::new(volume, params);
+        let selection = Selection::new(&scene.volume, &params.decode);
+        self.search(&mut grasps, &selection, scene, params, is_wanted)?;
+        let is_sure = |grasp: &Grasp| grasp.quality >= SURE && selection.accepts(&grasp.pose);
+        if !grasps.iter().any(is_sure) {
+            let mut fitted = HandFit::of(scene, params, is_wanted)?.spread(FITTED, scene.volume.pose());
+            self.search(&mut fitted, &selection, scene, params, is_wanted)?;
+            grasps.extend(fitted);
+            sort(&mut grasps);
+        }
+        let mut decoded = selection.select(&grasps, &params.decode);
+        decoded.dropped += dropped;
+        Ok(decoded)
+    }
+
+    /// Scores grasps, moves the best ones, and sorts all by quality.
+    fn search(
+        &mut self,
+        grasps: &mut [Grasp],
+        selection: &Selection<'_>,
+        scene: &Scene,
+        params: &PlanParams,
+        is_wanted: &dyn Fn() -> bool,
+    ) -> Result<(), PlanError> {
+        let (volume, depth) = (&scene.volume, depth(&params.decode));
+        self.evaluate(grasps, volume, depth)?;
+        sort(grasps);
         let mut moving: Vec<usize> = (0..REFINED.min(grasps.len())).collect();
         for _ in 0..MOVES {
             if !is_wanted() {
@@ -94,10 +123,8 @@ impl Evaluator {
             better.iter().for_each(|&(index, grasp)| grasps[index] = grasp);
             moving = better.into_iter().map(|(index, _)| index).collect();
         }
-        sort(&mut grasps);
-        let mut decoded = selection.select(&grasps, params);
-        decoded.dropped += dropped;
-        Ok(decoded)
+        sort(grasps);
+        Ok(())
     }
 
     /// The predicted probabilities of success of grasps at `poses`.

@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use grasp::gpd::{Candidate, Cloud, Params, by_sample, is_on_an_object};
 use grasp::{DecodeParams, Decoded, Fusion, Grasp, Hand, Selection, SurfacePoint};
 use grasp_perception::Scene;
+use nalgebra::Isometry3;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
@@ -69,6 +70,12 @@ impl HandFit {
             candidates.extend(of_sample);
         }
         Ok(Self { cloud, candidates, other_points, misfits })
+    }
+
+    /// At most `count` of the candidates as grasps in the frame of a volume at `pose`, from all over the cloud.
+    pub(crate) fn spread(&self, count: usize, pose: &Isometry3<f64>) -> Vec<Grasp> {
+        let of_cloud = self.candidates.iter().step_by(self.candidates.len().div_ceil(count).max(1));
+        of_cloud.map(|c| Grasp { pose: pose * c.pose, width: c.width, quality: 0.0 }).collect()
     }
 
     /// The grasps that pass the parameters, in the frame of the volume's pose. `grasps` are in the task frame, best

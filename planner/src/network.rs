@@ -65,7 +65,7 @@ impl Inference<'_> {
         self.evaluation
     }
 
-    /// The grasps in `volume`, which is the one at `index` of the batch. The evaluator stops when `is_wanted` returns
+    /// The grasps in `scene`, whose volume is the one at `index` of the batch. The evaluator stops when `is_wanted` returns
     /// false.
     ///
     /// # Errors
@@ -73,17 +73,18 @@ impl Inference<'_> {
     pub fn decode(
         &mut self,
         index: usize,
-        volume: &Volume,
-        params: &DecodeParams,
+        scene: &Scene,
+        params: &PlanParams,
         is_wanted: &dyn Fn() -> bool,
     ) -> Result<Decoded, PlanError> {
+        let volume = &scene.volume;
         let maps = self.output.maps(index);
         Ok(match &mut self.evaluator {
-            None => decode(volume, &maps, params)?,
+            None => decode(volume, &maps, &params.decode)?,
             Some(evaluator) => {
-                let proposals = decode(volume, &maps, &Evaluator::proposal_params(params))?;
+                let proposals = decode(volume, &maps, &Evaluator::proposal_params(&params.decode))?;
                 let started = Instant::now();
-                let refined = evaluator.refine(proposals, volume, params, is_wanted)?;
+                let refined = evaluator.refine(proposals, scene, params, is_wanted)?;
                 self.evaluation = Some(started.elapsed());
                 refined
             }
@@ -117,6 +118,6 @@ impl Inference<'_> {
 impl Planner for NetworkPlanner {
     /// The inference of the network cannot be interrupted.
     fn plan(&mut self, scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Decoded, PlanError> {
-        self.infer(&[&scene.volume])?.decode(0, &scene.volume, &params.decode, is_wanted)
+        self.infer(&[&scene.volume])?.decode(0, scene, params, is_wanted)
     }
 }

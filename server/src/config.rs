@@ -71,9 +71,10 @@ impl Config {
             Flags::command().get_arguments().filter_map(|flag| flag.get_env()).map(OsStr::to_owned).collect();
         let names = std::env::vars_os().map(|(name, _)| name).filter(|name| !known.contains(name));
         let mut unknown: Vec<String> = names.filter_map(|name| name.into_string().ok()).collect();
-        unknown.retain(|name| {
-            name.strip_prefix("GRASPD_").is_some_and(|rest| !rest.starts_with("SERVICE_") && !rest.starts_with("PORT"))
-        });
+        // `SERVER` and `TLS_CA` were variables of the client.
+        let others = ["SERVICE_", "PORT", "SERVER", "TLS_CA"];
+        let is_ours = |rest: &str| !others.iter().any(|other| rest.starts_with(other));
+        unknown.retain(|name| name.strip_prefix("GRASPD_").is_some_and(is_ours));
         unknown.sort();
         unknown
     }

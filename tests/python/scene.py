@@ -29,10 +29,11 @@ def rays():
     return np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(K).T
 
 
-def depth(camera_from_task, with_block=True):
-    """The depth image of a camera, [row][column], along its optical axis; 0 without a reading."""
+def depth(camera_from_task, with_block=True, along=None):
+    """The depth image of a camera, [row][column], along its optical axis; 0 without a reading. `along`: other rays."""
     task_from_camera = np.linalg.inv(camera_from_task)
-    eye, directions = task_from_camera[:3, 3], rays() @ task_from_camera[:3, :3].T
+    along = rays() if along is None else along
+    eye, directions = task_from_camera[:3, 3], along @ task_from_camera[:3, :3].T
     with np.errstate(divide="ignore"):
         table = (TABLE - eye[2]) / directions[..., 2]
         sides = (BLOCK[:, None, None] - eye) / directions

@@ -86,7 +86,7 @@ class Page:
         self.environment = {
             **os.environ,
             "PATH": f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}",
-            "GRASPD_SERVER": server.grpc,
+            "GRASP_SERVER": server.grpc,
         }
 
     def blocks(self):

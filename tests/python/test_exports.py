@@ -23,7 +23,7 @@ class ExportTest(unittest.TestCase):
         files = {form: folder / f"grasps.{form}" for form in ["csv", "moveit", "isaac"]}
         command = [os.environ["GRASP"], "detect", folder / "volume.npy", "--threshold", "0.3", "--frame-id", "base", "--json"]
         command += [argument for form, path in files.items() for argument in (f"--{form}", path)]
-        environment = {**os.environ, "GRASPD_SERVER": server.grpc}
+        environment = {**os.environ, "GRASP_SERVER": server.grpc}
         output = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
         cls.grasps = json.loads(output)["grasps"]
         cls.files = {form: path.read_text() for form, path in files.items()}

@@ -63,7 +63,7 @@ fn run(server: &Server, args: &[&str]) -> Output {
     // The hand of the test models points into the table.
     let unchecked: &[&str] = if checks { &[] } else { &["--collision", "off"] };
     let mut command = Command::new(grasp());
-    command.args(args).args(unchecked).env("GRASPD_SERVER", server.grpc().to_string()).output().unwrap()
+    command.args(args).args(unchecked).env("GRASP_SERVER", server.grpc().to_string()).output().unwrap()
 }
 
 fn text(bytes: &[u8]) -> &str {
@@ -253,7 +253,7 @@ fn watch_continues_after_a_refusal_and_detects_changed_poses() {
         .args(["watch", &path("m0.npy"), &path("m1.npy"), "--intrinsics", &path("k.npy"), "--collision", "off"])
         .args(["--camera-from-task", &path("poses.json"), "--json", "--threshold", "0.6"])
         .args(["--every", "0.02", "--count", "1"])
-        .env("GRASPD_SERVER", server.grpc().to_string())
+        .env("GRASP_SERVER", server.grpc().to_string())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
@@ -277,7 +277,7 @@ fn a_closed_stdout_is_not_an_error() {
     for args in [&["models"][..], &["health", "--json"], &["detect", file], &["watch", file]] {
         let mut process = Command::new(grasp())
             .args(args)
-            .env("GRASPD_SERVER", server.grpc().to_string())
+            .env("GRASP_SERVER", server.grpc().to_string())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .spawn()
@@ -618,7 +618,7 @@ fn watch_detects_again_when_the_file_changes() {
     let watched = files[0].to_str().unwrap();
     let mut watch = Command::new(grasp())
         .args(["watch", watched, "--json", "--every", "0.02", "--count", "2"])
-        .env("GRASPD_SERVER", server.grpc().to_string())
+        .env("GRASP_SERVER", server.grpc().to_string())
         .stdout(Stdio::piped())
         .spawn()
         .unwrap();

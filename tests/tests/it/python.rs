@@ -70,6 +70,17 @@ fn the_python_package_works() {
 }
 
 #[test]
+fn the_files_that_people_have_are_read_or_refused() {
+    let models = models();
+    let environment = [
+        ("GRASPD", graspd().as_os_str()),
+        ("GRASP", grasp().as_os_str()),
+        ("GRASPD_MODELS", models.path().as_os_str()),
+    ];
+    run("test_files.py", &environment, "test_lenses");
+}
+
+#[test]
 fn exported_files_can_be_parsed() {
     let models = models();
     let environment = [

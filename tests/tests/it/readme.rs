@@ -77,7 +77,7 @@ fn every_command_of_the_readme_works() {
         .args(["-c", &script])
         .current_dir(folder.path())
         .env("PATH", path)
-        .env("GRASPD_SERVER", format!("127.0.0.1:{grpc}"));
+        .env("GRASP_SERVER", format!("127.0.0.1:{grpc}"));
     let output = command.output().unwrap();
     let (stdout, stderr) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert!(output.status.success(), "{stdout}\n{stderr}");

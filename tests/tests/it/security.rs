@@ -238,7 +238,7 @@ async fn requests_need_a_valid_token_and_sighup_reloads_the_tokens() {
 
     let output = Command::new(grasp())
         .args(["--server", &server.grpc().to_string(), "models"])
-        .env("GRASPD_TOKEN_FILE", &file)
+        .env("GRASP_TOKEN_FILE", &file)
         .output()
         .unwrap();
     assert!(String::from_utf8_lossy(&output.stderr).contains("cannot read"), "the error names the missing file");

@@ -55,7 +55,7 @@ class Connection(Generic[Channel]):
         credentials = None
         if ca or cert or address.startswith("https://"):
             credentials = grpc.ssl_channel_credentials(ca, key, cert)
-        target = address.removeprefix("http://").removeprefix("https://")
+        target = with_port(address.removeprefix("http://").removeprefix("https://"))
         self._destination = (target, credentials, OPTIONS + replicas(target) + without_proxy(target))
         self._metadata = () if token is None else (("authorization", bearer(token)),)
         self._timeout = timeout
@@ -68,6 +68,12 @@ class Connection(Generic[Channel]):
 
     def _open(self, target: str, credentials: grpc.ChannelCredentials | None, options: ChannelOptions) -> Channel:
         raise NotImplementedError
+
+
+def with_port(target: str) -> str:
+    """The target with the port of graspd, if it is a host without a port."""
+    is_host = not target.startswith("unix:") and (target.endswith("]") or ":" not in target)
+    return f"{target}:50051" if is_host else target
 
 
 def replicas(target: str) -> ChannelOptions:

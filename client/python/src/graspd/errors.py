@@ -77,9 +77,21 @@ CLASSES = {
 CODES = {code.value[0]: code for code in StatusCode}
 
 
+# Parts of gRPC's messages about connections, and what to do.
+ADVICE = {
+    "Connection refused": "check the address and that graspd runs there",
+    "WRONG_VERSION_NUMBER": "the server does not use TLS: give an address without https://, and no PEM files",
+    "CERTIFICATE_VERIFY_FAILED": "the server's certificate is not signed by the CA of tls_ca, or is for another name",
+    "Socket closed": "if no call succeeds, the address may be the port for HTTP, or need https:// and tls_ca",
+}
+
+
 def from_status(status: RpcError) -> Error:
     """The error of a failed call."""
-    error = make(status.code(), status.details() or "")
+    message = status.details() or ""
+    if status.code() is StatusCode.UNAVAILABLE:
+        message = "; ".join([message, *(advice for part, advice in ADVICE.items() if part in message)])
+    error = make(status.code(), message)
     violations, pause, request = BadRequest(), RetryInfo(), RequestInfo()
     trailers: Any = status.trailing_metadata() or ()
     for key, value in trailers:

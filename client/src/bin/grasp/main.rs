@@ -21,6 +21,7 @@ mod table;
 mod view;
 mod volume;
 
+use std::env;
 use std::fs;
 use std::io::{self, IsTerminal};
 use std::path::PathBuf;
@@ -30,7 +31,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use anyhow::{Context, anyhow};
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 use grasp_client::{
     Access, Arrivals, Certificate, Client, DetectOptions, Detection, Health, Identity, Options, Retry, Token, Until,
     load,
@@ -51,7 +52,7 @@ use crate::view::ViewArgs;
 #[command(name = "grasp", version, max_term_width = 100)]
 struct Cli {
     /// Address of the server.
-    #[arg(long, global = true, env = "GRASPD_SERVER", value_name = "ADDR", default_value = "127.0.0.1:50051")]
+    #[arg(long, global = true, env = "GRASP_SERVER", value_name = "ADDR", default_value = "127.0.0.1:50051")]
     server: String,
 
     #[command(flatten)]
@@ -65,10 +66,29 @@ struct Cli {
     command: Command,
 }
 
+/// Arguments whose variables had the prefix of the server until version 0.1, and these variables.
+const FORMER_VARIABLES: [(&str, &str); 3] =
+    [("server", "GRASPD_SERVER"), ("tls_ca", "GRASPD_TLS_CA"), ("token_file", "GRASPD_TOKEN_FILE")];
+
+impl Cli {
+    /// Reads the command line and the environment. The process ends on `--help` and on unknown arguments.
+    fn from_args() -> Self {
+        let mut command = Self::command();
+        for (argument, former) in FORMER_VARIABLES {
+            let variable = former.replacen("GRASPD", "GRASP", 1);
+            if env::var_os(former).is_some() && env::var_os(&variable).is_none() {
+                eprintln!("grasp: {former} is a variable of graspd; set {variable} instead");
+                command = command.mut_arg(argument, |given| given.env(former));
+            }
+        }
+        Self::from_arg_matches(&command.get_matches()).unwrap_or_else(|error| error.exit())
+    }
+}
+
 #[derive(Args)]
 struct AccessArgs {
     /// CA that signed the server's certificate, PEM. Default for https:// addresses: the system's CAs.
-    #[arg(long, global = true, help_heading = "Connection", env = "GRASPD_TLS_CA", value_name = "FILE")]
+    #[arg(long, global = true, help_heading = "Connection", env = "GRASP_TLS_CA", value_name = "FILE")]
     tls_ca: Option<PathBuf>,
 
     /// Client certificate for servers that require one, PEM.
@@ -80,7 +100,7 @@ struct AccessArgs {
     tls_key: Option<PathBuf>,
 
     /// File with the bearer token, for servers that require one.
-    #[arg(long, global = true, help_heading = "Connection", env = "GRASPD_TOKEN_FILE", value_name = "FILE")]
+    #[arg(long, global = true, help_heading = "Connection", env = "GRASP_TOKEN_FILE", value_name = "FILE")]
     token_file: Option<PathBuf>,
 
     /// Time limit of each attempt of a request, seconds. It is sent to the server as the deadline.
@@ -236,7 +256,7 @@ impl AccessArgs {
 
 #[tokio::main(flavor = "current_thread")]
 async fn main() -> ExitCode {
-    match run(Cli::parse()).await {
+    match run(Cli::from_args()).await {
         Ok(code) => code,
         Err(error) => {
             eprintln!("grasp: {error:#}");

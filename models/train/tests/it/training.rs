@@ -61,9 +61,9 @@ fn eight_scenes_are_memorized() {
     // Only the smallest network in bf16, which is slow without instructions for it. The 87 M parameters of the paper's
     // transformer get fewer epochs: one takes seconds.
     for (network, orientation, learning_rate, epochs, bf16, largest) in [
-        (Architecture::Vgn, Quaternion, 1e-3, 120, false, 0.01),
-        (Architecture::Vgn, Axes, 1e-3, 120, true, 0.01),
-        (Architecture::TransformerSmall, Axes, 1e-3, 80, false, 0.01),
+        (Architecture::Vgn, Quaternion, 1e-3, 60, false, 0.01),
+        (Architecture::Vgn, Axes, 1e-3, 60, true, 0.02),
+        (Architecture::TransformerSmall, Axes, 1e-3, 50, false, 0.01),
         (Architecture::Transformer, Quaternion, 2e-4, 12, false, 0.2),
     ] {
         let settings = TrainingSettings { batch: 8, learning_rate, warmup: 10, bf16, ..settings() };

@@ -1,0 +1,149 @@
+"""Reads the files of people_files.py with the command line and compares the grasps with the block in the scene.
+
+    GRASPD=target/release/graspd GRASP=target/release/grasp GRASPD_MODELS=models/zoo \\
+    ORT_DYLIB_PATH=$(python3 deploy/native.py onnxruntime) \\
+    $(python3 tests/tools.py python) -m unittest discover --start-directory tests/python --pattern test_files.py
+"""
+
+import json
+import os
+import subprocess
+import tempfile
+import unittest
+from pathlib import Path
+
+import numpy as np
+import people_files as files
+import scene
+from server import Server
+
+WORKSPACE = "--workspace=0,0,0"
+
+
+class FilesTest(unittest.TestCase):
+    """A camera 0.6 m from the block. Each file gives the grasps of the reference, or an error that says what is wrong."""
+
+    @classmethod
+    def setUpClass(cls):
+        cls.server = cls.enterClassContext(Server())
+        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
+        cls.depths, cls.poses = files.depths(cls.folder), files.poses(cls.folder)
+        cls.intrinsics, cls.clouds = files.intrinsics(cls.folder), files.clouds(cls.folder)
+
+    def grasp(self, *arguments):
+        """Runs the command in the folder with the files."""
+        command = [os.environ["GRASP"], *map(str, arguments)]
+        environment = os.environ | {"GRASP_SERVER": self.server.grpc}
+        return subprocess.run(command, cwd=self.folder, env=environment, capture_output=True, text=True)
+
+    def detect(self, image, *more, k="cam_k.json", pose="rows.json", workspace=WORKSPACE):
+        """Detects in a depth image."""
+        placed = ["--frame-from-camera", pose, workspace]
+        return self.grasp("detect", image, "--intrinsics", k, *placed, "--origin", "tcp", "--json", *more)
+
+    def assert_right(self, result, within=0.012):
+        """The best grasp closes around the block, whose middle is at x = 0.15 m."""
+        self.assertEqual(result.returncode, 0, result.stderr)
+        reply = json.loads(result.stdout)
+        self.assertTrue(reply["grasps"], reply)
+        tips = np.array(reply["grasps"][0]["position"])
+        lower, upper = scene.BLOCK
+        self.assertLess(abs(tips[0] - 0.15), within, tips)
+        self.assertTrue(np.all(tips[1:] > lower[1:] - 0.01) and np.all(tips[1:] < upper[1:] + 0.01), tips)
+        return reply
+
+    def assert_refused(self, result, *parts):
+        """The command fails with an error that has all parts."""
+        self.assertNotEqual(result.returncode, 0, result.stdout)
+        for part in parts:
+            self.assertIn(part, result.stderr)
+
+    def test_depth_images(self):
+        for name, scale in self.depths:
+            with self.subTest(name):
+                self.assert_right(self.detect(name, *scale))
+        # The unit in the file of the intrinsics: that of BOP is in millimetres.
+        camera = {"cam_K": files.K.flatten().tolist(), "depth_scale": 0.1}
+        (self.folder / "tenths.json").write_text(json.dumps(camera))
+        self.assert_right(self.detect("tenths.png", k="tenths.json"))
+
+    def test_poses(self):
+        for name in self.poses:
+            with self.subTest(name):
+                self.assert_right(self.detect("depth.png", pose=name))
+
+    def test_intrinsics(self):
+        for name in self.intrinsics:
+            with self.subTest(name):
+                self.assert_right(self.detect("depth.png", k=name))
+
+    def test_point_clouds(self):
+        for name, scale in self.clouds:
+            with self.subTest(name):
+                placed = ["--camera-position", "0,0,0", "--frame-from-cloud", "rows.json", WORKSPACE]
+                self.assert_right(self.grasp("detect", name, *placed, *scale, "--origin", "tcp", "--json"))
+        placed = ["--camera-position", "0,0,0", "--frame-from-cloud", "rows.json", WORKSPACE]
+        self.assert_refused(self.grasp("detect", "float_mm.ply", *placed), "looks like millimetres")
+
+    def test_lenses(self):
+        """The depth image of a lens with distortion gives the grasps of one without."""
+        lenses = {
+            "plumb_bob": [-0.25, 0.08, 0.001, -0.001, 0.0],
+            "rational_polynomial": [0.4, -0.1, 0.0005, 0.0005, 0.01, 0.7, -0.1, 0.02],
+            "equidistant": [0.02, -0.01, 0.003, -0.001],
+        }
+        for model, d in lenses.items():
+            with self.subTest(model):
+                np.save(self.folder / "seen.npy", files.distorted(d, model))
+                (self.folder / "lens.yaml").write_text(files.camera_info(d=d, model=model))
+                self.assert_right(self.detect("seen.npy", k="lens.yaml"))
+        (self.folder / "lens.yaml").write_text(files.camera_info(d=[0.1] * 4, model="double_sphere"))
+        self.assert_refused(self.detect("depth.png", k="lens.yaml"), "double_sphere")
+
+    def test_intrinsics_of_another_resolution_are_refused(self):
+        (fx, _, cx), (_, fy, cy), _ = files.K.tolist()
+        numbers, size = files.K.flatten().tolist(), {"width": 320, "height": 240}
+        texts = {
+            "camera_info.yaml": files.camera_info(size=(320, 240)),
+            "calibration.yaml": f"image_width: 320\nimage_height: 240\ncamera_matrix: {{rows: 3, cols: 3, data: {numbers}}}\n",
+            "open3d.json": json.dumps(size | {"intrinsic_matrix": files.K.T.flatten().tolist()}),
+            "librealsense.json": json.dumps(size | {"fx": fx, "fy": fy, "ppx": cx, "ppy": cy}),
+        }
+        for name, text in texts.items():
+            with self.subTest(name):
+                (self.folder / f"other_{name}").write_text(text)
+                result = self.detect("depth.png", k=f"other_{name}")
+                self.assert_refused(result, "320 × 240", "160 × 120", "if the image was scaled")
+        (self.folder / "wide.json").write_text(json.dumps({"width": 320, "height": 180, "K": numbers}))
+        result = self.detect("depth.png", k="wide.json")
+        self.assert_refused(result, "320 × 180", "160 × 120")
+        self.assertNotIn("if the image was scaled", result.stderr)
+
+    def test_depth_scales_that_are_wrong_are_refused(self):
+        for scale, advice in [("10000", "did you mean 0.0001?"), ("0", "--depth-scale"), ("nan", "--depth-scale")]:
+            with self.subTest(scale):
+                self.assert_refused(self.detect("tenths.png", "--depth-scale", scale), advice)
+        self.assert_refused(self.detect("tenths.png"), "9.6 × the ", "check the depth unit")
+        camera = {"cam_K": files.K.flatten().tolist(), "depth_scale": 0.1}
+        (self.folder / "tenths.json").write_text(json.dumps(camera))
+        self.assert_refused(self.detect("tenths.png", "--depth-scale", "0.001", k="tenths.json"), "0.001", "0.0001")
+
+    def test_masks(self):
+        for name, mask in [("bool", files.ON_BLOCK), ("float", files.ON_BLOCK.astype(np.float32))]:
+            with self.subTest(name):
+                np.save(self.folder / "mask.npy", mask)
+                reply = self.assert_right(self.detect("depth.png", "--labels", "mask.npy", "--objects", "1"))
+                self.assertEqual({grasp["object"] for grasp in reply["grasps"]}, {1})
+        np.save(self.folder / "mask.npy", files.ON_BLOCK[:60])
+        self.assert_refused(self.detect("depth.png", "--labels", "mask.npy", "--objects", "1"), "[60, 160]", "120 × 160")
+
+    def test_other_files_are_named(self):
+        files.pickled(self.folder / "dict.npy")
+        self.assert_refused(self.detect("dict.npy"), "pickled", "save")
+        for name, content in {"a.jpg": b"\xff\xd8\xff\xe0\0\x10JFIF", "a.h5": b"\x89HDF\r\n\x1a\n"}.items():
+            (self.folder / name).write_bytes(content)
+            self.assert_refused(self.detect(name), {"a.jpg": "JPEG", "a.h5": "HDF5"}[name])
+
+
+if __name__ == "__main__":
+    unittest.main()
