@@ -580,7 +580,7 @@ class EndTest(RosTest):
             server.process.communicate()
             for outcome, result in map(ended, goals[:4]):
                 self.assertEqual(outcome, GoalStatus.STATUS_ABORTED)
-                self.assert_error(result, "UNAVAILABLE", server.grpc, "start it")
+                self.assert_error(result, "UNAVAILABLE", server.grpc, "parameter address")
             self.assert_error(node.call(), "UNAVAILABLE", server.grpc)
             diagnostics.first(lambda array: level(array, "patient: server") == DiagnosticStatus.ERROR)
             diagnostics.messages.clear()

@@ -82,8 +82,8 @@ class Detector:
         try:
             return await call
         except graspd.Unavailable as error:
-            hint = f"graspd at {self._address} is not available: {error.message}; start it, or correct the parameter address"
-            raise Refusal(error.code.name, hint) from None
+            text = f"graspd at {self._address} (parameter address) is not available: {error.message}"
+            raise Refusal(error.code.name, text) from None
         except graspd.Error as error:
             raise Refusal(error.code.name, error.message) from None
         except (TypeError, ValueError) as error:

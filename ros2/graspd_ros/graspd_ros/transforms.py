@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from bisect import bisect_left
+from bisect import bisect_left, insort
+from threading import Lock
 from typing import Protocol
 
 import graspd
@@ -78,11 +79,12 @@ class Tf2:
 
 
 class TfTopics:
-    """The part of tf2 that the node needs. Its callbacks must not overlap, so they are in `group`."""
+    """The part of tf2 that the node needs."""
 
     def __init__(self, node: Node, group: CallbackGroup) -> None:
         from tf2_msgs.msg import TFMessage
 
+        self._lock = Lock()
         self._parents: dict[str, str] = {}
         self._fixed: dict[str, Transform] = {}
         self._moving: dict[str, list[Stamped]] = {}
@@ -91,13 +93,14 @@ class TfTopics:
         node.create_subscription(TFMessage, "/tf_static", self._add_fixed, latched, callback_group=group)
 
     def matrix(self, target: str, source: str, stamp: int) -> Matrix:
-        above_target, above_source = self._ancestors(target), self._ancestors(source)
-        common = next((frame for frame in above_source if frame in above_target), None)
-        if common is None:
-            raise NotKnown(f"{source!r} is below {above_source[-1]!r}, and {target!r} below {above_target[-1]!r}")
-        common_from_target, common_from_source = (
-            self._product(above[: above.index(common)], stamp) for above in (above_target, above_source)
-        )
+        with self._lock:
+            above_target, above_source = self._ancestors(target), self._ancestors(source)
+            common = next((frame for frame in above_source if frame in above_target), None)
+            if common is None:
+                raise NotKnown(f"{source!r} is below {above_source[-1]!r}, and {target!r} below {above_target[-1]!r}")
+            common_from_target, common_from_source = (
+                self._product(above[: above.index(common)], stamp) for above in (above_target, above_source)
+            )
         return np.linalg.inv(common_from_target) @ common_from_source
 
     def _ancestors(self, frame: str) -> list[str]:
@@ -127,22 +130,26 @@ class TfTopics:
         if not oldest <= stamp <= newest:
             relation = f"{(stamp - newest) * 1e-9:.3f} s after the newest" if stamp > newest else "before the oldest"
             raise NotKnown(f"the image is {relation} transform of {frame!r}")
-        after = bisect_left(history, stamp, key=lambda entry: entry[0])
+        after = bisect_left(history, stamp, key=stamp_of)
         return between(history[max(after - 1, 0)], history[after], stamp)
 
     def _add_fixed(self, message) -> None:
-        for each in message.transforms:
-            self._fixed[each.child_frame_id] = each.transform
-            self._parents[each.child_frame_id] = each.header.frame_id
+        with self._lock:
+            for each in message.transforms:
+                self._fixed[each.child_frame_id] = each.transform
+                self._parents[each.child_frame_id] = each.header.frame_id
 
     def _add_moving(self, message) -> None:
-        for each in message.transforms:
-            history = self._moving.get(each.child_frame_id, [])
-            entry = (nanoseconds(each.header.stamp), each.transform)
-            # Another list, because a lookup may be reading the present one.
-            newer = sorted([*history, entry], key=lambda entry: entry[0])
-            self._moving[each.child_frame_id] = [old for old in newer if old[0] >= newer[-1][0] - HISTORY]
-            self._parents[each.child_frame_id] = each.header.frame_id
+        with self._lock:
+            for each in message.transforms:
+                history = self._moving.setdefault(each.child_frame_id, [])
+                insort(history, (nanoseconds(each.header.stamp), each.transform), key=stamp_of)
+                del history[: bisect_left(history, history[-1][0] - HISTORY, key=stamp_of)]
+                self._parents[each.child_frame_id] = each.header.frame_id
+
+
+def stamp_of(entry: Stamped) -> int:
+    return entry[0]
 
 
 def between(before: Stamped, after: Stamped, stamp: int) -> Matrix:
