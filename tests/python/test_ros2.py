@@ -16,6 +16,7 @@ import tempfile
 import threading
 import time
 import unittest
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,8 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Pose, PoseArray, Quaternion, Transform, TransformStamped, Vector3
 from graspd_msgs import action, msg, srv
-from graspd_ros import camera, markers, messages, moveit
+from graspd import wire
+from graspd_ros import camera, markers, messages, moveit, parameters
 from graspd_ros.refusal import Refusal
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
 from rclpy.action import ActionClient
@@ -659,8 +661,72 @@ class TrackingTest(RosTest):
                 time.sleep(0.05)
             self.assertEqual(SERVER.metric("graspd_tracked_volumes"), 0)
 
+    def test_tracking_without_a_workspace_finds_the_table(self):
+        with Listener(msg.Detection, "/graspd/detection") as detections:
+            self.assertTrue(NODE.set("threshold", 0.5).successful and NODE.set("track", True).successful)
+            self.addCleanup(NODE.set, "threshold", math.nan)
+            self.addCleanup(NODE.set, "track", False)
+            detections.first(lambda _: len(detections.messages) >= 4)
+            for each in detections.messages[1:4]:  # the first may be older
+                self.assert_of_an_image(each.header, OPTICAL)
+                self.assertTrue(each.table and each.grasps)
+
 
 class ConversionTest(unittest.TestCase):
+    def test_messages_and_parameters_have_every_option(self):
+        for kind, message, prefix in [(graspd.Options, msg.Options, ""), (graspd.Workspace, msg.Workspace, "workspace.")]:
+            names = {field.name for field in fields(kind)} - {"stamp"}
+            self.assertEqual(names - {*message.get_fields_and_field_types()}, set())
+            declared = [declaration.name for declaration in parameters.DECLARATIONS]
+            missing = {name for name in names if not any(each.startswith(prefix + name) for each in declared)}
+            self.assertEqual(missing - {"find_table"}, set())
+
+    def test_messages_and_parameters_mean_the_same(self):
+        corners, seven = [0.0, -0.1, 0.2, 0.3, 0.4, 0.5], [0.1, 0.2, 0.3, 0.0, 0.0, 0.6, 0.8]
+        box = msg.Box(min=Vector3(x=0.0, y=-0.1, z=0.2), max=Vector3(x=0.3, y=0.4, z=0.5))
+        pose = messages.pose_message(graspd.Pose(tuple(seven[:3]), tuple(seven[3:])))
+        options = msg.Options(
+            model="vgn-packed", version="1", threshold=[0.5], force=[0.25], max_grasps=3, max_grasps_per_object=2,
+            objects=[4, 5], explain=True, region=[box], region_pose=[pose],
+            approach=[msg.Cone(axis=Vector3(z=-1.0), angle=0.8)], min_height=[0.0], margin=[0.05], pregrasp_distance=[0.1],
+            retreat=[msg.Retreat(distance=0.2, direction=[Vector3(z=1.0)])],
+            gripper=[msg.Gripper(max_opening=0.1, finger_depth=0.05, finger_width=0.02, finger_breadth=0.03, palm=[box])],
+            collision=[msg.CollisionCheck(mode="flag", table_height=[-1.0], clearance=[0.01], hidden=True)],
+            convention=[msg.Convention(origin="parent", closing_axis="x", parent_from_grasp=[pose])], priority="batch",
+        )
+        defaults = {declaration.name: declaration.default for declaration in parameters.DECLARATIONS}
+        values = {
+            "model": "vgn-packed", "version": "1", "threshold": 0.5, "force": 0.25, "max_grasps": 3,
+            "max_grasps_per_object": 2, "objects": [4, 5], "explain": True, "region": corners, "region_pose": seven,
+            "approach": [0, 0, -1, 0.8], "min_height": 0, "margin": 0.05, "pregrasp_distance": 0.1,
+            "retreat.distance": 0.2, "retreat.direction": [0, 0, 1], "gripper.size": [0.1, 0.05, 0.02, 0.03],
+            "gripper.palm": corners, "collision.mode": "flag", "collision.table_height": -1, "collision.clearance": 0.01,
+            "collision.hidden": True, "convention.origin": "parent", "convention.closing_axis": "x",
+            "convention.parent_from_grasp": seven, "priority": "batch",
+        }
+        self.assertEqual({declaration.name for declaration in parameters.OPTIONS}, set(values))
+        parameters.check({**defaults, **values})
+        own, other = messages.options(options), parameters.options({**defaults, **values})
+        self.assertEqual(set(own), {field.name for field in fields(graspd.Options)})
+        as_message = lambda values: wire.options_message(graspd.Options(**values))
+        self.assertEqual(as_message(own), as_message(other))
+        # Nothing is set.
+        self.assertEqual(messages.options(msg.Options()), {})
+        self.assertEqual(parameters.workspace(defaults), {})
+
+        workspace = msg.Workspace(
+            frame_id="corner", pose=[pose], size=0.3, extent=[0.5, 0.4], gravity=[Vector3(z=-1.0)],
+            correct_depth_scale=[False],
+        )
+        values = {
+            "workspace.frame_id": "corner", "workspace.pose": seven, "workspace.size": 0.3, "workspace.extent": [0.5, 0.4],
+            "workspace.gravity": [0, 0, -1], "workspace.correct_depth_scale": "never",
+        }
+        self.assertEqual({declaration.name for declaration in parameters.WORKSPACE}, set(values))
+        own, other = messages.workspace(workspace), parameters.workspace({**defaults, **values})
+        as_message = lambda values: wire.workspace_message(graspd.Workspace(**values))
+        self.assertEqual(as_message(own), as_message(other))
+
     def test_images_of_all_kinds(self):
         depth = np.array([[500, 600, 700], [800, 900, 1000]])
         for encoding, kind, big in [("16UC1", "<u2", 0), ("mono16", ">u2", 1), ("32FC1", "<f4", 0), ("32FC1", ">f4", 1)]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import graspd
@@ -53,6 +54,7 @@ class Tracker:
         seen = await self._images.next(query.values["image_timeout"])
         workspace = await self._detector.workspace(query, seen)
         async with self._client.track(workspace, half_life=parameters.number(query.values, "half_life")) as tracking:
+            table = None
             while query.values["track"]:
                 try:
                     view = await self._detector.view(query, seen)
@@ -60,6 +62,9 @@ class Tracker:
                     self._failed(refusal)
                 else:
                     found = await self._detector.answer(tracking.add(view, query.options, stamp=seen.stamp))
+                    # Only the first reply has the table, which is found in the first image.
+                    table = found.table or table
+                    found = replace(found, table=table)
                     self._results.publish(message(query, seen, found), query.options)
                     self._failure = ""
                 seen = await self._images.next(query.values["image_timeout"])
