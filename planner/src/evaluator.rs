@@ -17,7 +17,11 @@ const PROPOSALS: usize = 32;
 /// Quality from which a grasp makes further proposals needless.
 const SURE: f32 = 0.9;
 
-/// Largest number of proposals where the hand fits around the surface.
+/// Quality from which moving a grasp gains nothing.
+const SETTLED: f32 = 0.97;
+
+/// Number of points at which the hand is then fitted to the surface, and largest number of these grasps.
+const SAMPLES: usize = 150;
 const FITTED: usize = 96;
 
 /// Number of the best of them that are moved.
@@ -78,32 +82,18 @@ impl Evaluator {
         dropped.suppressed += grasps.len().saturating_sub(PROPOSALS);
         grasps.truncate(PROPOSALS);
         let selection = Selection::new(&scene.volume, &params.decode);
-        self.search(&mut grasps, &selection, scene, params, is_wanted)?;
+        let (volume, depth) = (&scene.volume, depth(&params.decode));
+        self.evaluate(&mut grasps, volume, depth)?;
+        let is_settled = |grasp: &Grasp| grasp.quality >= SETTLED && selection.accepts(&grasp.pose);
         let is_sure = |grasp: &Grasp| grasp.quality >= SURE && selection.accepts(&grasp.pose);
         if !grasps.iter().any(is_sure) {
-            let mut fitted = HandFit::of(scene, params, is_wanted)?.spread(FITTED, scene.volume.pose());
-            self.search(&mut fitted, &selection, scene, params, is_wanted)?;
+            let mut fitted = HandFit::sampled(SAMPLES, scene, params, is_wanted)?.spread(FITTED, volume.pose());
+            self.evaluate(&mut fitted, volume, depth)?;
             grasps.extend(fitted);
-            sort(&mut grasps);
         }
-        let mut decoded = selection.select(&grasps, &params.decode);
-        decoded.dropped += dropped;
-        Ok(decoded)
-    }
-
-    /// Scores grasps, moves the best ones, and sorts all by quality.
-    fn search(
-        &mut self,
-        grasps: &mut [Grasp],
-        selection: &Selection<'_>,
-        scene: &Scene,
-        params: &PlanParams,
-        is_wanted: &dyn Fn() -> bool,
-    ) -> Result<(), PlanError> {
-        let (volume, depth) = (&scene.volume, depth(&params.decode));
-        self.evaluate(grasps, volume, depth)?;
-        sort(grasps);
+        sort(&mut grasps);
         let mut moving: Vec<usize> = (0..REFINED.min(grasps.len())).collect();
+        moving.retain(|&index| !is_settled(&grasps[index]));
         for _ in 0..MOVES {
             if !is_wanted() {
                 return Err(PlanError::Cancelled);
@@ -123,8 +113,10 @@ impl Evaluator {
             better.iter().for_each(|&(index, grasp)| grasps[index] = grasp);
             moving = better.into_iter().map(|(index, _)| index).collect();
         }
-        sort(grasps);
-        Ok(())
+        sort(&mut grasps);
+        let mut decoded = selection.select(&grasps, &params.decode);
+        decoded.dropped += dropped;
+        Ok(decoded)
     }
 
     /// The predicted probabilities of success of grasps at `poses`.

@@ -48,8 +48,18 @@ impl HandFit {
         Params { hand, aperture, bite, ..of_gpd }
     }
 
-    /// Fits the hand to the points of the scene.
+    /// Fits the hand to the points of the scene, at as many of them as GPD.
     pub(crate) fn of(scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Self, PlanError> {
+        Self::sampled(Params::above(0.0).samples, scene, params, is_wanted)
+    }
+
+    /// Fits the hand at `samples` points of the scene.
+    pub(crate) fn sampled(
+        samples: usize,
+        scene: &Scene,
+        params: &PlanParams,
+        is_wanted: &dyn Fn() -> bool,
+    ) -> Result<Self, PlanError> {
         let volume = &scene.volume;
         let size = volume.resolution() as f64 * volume.voxel_size();
         let table = params.table.unwrap_or(f64::NEG_INFINITY);
@@ -60,7 +70,7 @@ impl HandFit {
         let of_objects = object_points(&points, size, table);
         let other_points = points.len() - of_objects.len();
         let cloud = Cloud::new(of_objects);
-        let fit = Self::params(params.decode.hand.unwrap_or(Hand::GPD), table);
+        let fit = Params { samples, ..Self::params(params.decode.hand.unwrap_or(Hand::GPD), table) };
         let (mut candidates, mut misfits) = (Vec::new(), 0);
         for of_sample in by_sample(&cloud, &fit, &mut ChaCha8Rng::seed_from_u64(0)) {
             if !is_wanted() {
