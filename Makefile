@@ -19,7 +19,7 @@ with_libtorch = LIBTORCH="$$($(PYTHON) deploy/native.py libtorch)" && export LIB
 	LD_LIBRARY_PATH="$$LIBTORCH/lib$${LD_LIBRARY_PATH:+:$$LD_LIBRARY_PATH}" && export LD_LIBRARY_PATH &&
 
 
-.PHONY: help demo build test test-some test-ros2 fmt lint doc deny test-faults fuzz bench-sim bench-gpu bench-serve soak tables clean
+.PHONY: help demo build install wheel test test-some test-ros2 fmt lint doc deny test-faults fuzz bench-sim bench-gpu bench-serve soak tables clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):[^#]*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
@@ -33,6 +33,16 @@ build: ## build the server, the simulator and the client, optimised
 
 test: ## all checks that a change must pass
 	$(PYTHON) tests/run.py
+
+wheel: ## build the wheels of the Python client and of the programs into dist/
+	$(PYTHON) deploy/wheels.py
+
+PREFIX ?= $(HOME)/.local
+install: build ## install the programs and the models into PREFIX (~/.local)
+	install -D --target-directory $(PREFIX)/bin $(RELEASE)/graspd $(RELEASE)/grasp $(RELEASE)/grasp-sim
+	mkdir -p $(PREFIX)/share/graspd
+	cp -r --no-target-directory models/zoo $(PREFIX)/share/graspd/models
+	$(PYTHON) deploy/native.py onnxruntime
 
 fmt: ## format the code
 	$(CARGO) fmt --all

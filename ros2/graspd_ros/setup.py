@@ -6,7 +6,7 @@ NAME = "graspd_ros"
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version="0.2.0",
     description="A node that detects 6-DoF grasps in depth images or point clouds with a graspd server",
     license="MIT OR Apache-2.0",
     packages=[NAME],

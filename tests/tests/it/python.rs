@@ -81,6 +81,11 @@ fn the_files_that_people_have_are_read_or_refused() {
 }
 
 #[test]
+fn the_wheels_work_in_a_new_environment() {
+    run("test_wheels.py", &[("GRASPD", graspd().as_os_str())], "test_the_demo_needs_no_option");
+}
+
+#[test]
 fn exported_files_can_be_parsed() {
     let models = models();
     let environment = [
