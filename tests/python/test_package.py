@@ -37,6 +37,7 @@ sys.path.insert(0, INSTALLED.name)
 import graspd
 import graspd.aio
 from graspd import grasp_pb2, wire
+from graspd.connection import with_port
 
 CAMERAS = [scene.camera(30, -90), scene.camera(40, 90)]
 LOW = graspd.Options(threshold=0.5)
@@ -445,6 +446,10 @@ class ErrorsTest(ServerTest):
             (lambda: graspd.CollisionCheck("never"), "mode is 'never', must be one of 'off', 'flag', 'filter'"),
             (lambda: graspd.Convention("wrist"), "origin is 'wrist', must be one of 'finger_base'"),
             (lambda: graspd.Options(priority="high"), "priority is 'high', must be one of 'normal', 'batch'"),
+            (lambda: graspd.Options(max_grasps=-1), "Options.max_grasps is -1, must be from 0 to"),
+            (lambda: graspd.Options(objects=[3, -7]), "Options.objects is -7, must be from 0 to"),
+            (lambda: graspd.Client("127.0.0.1:1", timeout=-1), "timeout is -1, must be greater than 0 seconds"),
+            (lambda: self.client.detect(volume, timeout=0), "timeout is 0, must be greater than 0 seconds"),
             (lambda: graspd.Client("127.0.0.1:1", tls_cert="a.pem"), "must be given together"),
             (lambda: graspd.Client("127.0.0.1:1", token=" "), "token is empty"),
             (lambda: graspd.Client("127.0.0.1:1", token="two\nlines"), "token"),
@@ -457,6 +462,11 @@ class ErrorsTest(ServerTest):
             (lambda: graspd.Options(collision="filter"), r'collision is .filter., must be a graspd.CollisionCheck, such as'),
             (lambda: graspd.Options(convention="tcp"), r"must be a graspd.Convention"),
             (lambda: graspd.Options(region=((0, 0, 0), (1, 1, 1))), r"must be a graspd.Box"),
+            (lambda: graspd.Options(max_grasps=2.5), r"Options.max_grasps is 2.5, must be an integer"),
+            (lambda: graspd.Options(threshold="0.5"), r"Options.threshold is '0.5', must be a number"),
+            (lambda: graspd.Options(objects=7), r"Options.objects is 7, must be a list of labels"),
+            (lambda: graspd.CollisionCheck(clearance=True), r"CollisionCheck.clearance is True, must be a number"),
+            (lambda: graspd.Client("127.0.0.1:1", timeout="10"), r"timeout is '10', must be a number of seconds"),
         ]:
             with self.subTest(expected), self.assertRaisesRegex(TypeError, expected):
                 call()
@@ -465,8 +475,32 @@ class ErrorsTest(ServerTest):
         volume = scene.volume(*CAMERAS)
         with graspd.Client(self.server.grpc, timeout=1e-4) as client, self.assertRaises(graspd.DeadlineExceeded):
             client.detect(volume)
-        with graspd.Client("127.0.0.1:1", retry=graspd.Retry.NONE) as client, self.assertRaises(graspd.Unavailable):
-            client.detect(volume)
+        with self.assertRaises(graspd.DeadlineExceeded):
+            self.client.detect(volume, timeout=1e-4)
+        with graspd.Client("127.0.0.1:1", retry=graspd.Retry.NONE) as client:
+            with self.assertRaisesRegex(graspd.Unavailable, "check the address and that graspd runs there"):
+                client.detect(volume)
+
+    def test_something_else_at_the_address_is_named(self):
+        for address, expected in [
+            (self.server.http, "the address may be the port for HTTP"),
+            (f"https://{self.server.grpc}", "the server does not use TLS"),
+        ]:
+            with self.subTest(address), graspd.Client(address, retry=graspd.Retry.NONE) as client:
+                with self.assertRaisesRegex(graspd.Unavailable, expected):
+                    client.models()
+
+    def test_a_closed_client_makes_no_calls(self):
+        client = graspd.Client(self.server.grpc)
+        client.close()
+        with self.assertRaisesRegex(ValueError, "the client is closed"):
+            client.health()
+
+    def test_the_port_of_an_address_without_one_is_50051(self):
+        for address, expected in [
+            ("robot", "robot:50051"), ("robot:1", "robot:1"), ("[::1]", "[::1]:50051"), ("unix:/run/graspd.sock", None),
+        ]:
+            self.assertEqual(with_port(address), expected or address)
 
 
 class StreamTest(ServerTest):
@@ -773,6 +807,8 @@ class AsyncioTest(unittest.IsolatedAsyncioTestCase):
                 answers.append(answer)
         self.assertIsInstance(answers.pop(1), graspd.InvalidArgument)
         self.assertEqual([answer.frame_id for answer in answers], ["0", "2", "3"])
+        named = [graspd.Volume(volume, frame_id=str(index)) for index in range(2)]
+        self.assertEqual([answer.frame_id async for answer in self.client.detect_stream(named, LOW)], ["0", "1"])
 
     async def test_volumes_are_tracked(self):
         async with self.client.track(graspd.Workspace(frame_id="base")) as tracking:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from graspd import grasp_pb2 as pb
 from graspd import methods, wire
-from graspd.connection import ChannelOptions, Connection
+from graspd.connection import ChannelOptions, Connection, positive
 from graspd.detection import Detection, FoundTable, Grasp, Model, Scores
 from graspd.errors import DeadlineExceeded, Error, Unavailable, from_status
 from graspd.geometry import PoseLike
@@ -39,13 +39,19 @@ class Client(Connection[grpc.aio.Channel]):
 
     async def close(self) -> None:
         """Closes the connection and cancels running calls."""
-        await self._channel.close()
+        channel, self._is_closed = self._channel, True
+        await channel.close()
 
     async def detect(
-        self, volume: Volume | NDArray[Any], options: Options | None = None, *, request_id: str = ""
+        self,
+        volume: Volume | NDArray[Any],
+        options: Options | None = None,
+        *,
+        request_id: str = "",
+        timeout: float | None = None,
     ) -> Detection:
         """Detects grasps in a volume."""
-        return await self._call(methods.DETECT, wire.detect_request(volume, options, request_id))
+        return await self._call(methods.DETECT, wire.detect_request(volume, options, request_id), timeout)
 
     async def detect_from_depth(
         self,
@@ -54,9 +60,11 @@ class Client(Connection[grpc.aio.Channel]):
         options: Options | None = None,
         *,
         request_id: str = "",
+        timeout: float | None = None,
     ) -> Detection:
         """Detects grasps in 1 to 64 depth images."""
-        return await self._call(methods.DETECT_FROM_DEPTH, wire.depth_request(views, workspace, options, request_id))
+        request = wire.depth_request(views, workspace, options, request_id)
+        return await self._call(methods.DETECT_FROM_DEPTH, request, timeout)
 
     async def detect_from_cloud(
         self,
@@ -65,12 +73,16 @@ class Client(Connection[grpc.aio.Channel]):
         options: Options | None = None,
         *,
         request_id: str = "",
+        timeout: float | None = None,
     ) -> Detection:
         """Detects grasps in 1 to 64 point clouds, each observed by one camera."""
-        return await self._call(methods.DETECT_FROM_CLOUD, wire.cloud_request(views, workspace, options, request_id))
+        request = wire.cloud_request(views, workspace, options, request_id)
+        return await self._call(methods.DETECT_FROM_CLOUD, request, timeout)
 
     async def detect_stream(
-        self, volumes: AsyncIterable[Volume | NDArray[Any]], options: Options | None = None
+        self,
+        volumes: AsyncIterable[Volume | NDArray[Any]] | Iterable[Volume | NDArray[Any]],
+        options: Options | None = None,
     ) -> AsyncIterator[Detection | Error]:
         """Yields the grasps of each volume in the order of the volumes. For a refused volume it yields the `Error`, and
         the stream continues. An error that ends the stream is raised."""
@@ -78,8 +90,12 @@ class Client(Connection[grpc.aio.Channel]):
 
         async def requests() -> AsyncIterator[pb.DetectGraspsRequest]:
             with detecting.sending():
-                async for volume in volumes:
-                    yield detecting.request(volume)
+                if isinstance(volumes, AsyncIterable):
+                    async for volume in volumes:
+                        yield detecting.request(volume)
+                else:
+                    for volume in volumes:
+                        yield detecting.request(volume)
 
         replies = self._stream(methods.DETECT_STREAM, requests())
         try:
@@ -105,12 +121,13 @@ class Client(Connection[grpc.aio.Channel]):
         options: Options | None = None,
         *,
         request_id: str = "",
+        timeout: float | None = None,
     ) -> Scores:
         """Scores the caller's grasps in a volume, depth images or point clouds. `grasps` are ``T_frame_grasp``, in the
         convention of the options, 1 to 1024; a `Candidate` also has a width. `workspace` is that of the images or
         points."""
         return await self._call(
-            methods.SCORE, wire.score_request(observation, grasps, workspace, options, request_id)
+            methods.SCORE, wire.score_request(observation, grasps, workspace, options, request_id), timeout
         )
 
     async def find_table(
@@ -120,11 +137,13 @@ class Client(Connection[grpc.aio.Channel]):
         *,
         table_height: float | None = None,
         request_id: str = "",
+        timeout: float | None = None,
     ) -> FoundTable:
         """Finds the table in a depth image or a point cloud, and the workspace over what stands on it. Of `workspace`
         only `size`, `extent`, `gravity`, `frame_id` and `stamp` are used. `table_height` is the height of the table above the
         bottom of the workspace, metres; None: 0.05."""
-        return await self._call(methods.FIND_TABLE, wire.table_request(view, workspace, table_height, request_id))
+        request = wire.table_request(view, workspace, table_height, request_id)
+        return await self._call(methods.FIND_TABLE, request, timeout)
 
     async def models(self) -> tuple[Model, ...]:
         """The models that the server serves; the default model is first."""
@@ -154,12 +173,15 @@ class Client(Connection[grpc.aio.Channel]):
             return grpc.aio.insecure_channel(target, options)
         return grpc.aio.secure_channel(target, credentials, options)
 
-    async def _call(self, method: Method[Request, Response, Answer], request: Request) -> Answer:
-        call = self._channel.unary_unary(method.path, method.serialize, method.parse)
+    async def _call(
+        self, method: Method[Request, Response, Answer], request: Request, timeout: float | None = None
+    ) -> Answer:
+        limit = self._timeout if timeout is None else positive("timeout", timeout)
+        call = self._opened().unary_unary(method.path, method.serialize, method.parse)
         attempts = 0
         while True:
             try:
-                return method.answer(await call(request, timeout=self._timeout, metadata=self._metadata))
+                return method.answer(await call(request, timeout=limit, metadata=self._metadata))
             except grpc.RpcError as status:
                 error = from_status(status)
             attempts += 1
@@ -171,7 +193,7 @@ class Client(Connection[grpc.aio.Channel]):
     def _stream(
         self, method: Method[Request, Response, Any], requests: AsyncIterator[Request] | None = None
     ) -> grpc.aio.StreamStreamCall[Request, Response]:
-        stream = self._channel.stream_stream(method.path, method.serialize, method.parse)
+        stream = self._opened().stream_stream(method.path, method.serialize, method.parse)
         return stream(requests, metadata=self._metadata)
 
 

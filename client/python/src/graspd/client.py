@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from graspd import grasp_pb2 as pb
 from graspd import methods, wire
-from graspd.connection import ChannelOptions, Connection
+from graspd.connection import ChannelOptions, Connection, positive
 from graspd.detection import Detection, FoundTable, Grasp, Model, Scores
 from graspd.errors import DeadlineExceeded, Error, Unavailable, from_status
 from graspd.geometry import PoseLike
@@ -32,7 +32,8 @@ class Client(Connection[grpc.Channel]):
 
     Methods raise `Error` if the server refuses the request or the connection fails, and `ValueError` for arguments that
     cannot be sent, such as a volume that is not a cube. With `options` of None the server's defaults apply.
-    `request_id`, at most 256 bytes, identifies the request in the reply and in the server's log.
+    `request_id`, at most 256 bytes, identifies the request in the reply and in the server's log. `timeout` limits each
+    attempt of this call, seconds; None: that of the client.
     """
 
     def __enter__(self) -> Client:
@@ -43,13 +44,19 @@ class Client(Connection[grpc.Channel]):
 
     def close(self) -> None:
         """Closes the connection and cancels running calls."""
-        self._channel.close()
+        channel, self._is_closed = self._channel, True
+        channel.close()
 
     def detect(
-        self, volume: Volume | NDArray[Any], options: Options | None = None, *, request_id: str = ""
+        self,
+        volume: Volume | NDArray[Any],
+        options: Options | None = None,
+        *,
+        request_id: str = "",
+        timeout: float | None = None,
     ) -> Detection:
         """Detects grasps in a volume. An array is a `Volume` with an edge of 0.3 m."""
-        return self._call(methods.DETECT, wire.detect_request(volume, options, request_id))
+        return self._call(methods.DETECT, wire.detect_request(volume, options, request_id), timeout)
 
     def detect_from_depth(
         self,
@@ -58,9 +65,11 @@ class Client(Connection[grpc.Channel]):
         options: Options | None = None,
         *,
         request_id: str = "",
+        timeout: float | None = None,
     ) -> Detection:
         """Detects grasps in 1 to 64 depth images."""
-        return self._call(methods.DETECT_FROM_DEPTH, wire.depth_request(views, workspace, options, request_id))
+        request = wire.depth_request(views, workspace, options, request_id)
+        return self._call(methods.DETECT_FROM_DEPTH, request, timeout)
 
     def detect_from_cloud(
         self,
@@ -69,9 +78,11 @@ class Client(Connection[grpc.Channel]):
         options: Options | None = None,
         *,
         request_id: str = "",
+        timeout: float | None = None,
     ) -> Detection:
         """Detects grasps in 1 to 64 point clouds, each observed by one camera."""
-        return self._call(methods.DETECT_FROM_CLOUD, wire.cloud_request(views, workspace, options, request_id))
+        request = wire.cloud_request(views, workspace, options, request_id)
+        return self._call(methods.DETECT_FROM_CLOUD, request, timeout)
 
     def detect_stream(
         self, volumes: Iterable[Volume | NDArray[Any]], options: Options | None = None
@@ -109,12 +120,13 @@ class Client(Connection[grpc.Channel]):
         options: Options | None = None,
         *,
         request_id: str = "",
+        timeout: float | None = None,
     ) -> Scores:
         """Scores the caller's grasps in a volume, depth images or point clouds. `grasps` are ``T_frame_grasp``, in the
         convention of the options, 1 to 1024; a `Candidate` also has a width. `workspace` is that of the images or
         points."""
         return self._call(
-            methods.SCORE, wire.score_request(observation, grasps, workspace, options, request_id)
+            methods.SCORE, wire.score_request(observation, grasps, workspace, options, request_id), timeout
         )
 
     def find_table(
@@ -124,11 +136,13 @@ class Client(Connection[grpc.Channel]):
         *,
         table_height: float | None = None,
         request_id: str = "",
+        timeout: float | None = None,
     ) -> FoundTable:
         """Finds the table in a depth image or a point cloud, and the workspace over what stands on it. Of `workspace`
         only `size`, `extent`, `gravity`, `frame_id` and `stamp` are used. `table_height` is the height of the table above the
         bottom of the workspace, metres; None: 0.05."""
-        return self._call(methods.FIND_TABLE, wire.table_request(view, workspace, table_height, request_id))
+        request = wire.table_request(view, workspace, table_height, request_id)
+        return self._call(methods.FIND_TABLE, request, timeout)
 
     def models(self) -> tuple[Model, ...]:
         """The models that the server serves; the default model is first."""
@@ -158,12 +172,15 @@ class Client(Connection[grpc.Channel]):
             return grpc.insecure_channel(target, options)
         return grpc.secure_channel(target, credentials, options)
 
-    def _call(self, method: Method[Request, Response, Answer], request: Request) -> Answer:
-        call = self._channel.unary_unary(method.path, method.serialize, method.parse)
+    def _call(
+        self, method: Method[Request, Response, Answer], request: Request, timeout: float | None = None
+    ) -> Answer:
+        limit = self._timeout if timeout is None else positive("timeout", timeout)
+        call = self._opened().unary_unary(method.path, method.serialize, method.parse)
         attempts = 0
         while True:
             try:
-                return method.answer(call(request, self._timeout, self._metadata))
+                return method.answer(call(request, limit, self._metadata))
             except grpc.RpcError as status:
                 error = from_status(status)
             attempts += 1
@@ -173,7 +190,7 @@ class Client(Connection[grpc.Channel]):
             time.sleep(pause)
 
     def _stream(self, method: Method[Request, Response, Any], requests: Iterator[Request]) -> Replies[Response]:
-        stream = self._channel.stream_stream(method.path, method.serialize, method.parse)
+        stream = self._opened().stream_stream(method.path, method.serialize, method.parse)
         return stream(requests, metadata=self._metadata)
 
 

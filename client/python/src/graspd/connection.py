@@ -58,7 +58,8 @@ class Connection(Generic[Channel]):
         target = with_port(address.removeprefix("http://").removeprefix("https://"))
         self._destination = (target, credentials, OPTIONS + replicas(target) + without_proxy(target))
         self._metadata = () if token is None else (("authorization", bearer(token)),)
-        self._timeout = timeout
+        self._timeout = None if timeout is None else positive("timeout", timeout)
+        self._is_closed = False
         self._retry = retry
 
     @cached_property
@@ -66,8 +67,22 @@ class Connection(Generic[Channel]):
         """Opened by the first call: a channel of asyncio belongs to the running event loop."""
         return self._open(*self._destination)
 
+    def _opened(self) -> Channel:
+        if self._is_closed:
+            raise ValueError("the client is closed; make a new one")
+        return self._channel
+
     def _open(self, target: str, credentials: grpc.ChannelCredentials | None, options: ChannelOptions) -> Channel:
         raise NotImplementedError
+
+
+def positive(name: str, value: float) -> float:
+    """Checks a number of seconds."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{name} is {value!r}, must be a number of seconds")
+    if not value > 0:
+        raise ValueError(f"{name} is {value!r}, must be greater than 0 seconds")
+    return value
 
 
 def with_port(target: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Any, Literal
 
 from graspd.geometry import PoseLike, Vector
@@ -19,6 +20,20 @@ def check_type(name: str, value: Any, kind: type, example: str) -> None:
     """Accepts None."""
     if not (value is None or isinstance(value, kind)):
         raise TypeError(f"{name} is {value!r}, must be a graspd.{kind.__name__}, such as {example}")
+
+
+def check_count(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise TypeError(f"{name} is {value!r}, must be an integer")
+    if not 0 <= int(value) < 2**32:
+        raise ValueError(f"{name} is {value!r}, must be from 0 to {2**32 - 1}")
+
+
+def check_numbers(name: str, values: dict[str, Any]) -> None:
+    """Accepts None among them."""
+    for field, value in values.items():
+        if value is not None and (isinstance(value, (bool, str)) or not isinstance(value, Real)):
+            raise TypeError(f"{name}.{field} is {value!r}, must be a number")
 
 
 @dataclass(frozen=True)
@@ -74,6 +89,7 @@ class CollisionCheck:
     depth images or point clouds."""
 
     def __post_init__(self) -> None:
+        check_numbers("CollisionCheck", {"table_height": self.table_height, "clearance": self.clearance})
         if self.mode is not None:
             check_choice("CollisionCheck.mode", self.mode, "off", "flag", "filter")
 
@@ -140,7 +156,7 @@ class Options:
     gripper: Gripper | None = None
     """Shape of the hand; None: the Panda hand, with which the networks were trained."""
     collision: CollisionCheck | None = None
-    """Collision check of the open hand; None: no check."""
+    """Collision check of the open hand; None: that of `CollisionCheck()`."""
     convention: Convention | None = None
     """Frame of the hand that the poses refer to; None: the finger base, closing along y."""
     pregrasp_distance: float | None = None
@@ -160,6 +176,14 @@ class Options:
     """``batch``: for offline processing; normal requests are processed first."""
 
     def __post_init__(self) -> None:
+        check_count("Options.max_grasps", self.max_grasps)
+        check_count("Options.max_grasps_per_object", self.max_grasps_per_object)
+        if isinstance(self.objects, (int, str)):
+            raise TypeError(f"Options.objects is {self.objects!r}, must be a list of labels")
+        for label in self.objects:
+            check_count("Options.objects", label)
+        names = ["threshold", "force", "min_height", "pregrasp_distance", "margin"]
+        check_numbers("Options", {name: getattr(self, name) for name in names})
         check_choice("Options.priority", self.priority, "normal", "batch")
         check_type("Options.collision", self.collision, CollisionCheck, 'CollisionCheck("filter")')
         check_type("Options.convention", self.convention, Convention, 'Convention("tcp")')
