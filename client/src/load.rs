@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Duration;
 
 use rand::rngs::SmallRng;
@@ -21,12 +21,14 @@ pub enum Arrivals {
 }
 
 /// When the load ends. Calls in flight are completed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug)]
 pub enum Until {
     /// After this many calls.
     Calls(usize),
     /// After this time.
     Elapsed(Duration),
+    /// After this time, or when the flag is set.
+    Stopped(Duration, Arc<AtomicBool>),
 }
 
 /// Latencies and outcomes of the calls.
@@ -87,9 +89,10 @@ where
 {
     let call = Arc::new(call);
     let started = Instant::now();
-    let continues = move |number: usize, now: Instant| match until {
-        Until::Calls(calls) => number < calls,
-        Until::Elapsed(duration) => now < started + duration,
+    let continues = move |number: usize, now: Instant| match &until {
+        Until::Calls(calls) => number < *calls,
+        Until::Elapsed(duration) => now < started + *duration,
+        Until::Stopped(duration, is_stopped) => now < started + *duration && !is_stopped.load(Ordering::Relaxed),
     };
     let mut report = match arrivals {
         Arrivals::Callers(callers) => by_callers(callers, continues, &call).await,
@@ -103,7 +106,7 @@ where
 
 async fn by_callers<C, F>(
     callers: usize,
-    continues: impl Fn(usize, Instant) -> bool + Copy + Send + 'static,
+    continues: impl Fn(usize, Instant) -> bool + Clone + Send + 'static,
     call: &Arc<C>,
 ) -> Report
 where
@@ -113,7 +116,7 @@ where
     let next = Arc::new(AtomicUsize::new(0));
     let mut tasks = JoinSet::new();
     for _ in 0..callers {
-        let (call, next) = (Arc::clone(call), Arc::clone(&next));
+        let (call, next, continues) = (Arc::clone(call), Arc::clone(&next), continues.clone());
         tasks.spawn(async move {
             let mut report = Report::default();
             loop {

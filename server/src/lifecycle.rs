@@ -261,19 +261,6 @@ impl Process<'_> {
         // Requests that are converted and fused, one for each CPU; as many as in the queue of a model may wait.
         let conversions = FairSemaphore::new(processors(), capacity);
         let inference = InferenceApi::new(Arc::clone(models), calls.clone(), control, conversions.clone());
-        let rest = listeners.rest.map(|listener| {
-            let rest = Rest {
-                inference: inference.clone(),
-                tokens: config.tokens.clone(),
-                limits: config.limits,
-                metrics: Arc::clone(metrics),
-                conversions: Arc::new(Semaphore::new(processors())),
-                waiting: Arc::new(Semaphore::new(capacity)),
-            };
-            let tls = config.tls.as_ref().map(|tls| tls.http.clone());
-            let of_rest = http_config("rest", self.connections, tls);
-            tokio::spawn(rest::serve(listener, rest, of_rest, state.clone()))
-        });
         let tracked_volumes = TrackedVolumes::new(config.max_tracked, config.track_timeout, metrics.tracked());
         let grasps = GraspApi {
             models: Arc::clone(models),
@@ -286,6 +273,20 @@ impl Process<'_> {
             read_ahead: (sessions * batching.max).min(capacity / 2).max(1),
             conversions,
         };
+        let rest = listeners.rest.map(|listener| {
+            let rest = Rest {
+                grasps: grasps.clone(),
+                inference: inference.clone(),
+                tokens: config.tokens.clone(),
+                limits: config.limits,
+                metrics: Arc::clone(metrics),
+                conversions: Arc::new(Semaphore::new(processors())),
+                waiting: Arc::new(Semaphore::new(capacity)),
+            };
+            let tls = config.tls.as_ref().map(|tls| tls.http.clone());
+            let of_rest = http_config("rest", self.connections, tls);
+            tokio::spawn(rest::serve(listener, rest, of_rest, state.clone()))
+        });
         if let Some(tokens) = &config.tokens {
             tokio::spawn(Arc::clone(tokens).watch(hangup().context("cannot install a signal handler")?));
         }

@@ -64,9 +64,9 @@ def share(part: int, whole: int) -> float:
 
 
 def half_interval(part: int, whole: int) -> float:
-    """Half-width of the 95 % interval of a share, by the normal approximation."""
-    p = share(part, whole)
-    return Z * math.sqrt(p * (1 - p) / whole) if whole else 0.0
+    """The distance of a share from the farther end of its 95 % interval."""
+    low, high = wilson(part, whole)
+    return max(share(part, whole) - low, high - share(part, whole))
 
 
 def wilson(part: int, whole: int) -> tuple[float, float]:

@@ -4,6 +4,8 @@ use grasp_models::Calibration;
 use nalgebra::{Matrix2, Vector2};
 use serde::{Deserialize, Serialize};
 
+use crate::score::wilson;
+
 /// An executed grasp as written by `bench --attempts` and `sim/pybullet/clear.py --attempts`; other fields are ignored.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 pub struct Attempt {
@@ -130,16 +132,11 @@ fn loss(rows: &[Row], weights: &Vector2<f64>) -> f64 {
 }
 
 impl Bin {
-    /// The success rate and its 95 % Wilson score interval (Wilson 1927), which is also valid near 0 and 1; `None`
-    /// without attempts.
+    /// The success rate and its 95 % interval; `None` without attempts.
     #[must_use]
     pub fn share(&self) -> Option<(f64, [f64; 2])> {
-        const Z: f64 = 1.96;
-        let n = self.attempts as f64;
-        let share = self.lifted as f64 / n;
-        let middle = (share + Z * Z / (2.0 * n)) / (1.0 + Z * Z / n);
-        let half = Z / (1.0 + Z * Z / n) * (share * (1.0 - share) / n + Z * Z / (4.0 * n * n)).sqrt();
-        (self.attempts > 0).then_some((share, [middle - half, middle + half]))
+        let share = self.lifted as f64 / self.attempts as f64;
+        (self.attempts > 0).then(|| (share, wilson(self.lifted, self.attempts)))
     }
 }
 

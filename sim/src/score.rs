@@ -22,9 +22,9 @@ pub struct Summary {
     pub gsr: f64,
     /// Declutter rate: successes / objects.
     pub dr: f64,
-    /// Half the width of the 95 % interval of `gsr`.
+    /// Distance of `gsr` from the farther end of its 95 % interval.
     pub gsr_interval: f64,
-    /// Half the width of the 95 % interval of `dr`.
+    /// Distance of `dr` from the farther end of its 95 % interval.
     pub dr_interval: f64,
     /// Failed attempts with a contact at the pre-grasp.
     pub blocked_at_pregrasp: usize,
@@ -97,13 +97,25 @@ impl Summary {
     }
 }
 
-/// A proportion and half the width of its 95 % interval (normal approximation).
+/// A proportion, and its distance from the farther end of its [`wilson`] interval; 0 and 1 for no attempts.
 fn proportion(part: usize, whole: usize) -> (f64, f64) {
     if whole == 0 {
-        return (0.0, 0.0);
+        return (0.0, 1.0);
     }
     let share = part as f64 / whole as f64;
-    (share, 1.96 * (share * (1.0 - share) / whole as f64).sqrt())
+    let [low, high] = wilson(part as u64, whole as u64);
+    (share, (share - low).max(high - share))
+}
+
+/// The 95 % Wilson score interval of a proportion (Wilson 1927), which is also valid near 0 and 1. NaN without attempts.
+#[must_use]
+pub(crate) fn wilson(part: u64, whole: u64) -> [f64; 2] {
+    const Z: f64 = 1.96;
+    let n = whole as f64;
+    let share = part as f64 / n;
+    let middle = (share + Z * Z / (2.0 * n)) / (1.0 + Z * Z / n);
+    let half = Z / (1.0 + Z * Z / n) * (share * (1.0 - share) / n + Z * Z / (4.0 * n * n)).sqrt();
+    [middle - half, middle + half]
 }
 
 /// A figure over several seeds.
@@ -156,6 +168,16 @@ impl Milliseconds {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn few_attempts_have_wide_intervals() {
+        let (share, interval) = proportion(3, 3);
+        assert_eq!(share, 1.0);
+        assert!((interval - 0.561).abs() < 1e-3, "{interval}");
+        let (share, interval) = proportion(800, 1000);
+        assert!(share == 0.8 && (interval - 0.0259).abs() < 1e-3, "{interval}");
+        assert_eq!(proportion(0, 0), (0.0, 1.0));
+    }
 
     #[test]
     fn seeds_are_averaged() {

@@ -4,6 +4,7 @@
     GRASPD_PERF_ANALYZER=$(python3 tests/tools.py perf-analyzer) $(python3 tests/tools.py python) -m unittest discover --start-directory tests/python --pattern test_inference.py
 """
 
+import base64
 import gzip
 import json
 import os
@@ -12,12 +13,14 @@ import subprocess
 import unittest
 import zlib
 from queue import SimpleQueue
+from pathlib import Path
 from tempfile import NamedTemporaryFile
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 import numpy as np
 import scene
+from people_files import CAMERA_FROM_TASK, MILLIMETRES, png, quaternion
 from server import Server
 from tritonclient.grpc import InferenceServerClient, InferInput, InferRequestedOutput
 from tritonclient.utils import InferenceServerException
@@ -232,6 +235,44 @@ class InferenceTest(unittest.TestCase):
             with self.subTest(message):
                 status, _, text = self.rest(f"/models/{MODEL}/infer", data, Content_Encoding="gzip")
                 self.assertEqual((status, message in json.loads(text)["error"]), (400, True), text)
+
+    def detect(self, **changes):
+        """The status and the response of `POST /v1/detect` with a depth image of the block."""
+        pose = np.linalg.inv(CAMERA_FROM_TASK)
+        x, y, z, w = quaternion(pose)
+        position = dict(zip("xyz", pose[:3, 3].tolist()))
+        with NamedTemporaryFile() as image:
+            png(Path(image.name), MILLIMETRES)
+            data = base64.b64encode(Path(image.name).read_bytes()).decode()
+        view = {
+            "data": data,
+            "unit": "DEPTH_UNIT_PNG_MILLIMETRES",
+            "camera": {"width": scene.WIDTH, "height": scene.HEIGHT, "k": scene.K.flatten().tolist()},
+            "frameFromCamera": {"position": position, "orientation": {"x": x, "y": y, "z": z, "w": w}},
+        }
+        body = {"views": [view], "options": {"maxGrasps": 3, "convention": {"origin": "ORIGIN_TCP"}}} | changes
+        request = Request(f"http://{self.server.rest}/v1/detect", json.dumps(body).encode())
+        try:
+            with urlopen(request) as response:
+                return response.status, json.load(response)
+        except HTTPError as refusal:
+            return refusal.code, json.load(refusal)
+
+    def test_grasps_in_a_depth_image_as_json(self):
+        status, reply = self.detect()
+        self.assertEqual(status, 200, reply)
+        self.assertTrue(1 <= len(reply["grasps"]) <= 3)
+        tips = reply["grasps"][0]["pose"]["position"]
+        self.assertLess(abs(tips["x"] - 0.15), 0.012)
+        self.assertEqual(reply["model"], MODEL)
+        for change, expected in [
+            ({"view": []}, "unrecognized field name 'view'"),
+            ({"views": []}, "views is a list of 0, must have from 1 to 64"),
+            ({"options": {"threshold": 2}}, "options.threshold is 2"),
+        ]:
+            status, reply = self.detect(**change)
+            self.assertEqual(status, 400)
+            self.assertIn(expected, reply["error"])
 
     def test_rest_errors_say_what_is_wrong(self):
         tensor = {"name": "tsdf", "datatype": "FP32", "shape": [1, 1, *EDGE], "data": [0.5]}

@@ -1,7 +1,8 @@
-//! The Open Inference Protocol over HTTP/1.1, for clients without gRPC: the requests of `api::inference` with
-//! JSON, and tensors as JSON or binary (Triton's extension).
+//! HTTP/1.1 for clients without gRPC: grasps in depth images as JSON, and the Open Inference Protocol, which are the requests
+//! of `api::inference` with tensors as JSON or binary (Triton's extension).
 
 mod body;
+mod detect;
 mod tensors;
 
 use std::sync::Arc;
@@ -18,6 +19,7 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use axum::{Json, Router};
 use grasp_proto::oip;
+use grasp_proto::pb::grasp_service_server::GraspService;
 use grasp_proto::oip::grpc_inference_service_server::GrpcInferenceService;
 use serde_json::{Value, json};
 use tokio::net::TcpListener;
@@ -27,6 +29,7 @@ use tonic::metadata::MetadataMap;
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
 
+use crate::api::grasp::GraspApi;
 use crate::api::inference::InferenceApi;
 use crate::readiness;
 use crate::telemetry::metrics::Metrics;
@@ -44,6 +47,7 @@ const TIMEOUT: Duration = Duration::from_secs(60);
 /// State shared by the handlers.
 #[derive(Clone)]
 pub(crate) struct Rest {
+    pub grasps: GraspApi,
     pub inference: InferenceApi,
     /// None if requests need no token.
     pub tokens: Option<Arc<Tokens>>,
@@ -64,6 +68,7 @@ pub(crate) async fn serve(
     state: watch::Receiver<readiness::State>,
 ) {
     let mut app = Router::new()
+        .route("/v1/detect", post(detect))
         .route("/v2", get(server_metadata))
         .route("/v2/models/stats", get(all_statistics))
         .route("/v2/repository/index", post(repository_index))
@@ -268,6 +273,27 @@ async fn statistics(State(rest): State<Rest>, name: String, version: String) -> 
         })
     });
     Ok(Json(json!({ "model_stats": models.collect::<Vec<_>>() })))
+}
+
+/// Detects grasps in depth images.
+async fn detect(State(rest): State<Rest>, request: Request) -> Reply<Response> {
+    let (mut parts, body) = request.into_parts();
+    let deadline = deadline::read(&parts.headers).unwrap_or_else(|| Deadline(Instant::now() + TIMEOUT));
+    parts.extensions.insert(deadline);
+    let body = read(body, &parts, rest.limits).await.inspect_err(|status| rest.metrics.ended("", status.code()))?;
+    let parse = move || {
+        let body = body;
+        detect::request(&body.bytes)
+    };
+    let message = rest.convert(deadline, parse).await.and_then(|parsed| parsed);
+    let message = message.inspect_err(|status| rest.metrics.ended("", status.code()))?;
+    let reply = rest.grasps.detect_grasps_from_depth(grpc(parts, message)).await?;
+    let (_, reply, extensions) = reply.into_parts();
+    let bytes = rest.convert(deadline, move || detect::response(&reply)).await??;
+    let mut response = http::Response::new(tonic::body::Body::new(Body::from(bytes)));
+    *response.extensions_mut() = extensions;
+    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/json"));
+    Ok(keep_permit(response, rest.limits).map(Body::new))
 }
 
 async fn infer(

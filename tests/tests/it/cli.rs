@@ -14,6 +14,7 @@ use grasp_tests::scene::{CAMERA, TABLE, camera, camera_at, depth, seen};
 use grasp_tests::{RESOLUTION, Server, TestModel, blobs, grasp};
 use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use npyz::WriterBuilder;
+use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 use tempfile::TempDir;
 use tokio_stream::StreamExt;
@@ -310,6 +311,46 @@ fn bench_reports_latency_throughput_and_refusals() {
     assert!(crowd["outcomes"]["ResourceExhausted"]["calls"].as_u64().unwrap() > 0, "{crowd}");
     let steady = bench(&["--seconds", "0.5", "--rate", "20"]);
     assert!(steady["outcomes"]["answered"]["p50_seconds"].as_f64().unwrap() > 0.0, "{steady}");
+}
+
+#[test]
+fn the_former_names_of_variables_work_with_a_warning() {
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let address = server.grpc().to_string();
+    let models = |variables: &[(&str, &str)]| {
+        let mut command = Command::new(grasp());
+        command.arg("models").env_remove("GRASP_SERVER").env_remove("GRASPD_SERVER").envs(variables.iter().copied());
+        command.output().unwrap()
+    };
+    let former = models(&[("GRASPD_SERVER", &address)]);
+    assert!(former.status.success() && text(&former.stderr).contains("set GRASP_SERVER instead"), "{former:?}");
+    let both = models(&[("GRASPD_SERVER", "127.0.0.1:1"), ("GRASP_SERVER", &address)]);
+    assert!(both.status.success() && both.stderr.is_empty(), "{both:?}");
+}
+
+#[test]
+fn help_is_in_groups_and_shells_get_completions() {
+    let run = |args: &[&str]| Command::new(grasp()).args(args).output().unwrap();
+    let help = run(&["detect", "-h"]);
+    let headings: Vec<&str> = text(&help.stdout).lines().filter(|line| line.ends_with(':')).collect();
+    assert_eq!(headings, ["Options:", "Input:", "Grasps:", "Connection:"]);
+    let script = run(&["completions", "bash"]);
+    assert!(script.status.success() && text(&script.stdout).contains("--find-table"), "{script:?}");
+}
+
+#[tokio::test]
+async fn ctrl_c_ends_a_bench_with_what_was_measured() {
+    let (_folder, files) = files();
+    let server = Server::run(&[TestModel::new("mirror")], &[]);
+    let mut command = Command::new(grasp());
+    command.args(["--server", &server.grpc().to_string(), "--json", "bench"]).arg(&files[0]).args(["--seconds", "600"]);
+    let bench = command.stdout(Stdio::piped()).spawn().unwrap();
+    server.wait_until("graspd_requests_total{code=\"OK\",model=\"mirror 1\"}", |count| count > 5.0).await;
+    kill_process(Pid::from_child(&bench), Signal::INT).unwrap();
+    let output = bench.wait_with_output().unwrap();
+    assert!(output.status.success(), "{output:?}");
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert!(report["outcomes"]["answered"]["calls"].as_u64().unwrap() > 0, "{report}");
 }
 
 /// Depth images of two cameras in each supported format: paths of the images, and flags with intrinsics and poses.

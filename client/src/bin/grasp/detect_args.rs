@@ -7,6 +7,7 @@ use crate::pose::Poses;
 
 /// Options of the detection.
 #[derive(Args, Clone)]
+#[command(next_help_heading = "Grasps")]
 pub(crate) struct DetectArgs {
     /// Model, one of `grasp models`. Default: the server's default model.
     #[arg(long, default_value = "", hide_default_value = true)]

@@ -27,12 +27,14 @@ use std::fs;
 use std::io::{self, IsTerminal};
 use std::path::PathBuf;
 use std::pin::pin;
-use std::process::ExitCode;
+use std::process::{ExitCode, exit};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
 use anyhow::{Context, anyhow};
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
+use clap_complete::{Shell, generate};
 use grasp_client::{
     Access, Arrivals, Certificate, Client, DetectOptions, Detection, Health, Identity, Options, Retry, Token, Until,
     load,
@@ -139,6 +141,11 @@ enum Command {
     Models,
     /// Print whether the server is ready; exit status 1 if it is not.
     Health,
+    /// Print the completions of a shell, for example: source <(grasp completions bash)
+    Completions {
+        /// The shell.
+        shell: Shell,
+    },
 }
 
 #[derive(Args)]
@@ -357,7 +364,7 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             // An invalid request ends the benchmark with its error before the load starts.
             scene.detect(&client, options.clone()).await?;
             let arrivals = rate.map_or(Arrivals::Callers(callers.into()), Arrivals::Rate);
-            let until = Until::Elapsed(Duration::from_secs_f64(seconds));
+            let until = Until::Stopped(Duration::from_secs_f64(seconds), interrupted());
             let report = load(arrivals, until, move |_| {
                 let (client, scene, options) = (client.clone(), Arc::clone(&scene), options.clone());
                 async move {
@@ -374,6 +381,11 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
                 return Ok(ExitCode::FAILURE);
             }
         }
+        Command::Completions { shell } => {
+            let mut script = Vec::new();
+            generate(shell, &mut Cli::command(), "grasp", &mut script);
+            show::print(String::from_utf8_lossy(&script).trim_end())?;
+        }
         Command::Models => {
             let models = connect().await?.list_models().await?;
             show::print(&if json { show::models_json(&models) } else { show::models(&models) })?;
@@ -387,6 +399,21 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
         }
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// A flag that Ctrl-C sets, so that what was measured is printed. A second Ctrl-C ends the process.
+fn interrupted() -> Arc<AtomicBool> {
+    let flag = Arc::new(AtomicBool::new(false));
+    let set = Arc::clone(&flag);
+    tokio::spawn(async move {
+        // An error means that Ctrl-C cannot be received, and keeps its effect.
+        if tokio::signal::ctrl_c().await.is_ok() {
+            set.store(true, Ordering::Relaxed);
+            let _ = tokio::signal::ctrl_c().await;
+            exit(130);
+        }
+    });
+    flag
 }
 
 /// Shows a progress bar during `work`, if `enabled` and stderr is a terminal.

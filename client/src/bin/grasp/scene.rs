@@ -19,6 +19,7 @@ use crate::{cloud, volume};
 
 /// The observation: a volume, depth images with camera poses, or point clouds with camera positions.
 #[derive(Args, Clone)]
+#[command(next_help_heading = "Input")]
 pub(crate) struct SceneArgs {
     /// Volume, depth images or point clouds. A volume is a .npy file, or a .npz file with one array or an array `grid`:
     /// N×N×N values in [0, 1] (u8: 0 to 255), indexed x, y, z, 0.5 on the surface, 0 if unobserved. With --intrinsics
