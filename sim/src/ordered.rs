@@ -1,14 +1,16 @@
-//! Parallel work with results in order.
+//! Parallel work whose results are taken in order.
 
+use std::collections::BTreeMap;
 use std::ops::Range;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc;
 
-use rayon::prelude::*;
+/// Results per thread that are computed or wait for an earlier one.
+const AHEAD: u64 = 4;
 
-/// Numbers per thread in a chunk: enough that threads idle little at its end, and few enough that an interrupted run
-/// loses only seconds.
-const CHUNK: u64 = 16;
-
-/// Calls `work` for every number on rayon's threads, and `take` with the results in the order of the numbers.
+/// Computes `work` of each number on all threads and gives the results to `take`, in the order of the numbers and as soon
+/// as they are there, so that an interrupted run has taken nearly all of them.
 ///
 /// # Errors
 /// The first error of `take`. No further work is started then.
@@ -17,15 +19,41 @@ pub fn for_each<T: Send, E>(
     work: impl Fn(u64) -> T + Sync,
     mut take: impl FnMut(u64, T) -> Result<(), E>,
 ) -> Result<(), E> {
-    let chunk = CHUNK * rayon::current_num_threads() as u64;
-    let mut start = numbers.start;
-    while start < numbers.end {
-        let end = numbers.end.min(start + chunk);
-        let results: Vec<T> = (start..end).into_par_iter().map(&work).collect();
-        (start..end).zip(results).try_for_each(|(number, result)| take(number, result))?;
-        start = end;
-    }
-    Ok(())
+    let window = AHEAD * rayon::current_num_threads() as u64;
+    let is_stopped = AtomicBool::new(false);
+    let (work, is_stopped) = (&work, &is_stopped);
+    let (sender, results) = mpsc::channel();
+    rayon::in_place_scope_fifo(|scope| {
+        let (mut started, mut next) = (numbers.start, numbers.start);
+        let mut early = BTreeMap::new();
+        while next < numbers.end {
+            for number in started..numbers.end.min(next + window) {
+                let sender = sender.clone();
+                scope.spawn_fifo(move |_| {
+                    if !is_stopped.load(Ordering::Relaxed) {
+                        // The receiver is gone after an error of `take`, when nobody wants the result.
+                        let _ = sender.send((number, catch_unwind(AssertUnwindSafe(|| work(number)))));
+                    }
+                });
+                started = number + 1;
+            }
+            // The sender above keeps the channel open, and each started work sends one result.
+            let Ok((number, result)) = results.recv() else { break };
+            early.insert(number, result);
+            while let Some(result) = early.remove(&next) {
+                let taken = match result {
+                    Ok(result) => take(next, result),
+                    Err(panic) => {
+                        is_stopped.store(true, Ordering::Relaxed);
+                        resume_unwind(panic)
+                    }
+                };
+                taken.inspect_err(|_| is_stopped.store(true, Ordering::Relaxed))?;
+                next += 1;
+            }
+        }
+        Ok(())
+    })
 }
 
 #[cfg(test)]
@@ -57,5 +85,14 @@ mod tests {
     fn an_error_stops_the_work() {
         let ended = for_each(0..1000, |number| number, |number, _| if number == 5 { Err(number) } else { Ok(()) });
         assert_eq!(ended, Err(5));
+    }
+
+    #[test]
+    fn results_are_taken_while_later_ones_are_computed() {
+        let (sender, receiver) = mpsc::channel();
+        let receiver = std::sync::Mutex::new(receiver);
+        // The work on 100 ends when the result of 0 was taken.
+        let wait = |number| if number == 100 { receiver.lock().unwrap().recv().unwrap() };
+        for_each(0..101, wait, |number, ()| if number == 0 { sender.send(()) } else { Ok(()) }).unwrap();
     }
 }

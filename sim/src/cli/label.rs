@@ -100,6 +100,7 @@ impl Label {
             },
         )?;
         progress.finish();
+        eprintln!("scenes {} to {} are in {}", self.first, end.saturating_sub(1), self.out.display());
         Ok(())
     }
 
