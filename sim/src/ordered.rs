@@ -92,7 +92,11 @@ mod tests {
         let (sender, receiver) = mpsc::channel();
         let receiver = std::sync::Mutex::new(receiver);
         // The work on 100 ends when the result of 0 was taken.
-        let wait = |number| if number == 100 { receiver.lock().unwrap().recv().unwrap() };
+        let wait = |number| {
+            if number == 100 {
+                receiver.lock().unwrap().recv().unwrap()
+            }
+        };
         for_each(0..101, wait, |number, ()| if number == 0 { sender.send(()) } else { Ok(()) }).unwrap();
     }
 }

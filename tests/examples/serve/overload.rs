@@ -35,11 +35,12 @@ impl Bench {
             let client = Client::connect(server.grpc().to_string()).await?;
             let until = Until::Elapsed(2 * self.seconds);
             let callers = Arrivals::Callers(8);
-            let capacity = run_load(&client, &self.scene, callers, until, Options::default()).await.throughput();
+            let capacity =
+                run_load(&client, &self.scene, callers, until.clone(), Options::default()).await.throughput();
             for timeout in [None, Some(Duration::from_secs_f64(DEADLINE / capacity))] {
                 let options = Options { timeout, ..Options::default() };
                 let arrivals = Arrivals::Rate(OVERLOAD * capacity);
-                let report = run_load(&client, &self.scene, arrivals, until, options).await;
+                let report = run_load(&client, &self.scene, arrivals, until.clone(), options).await;
                 let goodput = report.throughput();
                 let kind =
                     timeout.map_or("without deadlines".to_owned(), |timeout| format!("deadlines of {timeout:.0?}"));
@@ -125,12 +126,13 @@ impl Bench {
         };
         let (many, single) = (client("many").await?, client("single").await?);
         let scene = Arc::clone(&self.scene);
-        let until = Until::Elapsed(self.seconds);
+        let until = || Until::Elapsed(self.seconds);
+        let of_many = until();
         let flood =
             tokio::spawn(
-                async move { run_load(&many, &scene, Arrivals::Callers(64), until, Options::default()).await },
+                async move { run_load(&many, &scene, Arrivals::Callers(64), of_many, Options::default()).await },
             );
-        let report = run_load(&single, &self.scene, Arrivals::Callers(1), until, Options::default()).await;
+        let report = run_load(&single, &self.scene, Arrivals::Callers(1), until(), Options::default()).await;
         let others = flood.await?;
         let mut table = Table::new("vgn, two callers", &["calls", "answers/s", "refused"]);
         table.row("64 open calls", [64.0, others.throughput(), others.refusals() as f64]);

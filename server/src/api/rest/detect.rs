@@ -7,8 +7,9 @@ use prost::Message;
 use prost_reflect::{DescriptorPool, DynamicMessage, MessageDescriptor};
 use tonic::Status;
 
-static POOL: LazyLock<DescriptorPool> =
-    LazyLock::new(|| DescriptorPool::decode(FILE_DESCRIPTOR_SET).expect("the descriptors are those that prost was built from"));
+static POOL: LazyLock<DescriptorPool> = LazyLock::new(|| {
+    DescriptorPool::decode(FILE_DESCRIPTOR_SET).expect("the descriptors are those that prost was built from")
+});
 
 fn descriptor(name: &str) -> MessageDescriptor {
     POOL.get_message_by_name(name).expect("the message is in grasp.proto")
@@ -28,8 +29,10 @@ pub(super) fn request(body: &[u8]) -> Result<pb::DetectGraspsFromDepthRequest, S
 
 /// The body of a response.
 pub(super) fn response(reply: &pb::DetectGraspsResponse) -> Result<Vec<u8>, Status> {
-    let failed = |error: &dyn std::fmt::Display| Status::internal(format!("the reply cannot be written as JSON: {error}"));
+    let failed =
+        |error: &dyn std::fmt::Display| Status::internal(format!("the reply cannot be written as JSON: {error}"));
     let descriptor = descriptor("grasp.v1.DetectGraspsResponse");
-    let message = DynamicMessage::decode(descriptor, reply.encode_to_vec().as_slice()).map_err(|error| failed(&error))?;
+    let message =
+        DynamicMessage::decode(descriptor, reply.encode_to_vec().as_slice()).map_err(|error| failed(&error))?;
     serde_json::to_vec(&message).map_err(|error| failed(&error))
 }
