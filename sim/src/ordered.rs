@@ -22,12 +22,14 @@ pub fn for_each<T: Send, E>(
     let window = AHEAD * rayon::current_num_threads() as u64;
     let is_stopped = AtomicBool::new(false);
     let (work, is_stopped) = (&work, &is_stopped);
-    let (sender, results) = mpsc::channel();
+    // As many as are started and not taken, so that no thread waits to send.
+    let (sender, results) = mpsc::sync_channel(window as usize);
     rayon::in_place_scope_fifo(|scope| {
         let (mut started, mut next) = (numbers.start, numbers.start);
         let mut early = BTreeMap::new();
         while next < numbers.end {
-            for number in started..numbers.end.min(next + window) {
+            let end = numbers.end.min(next + window);
+            for number in started..end {
                 let sender = sender.clone();
                 scope.spawn_fifo(move |_| {
                     if !is_stopped.load(Ordering::Relaxed) {
@@ -35,8 +37,8 @@ pub fn for_each<T: Send, E>(
                         let _ = sender.send((number, catch_unwind(AssertUnwindSafe(|| work(number)))));
                     }
                 });
-                started = number + 1;
             }
+            started = end;
             // The sender above keeps the channel open, and each started work sends one result.
             let Ok((number, result)) = results.recv() else { break };
             early.insert(number, result);
@@ -89,7 +91,7 @@ mod tests {
 
     #[test]
     fn results_are_taken_while_later_ones_are_computed() {
-        let (sender, receiver) = mpsc::channel();
+        let (sender, receiver) = mpsc::sync_channel(1);
         let receiver = std::sync::Mutex::new(receiver);
         // The work on 100 ends when the result of 0 was taken.
         let wait = |number| {

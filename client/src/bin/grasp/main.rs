@@ -27,7 +27,7 @@ use std::fs;
 use std::io::{self, IsTerminal};
 use std::path::PathBuf;
 use std::pin::pin;
-use std::process::{ExitCode, exit};
+use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
@@ -401,7 +401,7 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
     Ok(ExitCode::SUCCESS)
 }
 
-/// A flag that Ctrl-C sets, so that what was measured is printed. A second Ctrl-C ends the process.
+/// A flag that Ctrl-C sets, so that what was measured is printed after the calls in flight.
 fn interrupted() -> Arc<AtomicBool> {
     let flag = Arc::new(AtomicBool::new(false));
     let set = Arc::clone(&flag);
@@ -409,8 +409,6 @@ fn interrupted() -> Arc<AtomicBool> {
         // An error means that Ctrl-C cannot be received, and keeps its effect.
         if tokio::signal::ctrl_c().await.is_ok() {
             set.store(true, Ordering::Relaxed);
-            let _ = tokio::signal::ctrl_c().await;
-            exit(130);
         }
     });
     flag
