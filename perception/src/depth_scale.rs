@@ -82,7 +82,7 @@ pub fn measured_shift(factor: f64, eye: &Point3<f64>, table: f64) -> f64 {
     (eye.z - table) * (1.0 - 1.0 / factor)
 }
 
-/// The angle between the z axis and the plane that fits points best along z, radians; `None` for fewer than three.
+/// The angle between the z axis and the plane that fits points best along z, radians; `None` if the points lie on a line.
 fn tilt(points: impl Iterator<Item = Point3<f64>>) -> Option<f64> {
     let points: Vec<_> = points.collect();
     let mean = points.iter().map(|point| point.coords).sum::<Vector3<f64>>() / points.len() as f64;

@@ -171,7 +171,7 @@ impl Warning {
         }
     }
 
-    /// Tells of a correction of the depths of a view from `eye` that moved the table by as much as a wrong height of it.
+    /// The warning about corrected depths of a view from `eye`, if the correction moved the table by more than 1 cm.
     #[must_use]
     pub fn of_depth_factor(view: usize, factor: f64, eye: &Point3<f64>, expected: f64) -> Option<Warning> {
         let shift = measured_shift(factor, eye, expected);

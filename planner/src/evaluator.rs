@@ -3,10 +3,10 @@ use std::path::Path;
 
 use grasp::{DecodeParams, Decoded, FINGER_DEPTH, Grasp, Patch, Selection, Volume};
 use grasp_models::{Classifier, LoadError, Metadata, Options, RuntimeError};
+use grasp_perception::Scene;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
 use crate::{HandFit, PlanError, PlanParams};
-use grasp_perception::Scene;
 
 /// Smallest quality of a network's grasp that is evaluated.
 const PROPOSAL_THRESHOLD: f32 = 0.2;
@@ -14,17 +14,17 @@ const PROPOSAL_THRESHOLD: f32 = 0.2;
 /// Largest number of a network's grasps that are evaluated.
 const PROPOSALS: usize = 32;
 
-/// Quality from which a grasp makes further proposals needless.
+/// If no proposal has this quality, the hand is fitted to the surface for more of them.
 const SURE: f32 = 0.9;
+
+/// Number of points at which the hand is fitted, and largest number of the proposals from it.
+const SAMPLES: usize = 150;
+const FITTED: usize = 96;
 
 /// Quality from which moving a grasp gains nothing.
 const SETTLED: f32 = 0.97;
 
-/// Number of points at which the hand is then fitted to the surface, and largest number of these grasps.
-const SAMPLES: usize = 150;
-const FITTED: usize = 96;
-
-/// Number of the best of them that are moved.
+/// Number of the best proposals that are moved.
 const REFINED: usize = 6;
 
 /// Largest number of times that a grasp is moved.
@@ -66,8 +66,8 @@ impl Evaluator {
         DecodeParams { threshold: PROPOSAL_THRESHOLD, force: None, clearance: None, ..*params }
     }
 
-    /// Scores and moves a network's proposals, and selects the grasps that pass `params`. Stops when `is_wanted` returns
-    /// false.
+    /// Scores and moves a network's proposals, and selects the grasps that pass `params`. If no proposal is sure to hold, places
+    /// where the hand fits around the surface are proposals, too. Stops when `is_wanted` returns false.
     ///
     /// # Errors
     /// [`PlanError`] if the classifier fails or planning is cancelled.
@@ -84,16 +84,15 @@ impl Evaluator {
         let selection = Selection::new(&scene.volume, &params.decode);
         let (volume, depth) = (&scene.volume, depth(&params.decode));
         self.evaluate(&mut grasps, volume, depth)?;
-        let is_settled = |grasp: &Grasp| grasp.quality >= SETTLED && selection.accepts(&grasp.pose);
-        let is_sure = |grasp: &Grasp| grasp.quality >= SURE && selection.accepts(&grasp.pose);
-        if !grasps.iter().any(is_sure) {
+        let reaches = |grasp: &Grasp, quality: f32| grasp.quality >= quality && selection.accepts(&grasp.pose);
+        if !grasps.iter().any(|grasp| reaches(grasp, SURE)) {
             let mut fitted = HandFit::sampled(SAMPLES, scene, params, is_wanted)?.spread(FITTED, volume.pose());
             self.evaluate(&mut fitted, volume, depth)?;
             grasps.extend(fitted);
         }
         sort(&mut grasps);
         let mut moving: Vec<usize> = (0..REFINED.min(grasps.len())).collect();
-        moving.retain(|&index| !is_settled(&grasps[index]));
+        moving.retain(|&index| !reaches(&grasps[index], SETTLED));
         for _ in 0..MOVES {
             if !is_wanted() {
                 return Err(PlanError::Cancelled);

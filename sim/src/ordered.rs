@@ -33,7 +33,7 @@ pub fn for_each<T: Send, E>(
                 let sender = sender.clone();
                 scope.spawn_fifo(move |_| {
                     if !is_stopped.load(Ordering::Relaxed) {
-                        // The receiver is gone after an error of `take`, when nobody wants the result.
+                        // Fails after an error of `take`, when the result is not needed.
                         let _ = sender.send((number, catch_unwind(AssertUnwindSafe(|| work(number)))));
                     }
                 });

@@ -1,7 +1,6 @@
 """Writes the files that people have of one scene: the block on a table of scene.py, seen by a camera of 160 × 120 pixels."""
 
 import json
-import pickle
 import struct
 import zlib
 
@@ -187,7 +186,6 @@ def depths(folder):
 def pickled(path):
     """A pickled dictionary in a .npy file, as data sets of grasps have it."""
     np.save(path, {"depth": DEPTH, "K": K}, allow_pickle=True)
-    assert pickle.dumps  # NumPy pickles it
 
 
 def distorted(d, model):

@@ -229,8 +229,8 @@ class GraspNode:
 
     def send(self, feedback=None, **fields):
         """The handle of an accepted goal."""
-        told = (lambda message: feedback(message.feedback.stage)) if feedback else None
-        handle = wait(self.action.send_goal_async(action.DetectGrasps.Goal(**fields), told))
+        on_feedback = (lambda message: feedback(message.feedback.stage)) if feedback else None
+        handle = wait(self.action.send_goal_async(action.DetectGrasps.Goal(**fields), on_feedback))
         assert handle.accepted
         return handle
 
