@@ -15,7 +15,7 @@ use crate::scheduler::{Refused, Scheduler, Service};
 #[derive(Clone)]
 pub struct FairSemaphore(Arc<Scheduler<oneshot::Sender<Permit>>>);
 
-/// A permit. Dropping it gives it to the next request.
+/// A permit, which returns to the semaphore when it is dropped.
 pub struct Permit(Option<FairSemaphore>);
 
 impl FairSemaphore {

@@ -4,11 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-/// Subfolder of the model folder with GPD's classifiers.
-pub(crate) const CLASSIFIERS: &str = "classifiers";
-
-/// Subfolder of the model folder with the evaluators of networks' grasps.
-pub(crate) const EVALUATORS: &str = "evaluators";
+use grasp_planner::{CLASSIFIERS, EVALUATORS};
 
 /// File in the model folder with the name of the default model.
 pub(crate) const DEFAULT: &str = "default";

@@ -13,7 +13,6 @@ mod fair_semaphore;
 mod fingerprints;
 mod job;
 mod model;
-mod model_files;
 mod model_folder;
 mod observer;
 mod registry;

@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::ensure;
 use grasp::{Code, RequestError};
 use grasp_models::{Entry, read_regular_file};
-use grasp_planner::ModelSpec;
+use grasp_planner::{ModelFiles, ModelSpec};
 use tokio::signal::unix::Signal;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
@@ -18,7 +18,6 @@ use tracing::{error, info, warn};
 use crate::control::{Change, Command, ModelControl};
 use crate::fingerprints::{DEFAULT, Fingerprints, fingerprints};
 use crate::model::{Model, ModelSettings};
-use crate::model_files::ModelFiles;
 use crate::observer::{Observer, Reload};
 use crate::registry::{ModelRegistry, Unavailable};
 use crate::session_threads::SessionThreads;
@@ -315,8 +314,11 @@ impl ModelFolder {
             unloaded.iter().map(|name| Unavailable { name: name.clone(), reason: reason.to_owned() }).collect();
         let mut rejected: Vec<PathBuf> = Vec::new();
         let mut reject = |path: &Path, name: Option<&str>, error: String| {
-            error!(error, "cannot load a model file; a model that was loaded from it before remains served");
             let before = served.iter().find(|model| model.spec.path() == Some(path));
+            match before {
+                Some(model) => error!(error, "cannot load a model file; {} stays in service", model.label),
+                None => error!(error, "cannot load a model file"),
+            }
             let name = name.or_else(|| before.map(|model| model.spec.name())).map(str::to_owned);
             let file = || path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
             unavailable.push(Unavailable { name: name.unwrap_or_else(file), reason: error });

@@ -96,7 +96,7 @@ impl ModelRegistry {
         };
         if name.is_empty() {
             if !version.is_empty() {
-                let needed = "which requires options.model";
+                let needed = "but options.model is empty: name the model of this version";
                 return Err(RequestError::invalid("options.version", format_args!("`{version}`"), needed));
             }
             let networks: Vec<_> = served.iter().filter(|model| model.spec.network().is_some()).collect();

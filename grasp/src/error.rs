@@ -57,6 +57,13 @@ impl RequestError {
         Self::of_field(field, &message)
     }
 
+    /// A list of an invalid length, with the message `{field} has {length} entries, {needed}`.
+    pub fn of_length(field: impl Into<Cow<'static, str>>, length: usize, needed: impl Display) -> Self {
+        let field = field.into();
+        let message = format!("{field} has {length} entries, {needed}");
+        Self::of_field(field, &message)
+    }
+
     /// An invalid field, with the message `{field}: {reason}`.
     pub fn refused(field: impl Into<Cow<'static, str>>, reason: impl Display) -> Self {
         let field = field.into();

@@ -1,6 +1,7 @@
 use nalgebra::{Isometry3, Point3, Vector3};
 use thiserror::Error;
 
+use crate::surface::Field;
 use crate::{DepthImage, Volume, VolumeError};
 
 /// Largest valid depth, metres, as in VGN's perception code.
@@ -10,7 +11,7 @@ pub const DEPTH_MAX: f32 = 2.0;
 pub const TRUNCATION_VOXELS: f64 = 4.0;
 
 /// Voxels whose |truncated distance| reaches this are read out as 0, like unobserved voxels (constant from Open3D).
-const NEAR_SURFACE: f32 = 0.98;
+pub(crate) const NEAR_SURFACE: f32 = 0.98;
 
 /// Voxels projected per step.
 const LANES: usize = 8;
@@ -124,21 +125,6 @@ impl Fusion {
     #[must_use]
     pub fn forgetting(self, half_life: f64) -> Self {
         Self { decay: Some(0.5_f64.powf(1.0 / half_life) as f32), ..self }
-    }
-
-    /// Restores the field from a volume: each voxel above 0 counts as measured by one view.
-    #[must_use]
-    pub fn of(volume: &Volume) -> Self {
-        let seen = |&value: &f32| {
-            if value > 0.0 { Voxel { distance: 2.0 * value - 1.0, weight: 1.0 } } else { Voxel::default() }
-        };
-        Self {
-            resolution: volume.resolution(),
-            voxel_size: volume.voxel_size(),
-            truncation: (TRUNCATION_VOXELS * volume.voxel_size()) as f32,
-            voxels: volume.values().iter().map(seen).collect(),
-            decay: None,
-        }
     }
 
     /// Adds one view. `camera_from_task` (`T_camera_task`) maps points of the cube's frame into the camera frame.
@@ -323,28 +309,24 @@ impl Fusion {
     pub fn voxel_size(&self) -> f64 {
         self.voxel_size
     }
+}
 
-    /// Distance at a voxel as a fraction of the truncation distance; `None` if no surface near the voxel was observed.
-    pub(crate) fn near_surface(&self, index: usize) -> Option<f32> {
-        let voxel = self.voxels[index];
-        voxel.is_near_surface().then_some(voxel.distance)
+impl Field for Fusion {
+    fn resolution(&self) -> usize {
+        self.resolution
     }
 
-    /// Distance at `point` (cube frame) as a fraction of the truncation distance, by trilinear interpolation.
-    /// Unobserved voxels count as 0.
-    pub(crate) fn interpolate(&self, point: &Point3<f64>) -> f64 {
-        let n = self.resolution;
-        let p = point.coords / self.voxel_size - Vector3::repeat(0.5);
-        let base = p.map(|c| c.floor().clamp(0.0, (n - 2) as f64));
-        let r = p - base;
-        let [x, y, z] = [base.x as usize, base.y as usize, base.z as usize];
-        let mut sum = 0.0;
-        for corner in 0..8 {
-            let (dx, dy, dz) = (corner >> 2, corner >> 1 & 1, corner & 1);
-            let weight = [1.0 - r.x, r.x][dx] * [1.0 - r.y, r.y][dy] * [1.0 - r.z, r.z][dz];
-            sum += weight * f64::from(self.voxels[((x + dx) * n + y + dy) * n + z + dz].distance);
-        }
-        sum
+    fn voxel_size(&self) -> f64 {
+        self.voxel_size
+    }
+
+    fn distance(&self, index: usize) -> f32 {
+        self.voxels[index].distance
+    }
+
+    fn near_surface(&self, index: usize) -> Option<f32> {
+        let voxel = self.voxels[index];
+        voxel.is_near_surface().then_some(voxel.distance)
     }
 }
 
@@ -421,14 +403,12 @@ mod tests {
     }
 
     #[test]
-    fn a_volume_restores_the_field_and_its_surface() {
+    fn a_volume_has_the_surface_of_its_field() {
         let camera = Intrinsics::BENCHMARK;
         let depth = vec![0.65; camera.width * camera.height];
         let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
         fusion.integrate(&DepthImage::new(camera, &depth).unwrap(), &facing());
-        let again = Fusion::of(&fusion.volume(Isometry3::identity()).unwrap());
-        assert!(again.values().iter().zip(fusion.values()).all(|(a, b)| (a - b).abs() < 1e-6));
-        let (surface, expected) = (again.surface(), fusion.surface());
+        let (surface, expected) = (fusion.volume(Isometry3::identity()).unwrap().surface(), fusion.surface());
         assert!(surface.len() == expected.len() && surface.len() > 500, "{} points", surface.len());
         let worst = surface.iter().zip(&expected).map(|(a, b)| (a.position - b.position).norm()).fold(0.0, f64::max);
         assert!(worst < 1e-6 && surface.iter().all(|point| point.normal.z < -0.99), "{worst}");

@@ -1,8 +1,9 @@
-use nalgebra::{Point3, Vector3};
-
 use std::collections::HashMap;
 
-use crate::Fusion;
+use nalgebra::{Point3, Vector3};
+
+use crate::fusion::NEAR_SURFACE;
+use crate::{Fusion, Volume};
 
 /// A zero crossing of the fused field, with the outward normal. Cube frame, metres.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -22,7 +23,116 @@ pub struct SurfaceMesh {
     pub triangles: Vec<[u32; 3]>,
 }
 
+/// A truncated signed distance field over a cube.
+pub(crate) trait Field {
+    /// Voxels along an edge.
+    fn resolution(&self) -> usize;
+
+    /// Edge of a voxel, metres.
+    fn voxel_size(&self) -> f64;
+
+    /// Distance at a voxel as a fraction of the truncation distance; 0 if the voxel was not observed.
+    fn distance(&self, index: usize) -> f32;
+
+    /// Distance at a voxel; `None` if no surface near the voxel was observed.
+    fn near_surface(&self, index: usize) -> Option<f32>;
+
+    /// The zero crossings between neighbouring voxels.
+    fn surface(&self) -> Vec<SurfacePoint> {
+        let n = self.resolution();
+        let stride = [n * n, n, 1];
+        let mut points = Vec::new();
+        for index in 0..n.pow(3) {
+            let Some(here) = self.near_surface(index) else { continue };
+            let cell = [index / (n * n), index / n % n, index % n];
+            // The normal needs neighbours on both sides, which voxels at the faces of the cube do not have.
+            let inner = 1..n - 1;
+            if !cell.iter().all(|c| inner.contains(c)) {
+                continue;
+            }
+            for axis in 0..3 {
+                if !inner.contains(&(cell[axis] + 1)) {
+                    continue;
+                }
+                let Some(there) = self.near_surface(index + stride[axis]) else { continue };
+                if here * there < 0.0 {
+                    let mut position = Point3::from(cell.map(|c| c as f64 + 0.5));
+                    position[axis] += f64::from(here.abs() / (here.abs() + there.abs()));
+                    let position = position * self.voxel_size();
+                    if let Some(normal) = self.normal_at(&position) {
+                        points.push(SurfacePoint { position, normal });
+                    }
+                }
+            }
+        }
+        points
+    }
+
+    /// Central difference of the field over 0.99 voxels to each side, as in Open3D.
+    fn normal_at(&self, point: &Point3<f64>) -> Option<Vector3<f64>> {
+        let gap = 0.99 * self.voxel_size();
+        let mut gradient = Vector3::zeros();
+        for axis in 0..3 {
+            let mut offset = Vector3::zeros();
+            offset[axis] = gap;
+            gradient[axis] = self.interpolate(&(point + offset)) - self.interpolate(&(point - offset));
+        }
+        gradient.try_normalize(1e-12)
+    }
+
+    /// Distance at `point` (cube frame) as a fraction of the truncation distance, by trilinear interpolation.
+    fn interpolate(&self, point: &Point3<f64>) -> f64 {
+        let n = self.resolution();
+        let p = point.coords / self.voxel_size() - Vector3::repeat(0.5);
+        let base = p.map(|c| c.floor().clamp(0.0, (n - 2) as f64));
+        let r = p - base;
+        let [x, y, z] = [base.x as usize, base.y as usize, base.z as usize];
+        let mut sum = 0.0;
+        for corner in 0..8 {
+            let (dx, dy, dz) = (corner >> 2, corner >> 1 & 1, corner & 1);
+            let weight = [1.0 - r.x, r.x][dx] * [1.0 - r.y, r.y][dy] * [1.0 - r.z, r.z][dz];
+            sum += weight * f64::from(self.distance(((x + dx) * n + y + dy) * n + z + dz));
+        }
+        sum
+    }
+}
+
+impl Field for Volume {
+    fn resolution(&self) -> usize {
+        self.resolution()
+    }
+
+    fn voxel_size(&self) -> f64 {
+        self.voxel_size()
+    }
+
+    fn distance(&self, index: usize) -> f32 {
+        let value = self.values()[index];
+        if value > 0.0 { 2.0 * value - 1.0 } else { 0.0 }
+    }
+
+    fn near_surface(&self, index: usize) -> Option<f32> {
+        let is_near = |distance: &f32| (-NEAR_SURFACE..NEAR_SURFACE).contains(distance);
+        (self.values()[index] > 0.0).then(|| self.distance(index)).filter(is_near)
+    }
+}
+
 impl Fusion {
+    /// The observed surface as points: every zero crossing between neighbouring voxels, as in Open3D's
+    /// `ExtractPointCloud`.
+    #[must_use]
+    pub fn surface(&self) -> Vec<SurfacePoint> {
+        Field::surface(self)
+    }
+}
+
+impl Volume {
+    /// The observed surface as points, as [`Fusion::surface`].
+    #[must_use]
+    pub fn surface(&self) -> Vec<SurfacePoint> {
+        Field::surface(self)
+    }
+
     /// The observed surface as a mesh, for display. Each group of eight voxels with a sign change gets one vertex, at
     /// the mean of the zero crossings on its edges (surface nets: Gibson, "Constrained Elastic Surface Nets", MICCAI
     /// 1998). Only edges with two observed ends count.
@@ -89,51 +199,6 @@ impl Fusion {
         }
         (count > 0.0).then(|| Point3::from(sum / count * self.voxel_size()))
     }
-
-    /// The observed surface as points: every zero crossing between neighbouring voxels, as in Open3D's
-    /// `ExtractPointCloud`.
-    #[must_use]
-    pub fn surface(&self) -> Vec<SurfacePoint> {
-        let n = self.resolution();
-        let stride = [n * n, n, 1];
-        let mut points = Vec::new();
-        for index in 0..n.pow(3) {
-            let Some(here) = self.near_surface(index) else { continue };
-            let cell = [index / (n * n), index / n % n, index % n];
-            // The normal needs neighbours on both sides, which voxels at the faces of the cube do not have.
-            let inner = 1..n - 1;
-            if !cell.iter().all(|c| inner.contains(c)) {
-                continue;
-            }
-            for axis in 0..3 {
-                if !inner.contains(&(cell[axis] + 1)) {
-                    continue;
-                }
-                let Some(there) = self.near_surface(index + stride[axis]) else { continue };
-                if here * there < 0.0 {
-                    let mut position = Point3::from(cell.map(|c| c as f64 + 0.5));
-                    position[axis] += f64::from(here.abs() / (here.abs() + there.abs()));
-                    let position = position * self.voxel_size();
-                    if let Some(normal) = self.normal_at(&position) {
-                        points.push(SurfacePoint { position, normal });
-                    }
-                }
-            }
-        }
-        points
-    }
-
-    /// Central difference of the field over 0.99 voxels to each side, as in Open3D.
-    fn normal_at(&self, point: &Point3<f64>) -> Option<Vector3<f64>> {
-        let gap = 0.99 * self.voxel_size();
-        let mut gradient = Vector3::zeros();
-        for axis in 0..3 {
-            let mut offset = Vector3::zeros();
-            offset[axis] = gap;
-            gradient[axis] = self.interpolate(&(point + offset)) - self.interpolate(&(point - offset));
-        }
-        gradient.try_normalize(1e-12)
-    }
 }
 
 #[cfg(test)]
@@ -141,17 +206,16 @@ mod tests {
     use nalgebra::Isometry3;
 
     use super::*;
-    use crate::Volume;
 
     /// The field of a ball of radius 0.05 m in the middle of the cube, observed from all sides.
-    fn ball() -> Fusion {
+    fn ball() -> Volume {
         let (n, size) = (40, 0.0075);
         let value = |i: usize| {
             let p = Point3::from([i / (n * n), i / n % n, i % n].map(|c| (c as f64 + 0.5) * size));
             let distance = ((p - Point3::new(0.15, 0.15, 0.15)).norm() - 0.05) / 0.03;
             if distance.abs() < 1.0 { (distance as f32 + 1.0) / 2.0 } else { 0.0 }
         };
-        Fusion::of(&Volume::new(n, size, Isometry3::identity(), (0..n.pow(3)).map(value).collect()).unwrap())
+        Volume::new(n, size, Isometry3::identity(), (0..n.pow(3)).map(value).collect()).unwrap()
     }
 
     #[test]

@@ -42,7 +42,7 @@ impl Calibration {
     ///
     /// # Errors
     /// [`MetadataError`] if the property is invalid.
-    pub fn of(model: &ModelProto) -> Result<Self, MetadataError> {
+    pub fn from_model(model: &ModelProto) -> Result<Self, MetadataError> {
         let property = model.metadata_props.iter().find(|property| property.key().strip_prefix(PREFIX) == Some(KEY));
         property.map_or(Ok(Self::default()), |property| {
             let value = property.value();
@@ -80,15 +80,15 @@ mod tests {
     #[test]
     fn a_calibration_is_stored_in_the_model() {
         let mut model = ModelProto::default();
-        assert_eq!(Calibration::of(&model), Ok(Calibration::default()));
+        assert_eq!(Calibration::from_model(&model), Ok(Calibration::default()));
         let calibration = Calibration { slope: 0.5, offset: -0.25 };
         for _ in 0..2 {
             calibration.write_to(&mut model);
         }
         assert_eq!(model.metadata_props.len(), 1);
-        assert_eq!(Calibration::of(&model), Ok(calibration));
+        assert_eq!(Calibration::from_model(&model), Ok(calibration));
         model.metadata_props[0].value = Some("-1 0".to_owned());
-        let error = Calibration::of(&model).unwrap_err().to_string();
+        let error = Calibration::from_model(&model).unwrap_err().to_string();
         assert_eq!(error, "the model's property `graspd.calibration` is `-1 0`, must be a slope above 0 and an offset");
     }
 

@@ -59,7 +59,7 @@ pub(crate) enum HalfError {
 pub(crate) fn with_half_computation(model: &ModelProto) -> Result<ModelProto, HalfError> {
     let mut model = model.clone();
     let Some(graph) = model.graph.take() else { return Ok(model) };
-    let conversion = Conversion::of(&graph)?;
+    let conversion = Conversion::new(&graph)?;
     model.graph = Some(conversion.apply(&graph)?);
     Ok(model)
 }
@@ -77,7 +77,7 @@ struct Conversion<'a> {
 }
 
 impl<'a> Conversion<'a> {
-    fn of(graph: &'a GraphProto) -> Result<Self, HalfError> {
+    fn new(graph: &'a GraphProto) -> Result<Self, HalfError> {
         let nodes = up_to_products(graph);
         for &index in &nodes {
             let op = graph.node[index].op_type();

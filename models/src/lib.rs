@@ -36,5 +36,5 @@ pub use runtime::{
     Backend, BackendError, Choice, Classifier, INPUT, LoadError, LoadReason, NameError, Network, OUTPUTS, Options,
     Output, Precision, Provider, RuntimeError, RuntimeInfo, batch_sizes, init,
 };
-pub use store::{Entry, EntryError, MAX_MODEL_BYTES, Scan, Store, StoreError, read_regular_file};
+pub use store::{Entry, EntryError, MAX_MODEL_BYTES, Scan, Store, StoreError, own_models, read_regular_file};
 pub use upsampling::{upsampled_convolutions, upsampled_taps};

@@ -58,7 +58,7 @@ impl Metadata {
     ///
     /// # Errors
     /// [`MetadataError`] names the invalid property.
-    pub fn of(model: &ModelProto, path: &Path) -> Result<Self, MetadataError> {
+    pub fn from_model(model: &ModelProto, path: &Path) -> Result<Self, MetadataError> {
         let input = model.graph.as_ref().and_then(|graph| graph.input.first());
         let properties = model.metadata_props.iter().filter_map(|p| Some((p.key.clone()?, p.value.clone()?)));
         Self::from_properties(properties, Self::defaults(path, input.and_then(fixed_resolution)))

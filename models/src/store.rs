@@ -118,6 +118,17 @@ impl EntryError {
     }
 }
 
+/// The folder of the models that come with graspd: in the prefix in which it is installed, or in the checkout from which it
+/// was built.
+#[must_use]
+pub fn own_models() -> Option<PathBuf> {
+    let program = std::env::current_exe().ok().and_then(|program| program.canonicalize().ok());
+    let installed =
+        program.as_deref().and_then(|program| Some(program.parent()?.parent()?.join("share/graspd/models")));
+    let of_checkout = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/zoo"));
+    [installed, of_checkout.canonicalize().ok()].into_iter().flatten().find(|folder| folder.is_dir())
+}
+
 /// One indented line per error.
 fn lines(files: &[EntryError]) -> String {
     files.iter().map(|error| format!("\n    {error}")).collect()
@@ -233,7 +244,7 @@ impl Entry {
             read_regular_file(&path, max_bytes).map_err(|source| FileError::Io { path: path.clone(), source })?;
         let model =
             ModelProto::from_bytes(&bytes).map_err(|reason| FileError::Decode { path: path.clone(), reason })?;
-        let metadata = match Metadata::of(&model, &path) {
+        let metadata = match Metadata::from_model(&model, &path) {
             Ok(metadata) => metadata,
             Err(source) => return Err(EntryError::Metadata { path, source }),
         };

@@ -145,13 +145,12 @@ impl Cubes {
         let Some(extent) = extent else { return check_margin(margin, edge).map(|()| 1) };
         let margin = margin.max(Part::MARGIN);
         if edge <= 2.0 * margin {
-            let value = format_args!("given, for cubes with an edge of {edge} m");
-            let needed = format_args!(
-                "which must be above {} m, twice options.margin (at least {} m)",
-                2.0 * margin,
+            let reason = format_args!(
+                "cubes with an edge of {edge} m leave no room between margins of {margin} m on each side: set a smaller \
+                 options.margin (at least {} m with an extent), or a larger workspace.size",
                 Part::MARGIN
             );
-            return Err(RequestError::invalid("workspace.extent", value, needed));
+            return Err(RequestError::refused("workspace.extent", reason));
         }
         let count = Part::count(extent, edge, margin);
         if count > MAX_CUBES as f64 {

@@ -32,7 +32,7 @@ impl Table {
     #[must_use]
     pub fn find(volume: &Volume, expected: f64) -> Option<Table> {
         let stride = volume.resolution().div_ceil(COLUMNS);
-        let surface = Surface::of(volume, stride);
+        let surface = Surface::new(volume, stride);
         let level = Plane { slope: [0.0; 2], offset: expected };
         let largest = surface.largest_plane().unwrap_or(level);
         let preferred = surface.count(&level) as f64 >= PREFERRED * surface.count(&largest) as f64;
@@ -63,7 +63,7 @@ struct Plane {
 
 impl Surface {
     /// Samples every `stride`-th column.
-    fn of(volume: &Volume, stride: usize) -> Self {
+    fn new(volume: &Volume, stride: usize) -> Self {
         let (n, size) = (volume.resolution(), volume.voxel_size());
         let columns: Vec<usize> = (stride / 2..n).step_by(stride).collect();
         let place = |index: usize| (index as f64 + 0.5) * size;

@@ -154,7 +154,7 @@ impl Tabletop {
         }
         let squares: f64 = on_plane().map(|sample| plane.height(&sample.point).powi(2) * sample.weight).sum();
         let camera_from_table = plane.frame();
-        let segmentation = Segmentation::of(image, &camera_from_table);
+        let segmentation = Segmentation::new(image, &camera_from_table);
         let corner = match cover_objects(&segmentation.objects, WORKSPACE_SIZE, OBJECT_MARGIN, 1).0.first() {
             Some(corner) => *corner,
             None => plane.middle(&camera_from_table).map(|c| c - WORKSPACE_SIZE / 2.0),
@@ -199,12 +199,12 @@ fn proposals(image: &DepthImage) -> impl Iterator<Item = Plane> {
     pixels.flat_map(move |pixel| baselines.map(|baseline| (pixel, baseline))).filter_map(move |((u, v), baseline)| {
         let corner = image.point(u, v)?;
         let (right, below) = (image.point(u + baseline, v)?, image.point(u, v + baseline)?);
-        Plane::of(&corner, (right - corner).cross(&(below - corner)))
+        Plane::new(&corner, (right - corner).cross(&(below - corner)))
     })
 }
 
 impl Plane {
-    fn of(point: &Point3<f64>, normal: Vector3<f64>) -> Option<Self> {
+    fn new(point: &Point3<f64>, normal: Vector3<f64>) -> Option<Self> {
         let normal = Unit::try_new(normal, 1e-12)?;
         // The camera is at the origin.
         let normal = if normal.dot(&point.coords) < 0.0 { normal } else { -normal };
@@ -243,7 +243,7 @@ impl Plane {
             let covariance: Matrix3<f64> = spread.map(|(d, weight)| d * d.transpose() * weight).sum();
             let eigen = SymmetricEigen::new(covariance);
             let normal = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
-            Self::of(&mean.into(), normal).unwrap_or(plane)
+            Self::new(&mean.into(), normal).unwrap_or(plane)
         })
     }
 

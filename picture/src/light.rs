@@ -111,7 +111,7 @@ impl Lamp {
         let camera = Intrinsics { width: SHADOW_MAP, height: SHADOW_MAP, fx: focal, fy: focal, cx: middle, cy: middle };
         let mut view = View::new(&camera, &camera_from_task, radius, 20.0 * radius);
         for mesh in casters {
-            view.draw(&Instance::of(mesh), |_, _| ());
+            view.draw(&Instance::new(mesh), |_, _| ());
         }
         // The table also shades meshes below it.
         if let Some(height) = table {

@@ -133,7 +133,7 @@ impl Picture {
         let mut view = View::new(&fine, &self.camera_from_task, 0.01, 100.0);
         let mut seen = vec![(BACKGROUND, 0); view.depth.len()];
         for (index, item) in self.items.iter().enumerate() {
-            view.draw(&Instance::of(&item.mesh), |pixel, triangle| seen[pixel] = (index as u32, triangle as u32));
+            view.draw(&Instance::new(&item.mesh), |pixel, triangle| seen[pixel] = (index as u32, triangle as u32));
         }
         if let Some(height) = self.table {
             view.draw_table(height, |pixel| seen[pixel] = (TABLE, 0));

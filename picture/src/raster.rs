@@ -37,7 +37,7 @@ pub struct Instance<'a> {
 
 impl Instance<'_> {
     /// A mesh in the task frame.
-    pub(crate) fn of(mesh: &Mesh) -> Instance<'_> {
+    pub(crate) fn new(mesh: &Mesh) -> Instance<'_> {
         Instance { mesh, pose: Isometry3::identity(), scale: 1.0, id: 0 }
     }
 }

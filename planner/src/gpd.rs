@@ -40,14 +40,14 @@ impl Gpd {
 
 impl Planner for Gpd {
     fn plan(&mut self, scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Decoded, PlanError> {
-        let fit = HandFit::of(scene, params, is_wanted)?;
+        let fit = HandFit::new(scene, params, is_wanted)?;
         let mut scores = Vec::with_capacity(fit.candidates.len());
         for batch in fit.candidates.chunks(BATCH) {
             if !is_wanted() {
                 return Err(PlanError::Cancelled);
             }
             scores.extend(self.classifier.score(batch.len(), |index, values| {
-                Image::of(&fit.cloud, &batch[index]).write(values);
+                Image::new(&fit.cloud, &batch[index]).write(values);
             })?);
         }
         let grasps = scored(&fit.candidates, &scores);

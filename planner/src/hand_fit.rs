@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use grasp::gpd::{Candidate, Cloud, Params, by_sample, is_on_an_object};
-use grasp::{DecodeParams, Decoded, Fusion, Grasp, Hand, Selection, SurfacePoint};
+use grasp::{DecodeParams, Decoded, Grasp, Hand, Selection, SurfacePoint};
 use grasp_perception::Scene;
 use nalgebra::Isometry3;
 use rand_chacha::ChaCha8Rng;
@@ -49,7 +49,7 @@ impl HandFit {
     }
 
     /// Fits the hand to the points of the scene, at as many of them as GPD.
-    pub(crate) fn of(scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Self, PlanError> {
+    pub(crate) fn new(scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Self, PlanError> {
         Self::sampled(Params::above(0.0).samples, scene, params, is_wanted)
     }
 
@@ -65,7 +65,7 @@ impl HandFit {
         let table = params.table.unwrap_or(f64::NEG_INFINITY);
         let points = match &scene.points {
             Some(points) => Cow::Borrowed(points),
-            None => Cow::Owned(Fusion::of(volume).surface()),
+            None => Cow::Owned(volume.surface()),
         };
         let of_objects = object_points(&points, size, table);
         let other_points = points.len() - of_objects.len();

@@ -4,6 +4,7 @@
 mod evaluator;
 mod gpd;
 mod hand_fit;
+mod model_files;
 mod model_spec;
 mod network;
 mod shaf;
@@ -16,6 +17,7 @@ use thiserror::Error;
 pub use evaluator::Evaluator;
 pub use gpd::Gpd;
 pub use hand_fit::{HandFit, object_points};
+pub use model_files::{CLASSIFIERS, EVALUATORS, ModelFiles};
 pub use model_spec::{Loaded, ModelSpec};
 pub use network::{Inference, NetworkPlanner};
 pub use shaf::{HighestProposal, Shaf};

@@ -21,7 +21,7 @@ impl Shaf {
 
 impl Planner for Shaf {
     fn plan(&mut self, scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Decoded, PlanError> {
-        let mut fit = HandFit::of(scene, params, is_wanted)?;
+        let mut fit = HandFit::new(scene, params, is_wanted)?;
         let grasps = ranked(std::mem::take(&mut fit.candidates));
         Ok(fit.select(grasps, scene, &params.decode))
     }

@@ -16,8 +16,8 @@ const MAX_CANDIDATES: usize = 1024;
 /// [`RequestError`] names the invalid field.
 pub fn candidates(candidates: &[pb::Candidate], params: &DetectParams) -> Result<Vec<Candidate>, RequestError> {
     if !(1..=MAX_CANDIDATES).contains(&candidates.len()) {
-        let value = format_args!("a list of {}", candidates.len());
-        return Err(RequestError::invalid("candidates", value, format_args!("must have from 1 to {MAX_CANDIDATES}")));
+        let needed = format_args!("must have from 1 to {MAX_CANDIDATES}");
+        return Err(RequestError::of_length("candidates", candidates.len(), needed));
     }
     let depth = params.finger_depth();
     let candidate = |candidate: &pb::Candidate| {
@@ -93,7 +93,7 @@ mod tests {
         let params = DetectParams::try_from(&pb::Options::default()).unwrap();
         let valid = pb::Candidate { pose: Some((&Isometry3::identity()).into()), width: Some(0.04) };
         let refused = |list: &[pb::Candidate]| candidates(list, &params).unwrap_err().to_string();
-        assert_eq!(refused(&[]), "candidates is a list of 0, must have from 1 to 1024");
+        assert_eq!(refused(&[]), "candidates has 0 entries, must have from 1 to 1024");
         let absent = pb::Candidate { pose: None, ..valid };
         assert_eq!(refused(&[valid, absent]), "candidates[1].pose is absent, must be given");
         let wide = pb::Candidate { width: Some(40.0), ..valid };

@@ -24,8 +24,9 @@ pub(crate) fn of_points(labels: &pb::Labels, count: usize) -> Result<Vec<u16>, R
         }
     };
     if labels.data.len() != count * size {
-        let needed = format_args!("one label each needs {} ({})", count * size, labels.r#type().as_str_name());
-        return Err(RequestError::invalid("data", format_args!("{} bytes", labels.data.len()), needed));
+        let (got, kind) = (labels.data.len() / size, labels.r#type().as_str_name());
+        let reason = format_args!("{got} labels ({kind}, {} bytes), must be {count}", labels.data.len());
+        return Err(RequestError::refused("data", reason));
     }
     Ok(match size {
         1 => labels.data.iter().map(|&label| u16::from(label)).collect(),
@@ -53,10 +54,7 @@ mod tests {
     #[test]
     fn invalid_labels_are_named() {
         let refused = |labels: &pb::Labels| of_image(labels, 3, 2).unwrap_err().to_string();
-        assert_eq!(
-            refused(&labels(&[0; 5], pb::LabelType::U8)),
-            "data is 5 bytes, one label each needs 6 (LABEL_TYPE_U8)"
-        );
+        assert_eq!(refused(&labels(&[0; 5], pb::LabelType::U8)), "data: 5 labels (LABEL_TYPE_U8, 5 bytes), must be 6");
         assert_eq!(
             refused(&labels(&[0; 6], pb::LabelType::Unspecified)),
             "type is 0, must be LABEL_TYPE_U8 (1), LABEL_TYPE_U16 (2) or LABEL_TYPE_PNG (3)"

@@ -6,6 +6,7 @@
 #![warn(missing_docs)]
 
 mod bounded;
+mod clouds;
 mod grasps;
 mod labels;
 mod options;
@@ -30,10 +31,11 @@ pub mod oip {
 }
 
 pub use bounded::{BoundedCodec, BoundedDecoder};
+pub use clouds::{cloud, clouds};
 pub use grasps::candidates;
 pub use png::grey_png;
 pub use pose::pose;
-pub use views::{MAX_VIEWS, check_views, cloud, clouds, frame, frames};
+pub use views::{MAX_VIEWS, check_views, frame, frames};
 pub use volume::{encode, resolution};
 pub use workspace::{FrameStamp, check_id};
 

@@ -1,6 +1,5 @@
 use grasp::{DepthImage, Intrinsics, RequestError, Unit as DepthUnit};
-use grasp_perception::{CameraPose, Cloud, Frame};
-use nalgebra::{Isometry3, Point3};
+use grasp_perception::{CameraPose, Frame};
 
 use crate::pb::depth_view::Extrinsics;
 use crate::pose::{self, PoseFields};
@@ -8,10 +7,6 @@ use crate::{labels, pb, png};
 
 /// Largest number of views in one request.
 pub const MAX_VIEWS: usize = 64;
-
-/// Median distance of the points of a cloud from its camera beyond which they are probably not in metres: far beyond the
-/// range of depth cameras.
-const FARTHEST: f64 = 20.0;
 
 /// Longest edge of an image, pixels.
 const MAX_EDGE: u32 = 16_384;
@@ -24,9 +19,6 @@ const CAMERA_FROM_TASK: PoseFields =
     PoseFields { position: "camera_from_task.position", orientation: "camera_from_task.orientation" };
 const FRAME_FROM_CAMERA: PoseFields =
     PoseFields { position: "frame_from_camera.position", orientation: "frame_from_camera.orientation" };
-const FRAME_FROM_CLOUD: PoseFields =
-    PoseFields { position: "frame_from_cloud.position", orientation: "frame_from_cloud.orientation" };
-
 /// Checks the number of views of a request.
 ///
 /// # Errors
@@ -35,15 +27,11 @@ pub fn check_views(views: usize) -> Result<(), RequestError> {
     if (1..=MAX_VIEWS).contains(&views) {
         return Ok(());
     }
-    Err(RequestError::invalid(
-        "views",
-        format_args!("a list of {views}"),
-        format_args!("must have from 1 to {MAX_VIEWS}"),
-    ))
+    Err(RequestError::of_length("views", views, format_args!("must have from 1 to {MAX_VIEWS}")))
 }
 
 /// A request of a stream may have no views.
-fn check_number(views: usize) -> Result<(), RequestError> {
+pub(crate) fn check_number(views: usize) -> Result<(), RequestError> {
     if views == 0 { Ok(()) } else { check_views(views) }
 }
 
@@ -135,24 +123,22 @@ fn image(view: &pb::DepthView) -> Result<DepthImage<'static>, RequestError> {
         _ => view.data.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect(),
     };
     let image = DepthImage::new(intrinsics, depth).map_err(|error| RequestError::refused("camera", error))?;
+    let refuse = |reason: &str| Err(RequestError::refused("data", reason));
     match (image.unit(), view.unit()) {
-        (DepthUnit::Millimetres, pb::DepthUnit::U16Millimetres | pb::DepthUnit::PngMillimetres) => {
-            let needed = "is farther than depth cameras measure: send 0 for pixels without a reading";
-            Err(RequestError::invalid("data", "in millimetres, with a median above 20,000", needed))
-        }
-        (DepthUnit::Millimetres, _) => {
-            let needed = "must be metres but looks like millimetres: send u16 with DEPTH_UNIT_U16_MILLIMETRES, or divide \
-                          by 1000";
-            Err(RequestError::invalid("data", "in metres, with a median above 20", needed))
-        }
-        (DepthUnit::Thousandths, pb::DepthUnit::U16Millimetres | pb::DepthUnit::PngMillimetres) => {
-            let needed = "must be millimetres but looks like metres: send f32 with DEPTH_UNIT_F32_METRES";
-            Err(RequestError::invalid("data", "in millimetres, with a median below 20", needed))
-        }
-        (DepthUnit::Thousandths, _) => {
-            let needed = "is closer than depth cameras measure: check that the values were not divided by 1000 twice";
-            Err(RequestError::invalid("data", "in metres, with a median below 0.02", needed))
-        }
+        (DepthUnit::Millimetres, pb::DepthUnit::U16Millimetres | pb::DepthUnit::PngMillimetres) => refuse(
+            "the median depth is above 20,000 mm, farther than depth cameras measure: send 0 for pixels without a reading",
+        ),
+        (DepthUnit::Millimetres, _) => refuse(
+            "the median depth is above 20 m, so the values look like millimetres: send u16 with \
+             DEPTH_UNIT_U16_MILLIMETRES, or divide by 1000",
+        ),
+        (DepthUnit::Thousandths, pb::DepthUnit::U16Millimetres | pb::DepthUnit::PngMillimetres) => refuse(
+            "the median depth is below 20 mm, so the values look like metres: send f32 with DEPTH_UNIT_F32_METRES",
+        ),
+        (DepthUnit::Thousandths, _) => refuse(
+            "the median depth is below 0.02 m, closer than depth cameras measure: check that the values were not divided \
+             by 1000 twice",
+        ),
         (DepthUnit::Metres, _) => Ok(image),
     }
 }
@@ -198,78 +184,10 @@ fn intrinsics(camera: &pb::Camera) -> Result<Intrinsics, RequestError> {
     Ok(Intrinsics { width: camera.width as usize, height: camera.height as usize, fx, fy, cx, cy })
 }
 
-/// Decodes the point clouds of a request, in the caller's frame.
-///
-/// # Errors
-/// [`RequestError`] names the invalid field.
-pub fn clouds(views: &[pb::CloudView]) -> Result<Vec<Cloud>, RequestError> {
-    check_number(views.len())?;
-    let indexed = views.iter().enumerate();
-    indexed.map(|(index, view)| cloud(view).map_err(|error| error.inside(format_args!("views[{index}]")))).collect()
-}
-
-/// Decodes a point cloud, in the caller's frame.
-///
-/// # Errors
-/// [`RequestError`] names the invalid field of the view.
-pub fn cloud(view: &pb::CloudView) -> Result<Cloud, RequestError> {
-    const POINT: usize = 12;
-    if view.points.is_empty() || !view.points.len().is_multiple_of(POINT) {
-        let value = format_args!("{} bytes", view.points.len());
-        return Err(RequestError::invalid(
-            "points",
-            value,
-            "must be a multiple of 12 above 0: x, y, z of each point, f32",
-        ));
-    }
-    let frame_from_cloud = view.frame_from_cloud.as_ref();
-    let frame_from_cloud =
-        frame_from_cloud.map_or(Ok(Isometry3::identity()), |p| pose::decode(p, &FRAME_FROM_CLOUD))?;
-    let eye =
-        view.camera_position.ok_or_else(|| RequestError::invalid("camera_position", "absent", "must be given"))?;
-    let pb::Vector3 { x, y, z } = eye;
-    if ![x, y, z].iter().all(|c| c.is_finite()) {
-        return Err(RequestError::invalid("camera_position", format_args!("({x}, {y}, {z})"), "must be finite"));
-    }
-    let point = |bytes: &[u8; POINT]| {
-        let [x, y, z] =
-            [0, 4, 8].map(|at| f32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]));
-        let finite = x.is_finite() && y.is_finite() && z.is_finite();
-        finite.then(|| frame_from_cloud * Point3::new(x, y, z).cast::<f64>())
-    };
-    let all = view.points.as_chunks().0;
-    let points: Vec<_> = all.iter().filter_map(point).collect();
-    let of_points = |message| labels::of_points(message, all.len());
-    let labels = view.labels.as_ref().map(of_points).transpose().map_err(|error| error.inside("labels"))?;
-    let labels = labels.map(|labels| {
-        let finite = all.iter().zip(labels).filter(|(bytes, _)| point(bytes).is_some());
-        finite.map(|(_, label)| label).collect()
-    });
-    if points.is_empty() {
-        return Err(RequestError::invalid("points", "NaN throughout", "must have at least one finite point"));
-    }
-    let eye = frame_from_cloud * Point3::new(x, y, z);
-    let distance = median(points.iter().map(|point| (point - eye).norm()));
-    if distance > FARTHEST {
-        let value = format_args!("{distance:.0} m from the camera (median)");
-        let needed = "must be in metres but looks like millimetres: divide by 1000";
-        return Err(RequestError::invalid("points", value, needed));
-    }
-    Ok(Cloud { points, eye, labels })
-}
-
-/// The median of a sample of the distances; 0 if there are none.
-fn median(distances: impl Iterator<Item = f64>) -> f64 {
-    /// Step between sampled points. More samples would not change the result.
-    const EVERY: usize = 61;
-    let mut sample: Vec<f64> = distances.step_by(EVERY).collect();
-    let middle = sample.len() / 2;
-    if sample.is_empty() { 0.0 } else { *sample.select_nth_unstable_by(middle, f64::total_cmp).1 }
-}
-
 #[cfg(test)]
 mod tests {
     use grasp_perception::Workspace;
+    use nalgebra::Isometry3;
 
     use super::*;
 
@@ -349,25 +267,7 @@ mod tests {
         assert_eq!(converted.labels, Some((0..12).collect()));
         assert_eq!(
             refused(|view| view.labels = labels(vec![1; 11])),
-            "views[1].labels.data is 11 bytes, one label each needs 12 (LABEL_TYPE_U8)"
-        );
-        // Points that are not finite are left out, with their labels.
-        let points = [[0.0, 0.0, 0.5], [f32::NAN, 0.0, 0.5], [0.1, 0.0, 0.5]];
-        let cloud = pb::CloudView {
-            points: points.iter().flatten().flat_map(|c| c.to_le_bytes()).collect::<Vec<u8>>().into(),
-            frame_from_cloud: None,
-            camera_position: Some(pb::Vector3::default()),
-            labels: labels(vec![4, 5, 6]),
-        };
-        let converted = self::cloud(&cloud).unwrap();
-        assert_eq!((converted.points.len(), converted.labels), (2, Some(vec![4, 6])));
-        let millimetres = points.iter().flatten().flat_map(|c| (c * 1000.0).to_le_bytes());
-        let cloud = pb::CloudView { points: millimetres.collect::<Vec<u8>>().into(), ..cloud };
-        assert!(
-            clouds(&[cloud])
-                .unwrap_err()
-                .to_string()
-                .starts_with("views[0].points is 500 m from the camera (median), must be in metres but looks like")
+            "views[1].labels.data: 11 labels (LABEL_TYPE_U8, 11 bytes), must be 12"
         );
     }
 
@@ -458,31 +358,11 @@ mod tests {
     fn a_wrong_depth_unit_is_an_error() {
         let f32s = |value: f32| [value; 12].iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
         let metres = |value: f32| refused(|v| (v.data, v.unit) = (f32s(value).into(), pb::DepthUnit::F32Metres.into()));
-        assert!(metres(500.0).contains("looks like millimetres"), "{}", metres(500.0));
+        assert!(metres(500.0).contains("look like millimetres"), "{}", metres(500.0));
         assert!(metres(0.0005).contains("not divided by 1000 twice"));
         let millimetres =
             refused(|v| v.data = [1_u16; 12].iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>().into());
-        assert!(millimetres.contains("looks like metres"), "{millimetres}");
-    }
-
-    #[test]
-    fn points_are_transformed_into_the_task_frame() {
-        let points: [f32; 6] = [0.1, 0.2, 0.3, f32::NAN, 0.0, 0.0];
-        let view = pb::CloudView {
-            points: points.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>().into(),
-            frame_from_cloud: Some((&Isometry3::translation(1.0, 0.0, 0.0)).into()),
-            camera_position: Some(pb::Vector3::default()),
-            labels: None,
-        };
-        let points = cloud(&view).unwrap().in_task(&Isometry3::translation(0.5, 0.0, 0.0));
-        let [point] = points.points[..] else { panic!("the NaN point is ignored") };
-        assert!((point - Point3::new(0.6, 0.2, 0.3)).norm() < 1e-6);
-        assert!((points.eye - Point3::new(0.5, 0.0, 0.0)).norm() < 1e-12);
-        let refused = |view: pb::CloudView| cloud(&view).unwrap_err().to_string();
-        assert!(
-            refused(pb::CloudView { points: vec![0; 13].into(), ..view.clone() }).starts_with("points is 13 bytes")
-        );
-        assert!(refused(pb::CloudView { camera_position: None, ..view }).starts_with("camera_position is absent"));
+        assert!(millimetres.contains("look like metres"), "{millimetres}");
     }
 
     #[test]
@@ -496,6 +376,6 @@ mod tests {
             );
         }
         assert!(check_views(1).is_ok() && check_views(64).is_ok());
-        assert_eq!(check_views(0).unwrap_err().message, "views is a list of 0, must have from 1 to 64");
+        assert_eq!(check_views(0).unwrap_err().message, "views has 0 entries, must have from 1 to 64");
     }
 }

@@ -11,15 +11,15 @@ use std::time::Duration;
 
 use clap::CommandFactory;
 use grasp_engine::{Batching, Fingerprints, FolderSettings, ModelSettings, fingerprints};
-use grasp_models::{Choice, Options, Store};
+use grasp_models::{Choice, Options, Store, own_models};
 
 use crate::transport::address::Address;
 use crate::transport::request_body::Limits;
 use crate::transport::tls::Tls;
 use crate::transport::tokens::Tokens;
 use errors::ConfigErrors;
+use flags::Flags;
 pub(crate) use flags::LogFormat;
-use flags::{Flags, own_models};
 
 /// The validated configuration.
 pub(crate) struct Config {

@@ -26,7 +26,7 @@ impl SceneConfig {
         let mut tried = Candidates::default();
         for candidate in chosen.into_iter().map(|chosen| &found[chosen]) {
             let success = trial::label(&world, &candidate.pose, 0.0).is_success();
-            tried.push(index, &Image::SHAPE, Image::of(&cloud, candidate).pixels(), success);
+            tried.push(index, &Image::SHAPE, Image::new(&cloud, candidate).pixels(), success);
         }
         tried
     }

@@ -140,7 +140,7 @@ impl Sensor {
     }
 
     /// The sensor of this name in the provenance of a data set.
-    fn of(name: &str) -> anyhow::Result<camera::Sensor> {
+    fn from_name(name: &str) -> anyhow::Result<camera::Sensor> {
         Self::from_str(name, false).map(Into::into).map_err(anyhow::Error::msg)
     }
 }
@@ -179,7 +179,7 @@ impl Part {
         };
         ensure!(PathBuf::from(name).is_dir(), "--part needs a folder of URDF files, but --objects is `{name}`");
         let part = objects.listed().iter().enumerate().filter(|(index, _)| is_kept(*index));
-        ObjectSet::of(part.map(|(_, object)| Arc::clone(object)).collect())
+        ObjectSet::new(part.map(|(_, object)| Arc::clone(object)).collect())
             .with_context(|| format!("--objects {name}: too few URDF files for this --part; `validation` needs five"))
     }
 

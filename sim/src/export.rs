@@ -76,7 +76,7 @@ fn missing_share() -> f32 {
 impl Line {
     /// The line of a scene.
     #[must_use]
-    pub fn of(number: u64, scene: &LabelledScene) -> Self {
+    pub fn new(number: u64, scene: &LabelledScene) -> Self {
         let objects = scene.objects.iter();
         let points = scene.points.iter();
         Self {

@@ -263,7 +263,7 @@ fn try_point(world: &World, cloud: &[SurfacePoint], rng: &mut impl Rng) -> Point
     let best = middle_of_widest_run(&lifted).and_then(|yaw| widths[yaw].map(|width| (yaw, width)));
     let yaw = best.map_or(0, |(yaw, _)| yaw);
     let grasp = turned(yaw);
-    let tries = if best.is_some() { Tries::of(world, &grasp, rng) } else { Tries { held: 0, failed: 1 } };
+    let tries = if best.is_some() { Tries::new(world, &grasp, rng) } else { Tries { held: 0, failed: 1 } };
     let (width, quality) = match best {
         Some((_, width)) if tries.is_success() => (width, 1.0),
         _ => (MAX_OPENING, 0.0),
@@ -287,7 +287,7 @@ struct Tries {
 impl Tries {
     /// Repeats a grasp that holds without pose error. Ends when it is a failure, after [`ENOUGH`] successes without a
     /// failure, or after [`REPEATS`] repetitions.
-    fn of(world: &World, grasp: &Isometry3<f64>, rng: &mut impl Rng) -> Self {
+    fn new(world: &World, grasp: &Isometry3<f64>, rng: &mut impl Rng) -> Self {
         let mut tries = Self { held: 1, failed: 0 };
         while tries.held + tries.failed <= REPEATS && tries.is_success() && !(tries.failed == 0 && tries.held > ENOUGH)
         {

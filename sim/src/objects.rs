@@ -120,7 +120,7 @@ impl ObjectSet {
 
     /// A set of these objects; `None` if there are none.
     #[must_use]
-    pub fn of(objects: Vec<Arc<Object>>) -> Option<ObjectSet> {
+    pub fn new(objects: Vec<Arc<Object>>) -> Option<ObjectSet> {
         (!objects.is_empty()).then_some(ObjectSet { objects, ..Self::generated() })
     }
 

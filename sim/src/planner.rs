@@ -1,9 +1,11 @@
 //! The planners of the benchmark: those that graspd serves, a running graspd, and random grasps.
 
+mod named;
 mod random;
 mod server;
 
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 use std::time::{Duration, Instant};
 
 use grasp::{DecodeParams, Grasp, RESOLUTION, Volume};
@@ -104,9 +106,13 @@ pub enum PlannerSpec {
     },
 }
 
-impl From<&str> for PlannerSpec {
-    fn from(text: &str) -> Self {
-        match text.split_once(':') {
+impl FromStr for PlannerSpec {
+    type Err = String;
+
+    /// A file is a path with the extension `.onnx`. Other texts are names of the models that come with graspd.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let is_file = |text: &str| text.ends_with(".onnx") || Path::new(text).exists();
+        Ok(match text.split_once(':') {
             _ if text == "random" => Self::Random,
             _ if text == "shaf" => Self::Highest,
             Some(("grpc", address)) => Self::Server(address.to_owned()),
@@ -115,8 +121,9 @@ impl From<&str> for PlannerSpec {
             Some((evaluator, network)) if evaluator.ends_with(".onnx") => {
                 Self::Evaluated { evaluator: PathBuf::from(evaluator), network: PathBuf::from(network) }
             }
-            _ => Self::Network(PathBuf::from(text)),
-        }
+            _ if is_file(text) => Self::Network(PathBuf::from(text)),
+            _ => named::planner(text)?,
+        })
     }
 }
 
@@ -179,11 +186,16 @@ mod tests {
 
     #[test]
     fn planner_specs_are_parsed() {
-        assert_eq!(PlannerSpec::from("random"), PlannerSpec::Random);
-        assert_eq!(PlannerSpec::from("grpc:127.0.0.1:50051"), PlannerSpec::Server("127.0.0.1:50051".into()));
-        assert_eq!(PlannerSpec::from("shaf"), PlannerSpec::Highest);
-        assert_eq!(PlannerSpec::from("shaf:vgn.onnx"), PlannerSpec::HighestProposed("vgn.onnx".into()));
-        assert_eq!(PlannerSpec::from("gpd:zoo/gpd.onnx"), PlannerSpec::Gpd("zoo/gpd.onnx".into()));
-        assert_eq!(PlannerSpec::from("zoo/vgn.onnx"), PlannerSpec::Network("zoo/vgn.onnx".into()));
+        let planners = [
+            ("random", PlannerSpec::Random),
+            ("grpc:127.0.0.1:50051", PlannerSpec::Server("127.0.0.1:50051".into())),
+            ("shaf", PlannerSpec::Highest),
+            ("shaf:vgn.onnx", PlannerSpec::HighestProposed("vgn.onnx".into())),
+            ("gpd:zoo/gpd.onnx", PlannerSpec::Gpd("zoo/gpd.onnx".into())),
+            ("zoo/vgn.onnx", PlannerSpec::Network("zoo/vgn.onnx".into())),
+        ];
+        for (text, expected) in planners {
+            assert_eq!(text.parse(), Ok(expected));
+        }
     }
 }

@@ -49,7 +49,7 @@ const BINS: usize = 20;
 impl Reliability {
     /// The diagram of these attempts.
     #[must_use]
-    pub fn of(attempts: &[Attempt]) -> Self {
+    pub fn new(attempts: &[Attempt]) -> Self {
         let bin = |attempts: &mut dyn Iterator<Item = &Attempt>| {
             let mut bin = attempts.fold(Bin::default(), |bin, attempt| Bin {
                 attempts: bin.attempts + 1,
@@ -151,14 +151,14 @@ mod tests {
     #[test]
     fn calibrated_qualities_have_no_error() {
         let calibrated: Vec<Attempt> = attempts(0.75, 8, 6).chain(attempts(0.52, 100, 52)).collect();
-        let found = Reliability::of(&calibrated);
+        let found = Reliability::new(&calibrated);
         assert!(found.error < 1e-12, "{}", found.error);
         assert_eq!((found.whole.attempts, found.whole.lifted), (108, 58));
         // One tenth is 0.2 too high, the others are 0.1 too low.
         let other: Vec<Attempt> = attempts(1.0, 10, 8).chain(attempts(0.6, 90, 63)).collect();
-        assert!((Reliability::of(&other).error - (0.1 * 0.2 + 0.9 * 0.1)).abs() < 1e-12);
-        assert_eq!(Reliability::of(&other).bins[BINS - 1].attempts, 10, "quality 1 is in the last bin");
-        assert_eq!(Reliability::of(&[]).error, 0.0);
+        assert!((Reliability::new(&other).error - (0.1 * 0.2 + 0.9 * 0.1)).abs() < 1e-12);
+        assert_eq!(Reliability::new(&other).bins[BINS - 1].attempts, 10, "quality 1 is in the last bin");
+        assert_eq!(Reliability::new(&[]).error, 0.0);
     }
 
     #[test]

@@ -55,7 +55,7 @@ pub struct Summary {
 impl Summary {
     /// Pools the rounds, as in the papers.
     #[must_use]
-    pub fn of(rounds: &[Round]) -> Self {
+    pub fn new(rounds: &[Round]) -> Self {
         let attempts: Vec<Attempt> = rounds.iter().flat_map(|round| round.attempts.iter().copied()).collect();
         let count = |wanted: fn(&Outcome) -> bool| attempts.iter().filter(|attempt| wanted(&attempt.outcome)).count();
         let ended = |ending: Ending| rounds.iter().filter(|round| round.ending == ending).count();
@@ -63,8 +63,8 @@ impl Summary {
         let successes = count(Outcome::is_success);
         let (gsr, gsr_interval) = proportion(successes, attempts.len());
         let (dr, dr_interval) = proportion(successes, objects);
-        let fusion = Milliseconds::of(rounds.iter().flat_map(|round| &round.fusion));
-        let planning = Milliseconds::of(rounds.iter().flat_map(|round| &round.planning));
+        let fusion = Milliseconds::new(rounds.iter().flat_map(|round| &round.fusion));
+        let planning = Milliseconds::new(rounds.iter().flat_map(|round| &round.planning));
         Self {
             rounds: rounds.len(),
             objects,
@@ -132,7 +132,7 @@ pub struct Spread {
 impl Spread {
     /// The spread of these values; `None` without values.
     #[must_use]
-    pub fn of(values: &[f64]) -> Option<Self> {
+    pub fn new(values: &[f64]) -> Option<Self> {
         let n = values.len() as f64;
         let mean = values.iter().sum::<f64>() / n;
         let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
@@ -152,7 +152,7 @@ impl Spread {
 struct Milliseconds(Vec<f64>);
 
 impl Milliseconds {
-    fn of<'a>(durations: impl Iterator<Item = &'a Duration>) -> Self {
+    fn new<'a>(durations: impl Iterator<Item = &'a Duration>) -> Self {
         let mut sorted: Vec<f64> = durations.map(|duration| duration.as_secs_f64() * 1e3).collect();
         sorted.sort_by(f64::total_cmp);
         Self(sorted)
@@ -181,17 +181,17 @@ mod tests {
 
     #[test]
     fn seeds_are_averaged() {
-        assert_eq!(Spread::of(&[]), None);
-        assert_eq!(Spread::of(&[0.5]), Some(Spread { mean: 0.5, std: None, n: 1 }));
-        let two = Spread::of(&[0.1, 0.3]).unwrap();
+        assert_eq!(Spread::new(&[]), None);
+        assert_eq!(Spread::new(&[0.5]), Some(Spread { mean: 0.5, std: None, n: 1 }));
+        let two = Spread::new(&[0.1, 0.3]).unwrap();
         assert_eq!(two.percent(), "20.0 ± 14.1");
     }
 
     #[test]
     fn percentiles_are_measured_values() {
         let durations: Vec<Duration> = (1..=100).rev().map(Duration::from_millis).collect();
-        let sorted = Milliseconds::of(durations.iter());
+        let sorted = Milliseconds::new(durations.iter());
         assert_eq!((sorted.percentile(0.5), sorted.percentile(0.95), sorted.percentile(1.0)), (51.0, 96.0, 100.0));
-        assert_eq!(Milliseconds::of([].iter()).percentile(0.5), 0.0);
+        assert_eq!(Milliseconds::new([].iter()).percentile(0.5), 0.0);
     }
 }

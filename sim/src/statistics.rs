@@ -92,7 +92,7 @@ impl Count {
 impl Statistics {
     /// The statistics of a data set with the benchmark's workspace.
     #[must_use]
-    pub fn of(dataset: &Dataset) -> Self {
+    pub fn new(dataset: &Dataset) -> Self {
         let voxel_size = WORKSPACE_SIZE / dataset.resolution().max(1) as f64;
         let mut found = Self {
             scenes: dataset.len(),

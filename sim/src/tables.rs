@@ -412,7 +412,7 @@ fn name(condition: &Condition) -> String {
 
 fn spread(summaries: &[Summary], figure: fn(&Summary) -> f64) -> String {
     let values: Vec<f64> = summaries.iter().map(figure).collect();
-    Spread::of(&values).map_or_else(|| "–".to_owned(), |spread| spread.percent())
+    Spread::new(&values).map_or_else(|| "–".to_owned(), |spread| spread.percent())
 }
 
 /// GSR and DR of a condition with its first seed: only the conditions of the paper are measured with the others.

@@ -55,9 +55,9 @@ async fn main() -> anyhow::Result<()> {
     let capacity = caller.load(Arrivals::Callers(CALLERS), CAPACITY, None).await.throughput();
     println!("capacity: {capacity:.1} answers a second to {CALLERS} callers, in {CAPACITY:?}");
 
-    let before = Use::of(&server)?;
+    let before = Use::new(&server)?;
     let report = caller.load(Arrivals::Rate(OVERLOAD * capacity), MINUTE, None).await;
-    let after = Use::of(&server)?;
+    let after = Use::new(&server)?;
     let only_overload = report.refused.keys().all(|&code| code == i32::from(Code::ResourceExhausted));
     ensure!(only_overload, "refusals with other codes than RESOURCE_EXHAUSTED: {:?}", report.refused.keys());
     let refused = report.refused.values().next().map_or(&[][..], Vec::as_slice);
@@ -86,7 +86,7 @@ async fn main() -> anyhow::Result<()> {
         report.answered.len(),
         100.0 * deadline_goodput,
         report.refusals() - late,
-        Use::of(&server)?.megabytes
+        Use::new(&server)?.megabytes
     );
 
     println!(
@@ -100,7 +100,7 @@ async fn main() -> anyhow::Result<()> {
         let report = caller.load(Arrivals::Rate(SOAK * capacity), MINUTE, None).await;
         refusals += report.refusals();
         let [p50, p99] = [0.5, 0.99].map(|share| Report::quantile(&report.answered, share).as_secs_f64() * 1e3);
-        let used = Use::of(&server)?;
+        let used = Use::new(&server)?;
         println!(
             "{minute:6} {:10} {:8} {p50:7.2} {p99:7.2} {:7.1} {:6} {:9.1}",
             report.answered.len(),
@@ -178,7 +178,7 @@ struct Use {
 }
 
 impl Use {
-    fn of(server: &LocalServer) -> anyhow::Result<Self> {
+    fn new(server: &LocalServer) -> anyhow::Result<Self> {
         let process = format!("/proc/{}", server.id());
         let files = fs::read_dir(Path::new(&process).join("fd"))?.count();
         Ok(Self { megabytes: grasp_tests::resident_bytes(server.id()) as f64 / 1e6, files })

@@ -83,7 +83,7 @@ class FilesTest(unittest.TestCase):
                 placed = ["--camera-position", "0,0,0", "--frame-from-cloud", "rows.json", WORKSPACE]
                 self.assert_right(self.grasp("detect", name, *placed, *scale, "--origin", "tcp", "--json"))
         placed = ["--camera-position", "0,0,0", "--frame-from-cloud", "rows.json", WORKSPACE]
-        self.assert_refused(self.grasp("detect", "float_mm.ply", *placed), "looks like millimetres")
+        self.assert_refused(self.grasp("detect", "float_mm.ply", *placed), "look like millimetres")
 
     def test_lenses(self):
         """The depth image of a lens with distortion gives the grasps of one without."""

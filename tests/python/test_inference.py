@@ -267,7 +267,7 @@ class InferenceTest(unittest.TestCase):
         self.assertEqual(reply["model"], MODEL)
         for change, expected in [
             ({"view": []}, "unrecognized field name 'view'"),
-            ({"views": []}, "views is a list of 0, must have from 1 to 64"),
+            ({"views": []}, "views has 0 entries, must have from 1 to 64"),
             ({"options": {"threshold": 2}}, "options.threshold is 2"),
         ]:
             status, reply = self.detect(**change)
@@ -282,7 +282,7 @@ class InferenceTest(unittest.TestCase):
             ("/models/missing/infer", {"inputs": [tensor]}, 404, "model_name: `missing` not found"),
             ("/models/missing", None, 404, "name: `missing` not found"),
             (infer, {"inputs": [tensor]}, 400, "inputs[0] is 1 values, must be 64000 values"),
-            (infer, {"inputs": []}, 400, "inputs is a list of 0"),
+            (infer, {"inputs": []}, 400, "inputs has 0 entries"),
             (infer, timeout, 400, "parameters is `timeout`"),
             (infer, b"text", 400, "the request is not valid"),
             (infer, b"0" * (16 << 20) + b"0", 400, "--max-message-bytes"),

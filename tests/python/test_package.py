@@ -6,22 +6,28 @@
 
 import asyncio
 import atexit
+import base64
 import itertools
+import json
 import os
 import pickle
 import re
 import shutil
+import struct
 import subprocess
 import sys
 import tempfile
 import time
+import types
 import unittest
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import grpc
 import numpy as np
+import people_files
 import scene
 from scipy.spatial.transform import Rotation
 from server import Server
@@ -91,6 +97,34 @@ class DetectTest(ServerTest):
         scores = self.client.score(volume, found)
         self.assertEqual((len(scores), list(scores)), (len(found), list(scores.scores)))
         self.assertRegex(repr(scores), r"^<Scores of \S+ \d: [01]\.\d\d")
+
+    def test_grasps_are_shown_over_the_depth_image(self):
+        pose = CAMERAS[0]
+        workspace = graspd.Workspace(graspd.Pose((0.1, 0.0, 0.2)))
+        frame_from_camera = workspace.pose.matrix() @ np.linalg.inv(pose)
+        depth = scene.depth(pose)
+        seen = [graspd.DepthView(depth, scene.K, camera_from_task=pose)]
+        seen.append(graspd.DepthView(depth, scene.K, frame_from_camera=frame_from_camera))
+        found = self.client.detect_from_depth(seen[0], workspace, LOW)
+        self.assertGreater(len(found), 1)
+        pictures = [found.show(view, workspace.pose, count=1).svg for view in seen]
+        ends = []
+        for picture in pictures:
+            svg = ElementTree.fromstring(picture)
+            image, group = svg
+            png = base64.b64decode(image.get("href").split(",")[1])
+            self.assertEqual(struct.unpack(">IIB", png[16:25]), (scene.WIDTH, scene.HEIGHT, 8))
+            self.assertEqual(len(group), 1)
+            ends.append(np.array(re.findall(r"[-.\d]+", group[0].get("d")), float).reshape(-1, 2))
+        np.testing.assert_allclose(ends[0], ends[1], atol=0.2)
+        # The middle of the fingertips is where the depth image shows the block.
+        tips = ends[0][[1, 3]].mean(axis=0)
+        on_block = np.abs(depth - scene.depth(pose, with_block=False)) > 1e-3
+        rows, columns = np.nonzero(on_block)
+        self.assertLess(np.hypot(columns - tips[0], rows - tips[1]).min(), 8)
+        path = Path(self.enterContext(tempfile.TemporaryDirectory())) / "grasps.svg"
+        found.show(seen[0], workspace.pose).save(path)
+        self.assertEqual(len(ElementTree.parse(path).getroot()[1]), min(10, len(found)))
 
     def test_volumes_of_every_dtype_and_memory_order(self):
         values = scene.volume(*CAMERAS)
@@ -241,7 +275,7 @@ class DetectTest(ServerTest):
         of_volume = self.client.score(scene.volume(*CAMERAS), poses, options=LOW)
         self.assertAlmostEqual(of_volume.scores[1].quality, scores.scores[1].quality, places=3)
         self.assertIsNone(of_volume.scores[1].open_width)
-        with self.assertRaisesRegex(graspd.InvalidArgument, "candidates is a list of 0"):
+        with self.assertRaisesRegex(graspd.InvalidArgument, "candidates has 0 entries"):
             self.client.score(views(), [])
 
     def test_arrays_of_other_libraries_are_read(self):
@@ -282,6 +316,12 @@ class DetectTest(ServerTest):
         expected = found(points)
         self.assertGreater(len(expected), 0)
         far = np.vstack([points, [[0, 0, 0.2]]])
+        millimetres = graspd.CloudView(np.rint(points * 1e4).astype(np.int32), (0, 0, 0), frame_from_cloud=pose, scale=1e-4)
+        found_in_millimetres = positions(self.client.detect_from_cloud(millimetres, options=LOW))
+        np.testing.assert_allclose(found_in_millimetres[0], expected[0], atol=0.005)
+        for wrong in [0, -1, np.nan, "mm"]:
+            with self.assertRaisesRegex(ValueError, "0.001 for points in millimetres"):
+                graspd.CloudView(points, (0, 0, 0), scale=wrong)
         for name, again in {
             "structured": found(structured),
             "coloured": found(np.hstack([points, points])),
@@ -881,6 +921,75 @@ class PackageTest(ServerTest):
         ]:
             with self.subTest(ours.__name__):
                 self.assertEqual({field.name for field in fields(ours)}, set(theirs.DESCRIPTOR.fields_by_name))
+
+
+class CameraTest(ServerTest):
+    """The intrinsics of CameraInfo messages and files."""
+
+    INFO = {"width": scene.WIDTH, "height": scene.HEIGHT, "distortion_model": "plumb_bob", "k": scene.K.ravel().tolist()}
+
+    def test_lenses_are_rectified(self):
+        lenses = {
+            "plumb_bob": [-0.25, 0.08, 0.001, -0.001, 0.0],
+            "rational_polynomial": [0.4, -0.1, 0.0005, 0.0005, 0.01, 0.7, -0.1, 0.02],
+            "equidistant": [0.02, -0.01, 0.003, -0.001],
+        }
+        for model, d in lenses.items():
+            with self.subTest(model):
+                info = types.SimpleNamespace(**self.INFO | {"d": d, "distortion_model": model})
+                seen = people_files.distorted(d, model)
+                straight = graspd.Camera.from_info(info).rectified(seen)
+                expected = scene.depth(people_files.CAMERA_FROM_TASK)
+                # A pixel of an edge may have the depth of its neighbour.
+                near = np.abs(straight - expected) < 0.01
+                self.assertGreater(near[5:-5, 5:-5].mean(), 0.97)
+                self.assertLess((np.abs(seen - expected) < 0.01).mean(), 0.97)
+                options = replace(LOW, convention=graspd.Convention("tcp"))
+                view = graspd.DepthView(seen, graspd.Camera.from_info(info), camera_from_task=people_files.CAMERA_FROM_TASK)
+                found = self.client.detect_from_depth(view, options=options)
+                self.assertLess(abs(found[0].pose.position[0] - 0.15), 0.012)
+
+    def test_messages_and_files_of_either_ros_are_read(self):
+        folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        upper = {"K": self.INFO["k"], "D": [0.0] * 5, "width": scene.WIDTH, "height": scene.HEIGHT}
+        calibration = {
+            "image_width": scene.WIDTH,
+            "image_height": scene.HEIGHT,
+            "camera_matrix": {"rows": 3, "cols": 3, "data": self.INFO["k"]},
+            "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.0] * 5},
+        }
+        (folder / "info.yaml").write_text(people_files.camera_info() + "---\n")
+        (folder / "info.json").write_text(json.dumps(upper))
+        (folder / "calibration.yaml").write_text(json.dumps(calibration))
+        cameras = [graspd.Camera.from_info(info) for info in [self.INFO, upper, types.SimpleNamespace(**self.INFO)]]
+        cameras += [graspd.Camera.read(folder / name) for name in ["info.yaml", "info.json", "calibration.yaml"]]
+        for camera in cameras:
+            np.testing.assert_array_equal(camera.k, scene.K)
+            self.assertEqual(camera.size, (scene.WIDTH, scene.HEIGHT))
+
+    def test_parts_of_the_sensor_and_rectified_images(self):
+        part = {"roi": {"x_offset": 20, "y_offset": 40, "width": 120, "height": 80}, "binning_x": 2, "binning_y": 2}
+        camera = graspd.Camera.from_info(self.INFO | part)
+        self.assertEqual(camera.size, (60, 40))
+        np.testing.assert_allclose(camera.k, [[67.5, 0, 29.5], [0, 67.5, 9.5], [0, 0, 1]])
+        info = self.INFO | {"d": [0.1] * 5, "p": [100.0, 0, 80, 0, 0, 100, 60, 0, 0, 0, 1, 0]}
+        rectified = graspd.Camera.from_info(info, rectified=True)
+        self.assertEqual((rectified.k[0, 0], tuple(rectified.distortion)), (100.0, ()))
+
+    def test_contradictions_are_refused(self):
+        camera = graspd.Camera.from_info(self.INFO)
+        with self.assertRaisesRegex(ValueError, r"of 160 × 120 pixels, the image has 80 × 60; .* 67.5, 67.5, 39.75, 29.75"):
+            graspd.DepthView(np.ones((60, 80)), camera)
+        with self.assertRaisesRegex(ValueError, "has 160 × 100; if the image was cropped"):
+            graspd.DepthView(np.ones((100, 160)), camera)
+        for wrong, message in [
+            ({"d": [0.1] * 4, "distortion_model": "double_sphere"}, "'double_sphere' with 4 coefficients"),
+            ({"d": [0.1] * 6}, "'plumb_bob' with 6 coefficients"),
+            ({"k": [0.0] * 9}, "not calibrated"),
+            ({"k": None}, "must have k"),
+        ]:
+            with self.assertRaisesRegex(ValueError, message):
+                graspd.Camera.from_info(self.INFO | wrong)
 
 
 class WireTest(unittest.TestCase):

@@ -233,7 +233,7 @@ class CommandTest(unittest.TestCase):
 
     def test_figures_have_the_same_names_as_in_grasp_sim(self):
         flags = "--objects objects --planner random --rounds 1 --attempts"
-        first = self.last(self.run_sh(f"grasp-sim bench {flags} first.jsonl"))
+        first = self.last(self.run_sh(f"grasp-sim bench --json {flags} first.jsonl"))
         second = self.last(self.run_sh(f"python3 sim/pybullet/clear.py {flags} second.jsonl"))
         self.assertEqual(set(first) - {"provider"}, set(second) - {"rose"})
         files = [self.folder / "first.jsonl", self.folder / "second.jsonl"]

@@ -746,14 +746,14 @@ class ConversionTest(unittest.TestCase):
         k = np.array([[540.0, 0, 319.5], [0, 541.0, 239.5], [0, 0, 1]])
         info = camera_info(k, (480, 640))
         whole, half = Image(width=640, height=480), Image(width=320, height=240)
-        np.testing.assert_array_equal(camera.intrinsics(info, whole, "/i"), k)
-        with self.assertRaisesRegex(Refusal, "640 × 480 pixels, must be of the image, 320 × 240"):
+        np.testing.assert_array_equal(camera.intrinsics(info, whole, "/i").k, k)
+        with self.assertRaisesRegex(Refusal, "on /i: .* of 640 × 480 pixels, the image has 320 × 240"):
             camera.intrinsics(info, half, "/i")
         info.binning_x = info.binning_y = 2
-        np.testing.assert_array_equal(camera.intrinsics(info, half, "/i"), [[270, 0, 159.5], [0, 270.5, 119.5], [0, 0, 1]])
+        np.testing.assert_array_equal(camera.intrinsics(info, half, "/i").k, [[270, 0, 159.5], [0, 270.5, 119.5], [0, 0, 1]])
         info.binning_x = info.binning_y = 1
         info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height = 100, 50, 320, 240
-        np.testing.assert_array_equal(camera.intrinsics(info, half, "/i"), [[540, 0, 219.5], [0, 541, 189.5], [0, 0, 1]])
+        np.testing.assert_array_equal(camera.intrinsics(info, half, "/i").k, [[540, 0, 219.5], [0, 541, 189.5], [0, 0, 1]])
         with self.assertRaisesRegex(Refusal, "not calibrated"):
             camera.intrinsics(CameraInfo(width=320, height=240), half, "/i")
 

@@ -35,7 +35,7 @@ impl Image {
 
     /// The image of a candidate in its cloud.
     #[must_use]
-    pub fn of(cloud: &Cloud, candidate: &Candidate) -> Self {
+    pub fn new(cloud: &Cloud, candidate: &Candidate) -> Self {
         let points = in_region(cloud, &candidate.pose);
         let mut pixels = vec![0; CHANNELS * AREA];
         for (axis, channels) in pixels.chunks_exact_mut(4 * AREA).enumerate() {
@@ -144,7 +144,7 @@ mod tests {
 
     #[test]
     fn an_image_shows_the_surfaces_between_the_fingers() {
-        let image = Image::of(&slab(), &candidate());
+        let image = Image::new(&slab(), &candidate());
         assert_eq!(image.pixels().len(), CHANNELS * AREA);
         let channel = |index: usize| &image.pixels()[index * AREA..][..AREA];
         // Projection along x: rows are y, columns are z; the faces are two lines at y = ±0.02.
@@ -164,7 +164,7 @@ mod tests {
         let turned = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI);
         let cloud = slab();
         let [here, there] = [Isometry3::identity(), Isometry3::from_parts(Default::default(), turned)]
-            .map(|pose| Image::of(&cloud, &Candidate { pose, ..candidate() }));
+            .map(|pose| Image::new(&cloud, &Candidate { pose, ..candidate() }));
         let lit = |image: &Image| image.pixels().iter().map(|&value| f64::from(value)).sum::<f64>();
         let difference: f64 = here.pixels().iter().zip(there.pixels()).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
         // The voxel grid of the cloud is not symmetric.
@@ -176,9 +176,9 @@ mod tests {
     fn points_outside_the_region_are_not_shown() {
         let far = |position| SurfacePoint { position, normal: Vector3::z() };
         let points = [Point3::new(0.0, 0.06, 0.03), Point3::new(0.03, 0.0, 0.03), Point3::new(0.0, 0.0, -0.01)];
-        let image = Image::of(&Cloud::new(points.map(far)), &candidate());
+        let image = Image::new(&Cloud::new(points.map(far)), &candidate());
         assert!(image.pixels().iter().all(|&value| value == 0));
-        let image = Image::of(&Cloud::new([far(Point3::new(0.0, 0.0, 0.015))]), &candidate());
+        let image = Image::new(&Cloud::new([far(Point3::new(0.0, 0.0, 0.015))]), &candidate());
         let nearness = image.pixels()[11 * AREA..].iter().max();
         assert_eq!(nearness, Some(&191), "a quarter of the way along z");
     }
@@ -186,7 +186,7 @@ mod tests {
     #[test]
     fn a_pixel_is_the_rounded_mean_of_its_points() {
         let at = |z| SurfacePoint { position: Point3::new(0.0, 0.0, z), normal: Vector3::z() };
-        let image = Image::of(&Cloud::new([at(0.015), at(0.03)]), &candidate());
+        let image = Image::new(&Cloud::new([at(0.015), at(0.03)]), &candidate());
         // Along z: 1 - (0.25 + 0.5) / 2 = 0.625, times 255 = 159.4.
         let nearness = image.pixels()[11 * AREA..].iter().filter(|&&value| value > 0);
         assert!(nearness.clone().count() > 0 && nearness.clone().all(|&value| value == 159));

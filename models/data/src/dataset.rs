@@ -24,12 +24,12 @@ impl DataFormat {
     ///
     /// # Errors
     /// [`DataError`] if it cannot be read or is not a data set.
-    pub fn of(folder: &Path) -> Result<Self, DataError> {
+    pub fn from_folder(folder: &Path) -> Result<Self, DataError> {
         fs::metadata(folder).at(folder)?;
         if packed::is_packed(folder) {
             return Ok(Self::Packed);
         }
-        match LengthUnit::of(folder)? {
+        match LengthUnit::from_folder(folder)? {
             Some(LengthUnit::Metres) => Ok(Self::Raw),
             Some(LengthUnit::Voxels) => Ok(Self::Processed),
             None => Err(DataError::Empty(folder.to_owned())),
@@ -58,7 +58,7 @@ impl Dataset {
     pub fn open(folders: &[PathBuf]) -> Result<Self, DataError> {
         let mut dataset = Self::empty();
         for folder in folders {
-            let source = match DataFormat::of(folder)? {
+            let source = match DataFormat::from_folder(folder)? {
                 DataFormat::Packed => Source::Packed(packed::Reader::open(folder)?),
                 DataFormat::Processed => Source::Memory(processed::read(folder)?),
                 DataFormat::Raw => {
@@ -89,7 +89,7 @@ impl Dataset {
 
     /// A data set of scenes in memory; `None` unless all their volumes are cubes of one resolution.
     #[must_use]
-    pub fn of(scenes: Vec<Scene>) -> Option<Self> {
+    pub fn new(scenes: Vec<Scene>) -> Option<Self> {
         let mut dataset = Self::empty();
         dataset.add(Source::Memory(scenes)).ok()?;
         Some(dataset)

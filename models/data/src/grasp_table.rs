@@ -51,7 +51,7 @@ impl LengthUnit {
     }
 
     /// The unit of a folder's table, from its header; `None` if there is no table.
-    pub(crate) fn of(folder: &Path) -> Result<Option<Self>, DataError> {
+    pub(crate) fn from_folder(folder: &Path) -> Result<Option<Self>, DataError> {
         let path = folder.join(FILE);
         let file = match File::open(&path) {
             Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => return Ok(None),

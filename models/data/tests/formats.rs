@@ -81,7 +81,7 @@ fn pack(folder: &Path, numbers: impl IntoIterator<Item = u64>) {
 fn packed_scenes_round_trip() {
     let folder = tempfile::tempdir().unwrap();
     pack(folder.path(), [0, 1, 3]);
-    assert_eq!(DataFormat::of(folder.path()).unwrap(), DataFormat::Packed);
+    assert_eq!(DataFormat::from_folder(folder.path()).unwrap(), DataFormat::Packed);
     let dataset = Dataset::open(&[folder.path().to_owned()]).unwrap();
     assert_eq!((dataset.len(), dataset.resolution()), (3, N));
     for (index, number) in [0, 1, 3].into_iter().enumerate() {
@@ -106,7 +106,7 @@ fn a_scene_that_was_observed_again_counts_once() {
     };
     let scenes = [("0", trials(0), 0), ("1", trials(1), 0), ("0", trials(0), 1), ("0", trials(1), 0)];
     let scenes = scenes.map(|(id, trials, seen)| scene(id, trials, seen));
-    assert_eq!(Dataset::of(scenes.into()).unwrap().distinct(), [0, 1, 3]);
+    assert_eq!(Dataset::new(scenes.into()).unwrap().distinct(), [0, 1, 3]);
 }
 
 #[test]
@@ -115,7 +115,7 @@ fn the_fingerprint_depends_on_everything_that_is_trained() {
         let mut trials = trials(0);
         change(&mut trials[0]);
         let volumes = volumes(0).iter().map(|volume| grasp_data::quantise(volume)).collect();
-        Dataset::of(vec![Scene { id: "a".into(), volumes, trials, occupancy }]).unwrap().fingerprint()
+        Dataset::new(vec![Scene { id: "a".into(), volumes, trials, occupancy }]).unwrap().fingerprint()
     };
     let fingerprint = |change| fingerprint_of(change, None);
     let same = fingerprint(|_| {});
@@ -287,7 +287,7 @@ fn raw_scenes_round_trip() {
     assert_eq!(raw::Writer::open(folder.path(), &setup).unwrap().next(), Some(7), "the last scene is written again");
     raw::Writer::open(folder.path(), &setup).unwrap().append("00000007", &views, &trials(7)).unwrap();
 
-    assert_eq!(DataFormat::of(folder.path()).unwrap(), DataFormat::Raw);
+    assert_eq!(DataFormat::from_folder(folder.path()).unwrap(), DataFormat::Raw);
     let reader = raw::Reader::open(folder.path()).unwrap();
     let (id, read) = reader.trials().next().unwrap();
     assert_eq!(id, "00000007");

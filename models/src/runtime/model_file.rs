@@ -41,7 +41,7 @@ impl<'a> ModelFile<'a> {
     pub fn new(path: &'a Path, bytes: &'a [u8], options: &Options) -> Self {
         let model = ModelProto::from_bytes(bytes).unwrap_or_default();
         let optimized = optimized(&model, bytes);
-        let calibration = Calibration::of(&model);
+        let calibration = Calibration::from_model(&model);
         let graph = model.graph.unwrap_or_default();
         let is_int8 = graph.node.iter().any(|node| node.op_type() == "QuantizeLinear");
         let is_batch = |name: &str| name == INPUT || name == gpd::INPUT;

@@ -13,7 +13,7 @@ fn vgn() -> ModelProto {
 
 fn with(change: impl FnOnce(&mut Metadata)) -> ModelProto {
     let mut model = vgn();
-    let mut metadata = Metadata::of(&model, Path::new("vgn.onnx")).unwrap();
+    let mut metadata = Metadata::from_model(&model, Path::new("vgn.onnx")).unwrap();
     change(&mut metadata);
     metadata.write_to(&mut model);
     model
@@ -35,7 +35,7 @@ fn metadata_is_stored_in_the_file() {
         metadata.voxel_origin = VoxelOrigin::Center;
         metadata.provenance.insert("data".to_owned(), "1000 scenes, seed 7".to_owned());
     });
-    let read = Metadata::of(&model, Path::new("other.onnx")).unwrap();
+    let read = Metadata::from_model(&model, Path::new("other.onnx")).unwrap();
     assert_eq!((read.name.as_str(), read.version.as_str(), read.resolution), ("pile", "2.1", 8));
     assert_eq!(read.voxel_size, 0.3 / 40.0, "to the last bit");
     assert_eq!(read.provenance["data"], "1000 scenes, seed 7");
@@ -47,7 +47,7 @@ fn metadata_is_stored_in_the_file() {
 fn a_file_without_metadata_follows_vgns_conventions() {
     let mut model = vgn();
     model.metadata_props.clear();
-    let read = Metadata::of(&model, Path::new("models/vgn_pile.onnx")).unwrap();
+    let read = Metadata::from_model(&model, Path::new("models/vgn_pile.onnx")).unwrap();
     assert_eq!(read, Metadata::defaults(Path::new("vgn_pile.onnx"), Some(8)));
     assert_eq!((read.name.as_str(), read.version.as_str()), ("vgn_pile", "1"));
     assert_eq!(read.voxel_origin, VoxelOrigin::Corner);
@@ -57,7 +57,7 @@ fn a_file_without_metadata_follows_vgns_conventions() {
     model.metadata_props.retain(|property| property.key() == "graspd.resolution");
     let input = &mut model.graph.as_mut().unwrap().input[0];
     *input = ValueInfoProto::tensor(INPUT, ["batch", "channels", "x", "y", "z"].map(Dimension::named).to_vec());
-    let read = Metadata::of(&model, Path::new("x.onnx")).unwrap();
+    let read = Metadata::from_model(&model, Path::new("x.onnx")).unwrap();
     assert_eq!((read.resolution, read.voxel_size), (80, 0.3 / 80.0));
 }
 
@@ -74,7 +74,7 @@ fn invalid_metadata_is_an_error_that_names_the_property() {
         let mut model = vgn();
         let property = model.metadata_props.iter_mut().find(|p| p.key() == format!("graspd.{key}")).unwrap();
         property.value = Some(value.to_owned());
-        let error = Metadata::of(&model, Path::new("vgn.onnx")).unwrap_err().to_string();
+        let error = Metadata::from_model(&model, Path::new("vgn.onnx")).unwrap_err().to_string();
         assert!(error.contains(key) && error.contains(&format!("`{value}`")), "{error}");
     }
 }
@@ -85,7 +85,7 @@ fn an_unknown_property_and_an_empty_name_are_errors() {
         let mut model = vgn();
         let (key, value) = (Some(format!("graspd.{key}")), Some(value.to_owned()));
         model.metadata_props.push(StringStringEntryProto { key, value });
-        Metadata::of(&model, Path::new("vgn.onnx")).unwrap_err().to_string()
+        Metadata::from_model(&model, Path::new("vgn.onnx")).unwrap_err().to_string()
     };
     assert!(error("voxel_orign", "center").contains("`graspd.voxel_orign` is not known"));
     assert!(error("name", "").contains("`graspd.name` is ``, must be 1 to 128 bytes"), "{}", error("name", ""));
@@ -95,13 +95,13 @@ fn an_unknown_property_and_an_empty_name_are_errors() {
 fn an_unsupported_resolution_is_an_error() {
     // From the property, then from the shape of the input.
     let model = with(|metadata| metadata.resolution = 257);
-    let error = Metadata::of(&model, Path::new("vgn.onnx")).unwrap_err().to_string();
+    let error = Metadata::from_model(&model, Path::new("vgn.onnx")).unwrap_err().to_string();
     assert!(error.contains("257") && error.contains("from 1 to 256"), "{error}");
     let mut model = with(|metadata| metadata.resolution = 256);
-    assert_eq!(Metadata::of(&model, Path::new("vgn.onnx")).unwrap().resolution, 256);
+    assert_eq!(Metadata::from_model(&model, Path::new("vgn.onnx")).unwrap().resolution, 256);
     let input = ValueInfoProto::tensor("tsdf", [1, 1, 264, 264, 264].map(Dimension::size).to_vec());
     model.graph.as_mut().unwrap().input = vec![input];
-    let error = Metadata::of(&model, Path::new("vgn.onnx")).unwrap_err().to_string();
+    let error = Metadata::from_model(&model, Path::new("vgn.onnx")).unwrap_err().to_string();
     assert!(error.contains("264"), "{error}");
 }
 

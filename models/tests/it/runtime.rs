@@ -301,7 +301,7 @@ fn images(count: u64) -> Vec<Image> {
         normal: Vector3::y(),
     };
     let candidate = Candidate { pose: Isometry3::identity(), width: 0.04, point: Point3::origin() };
-    (0..count).map(|seed| Image::of(&Cloud::new((0..20).map(|i| point(i * (seed + 3)))), &candidate)).collect()
+    (0..count).map(|seed| Image::new(&Cloud::new((0..20).map(|i| point(i * (seed + 3)))), &candidate)).collect()
 }
 
 #[test]

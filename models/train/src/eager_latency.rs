@@ -43,7 +43,7 @@ impl EagerLatency {
         let model = ModelProto::read(&self.model)?;
         let published =
             with_published_heads(&with_full_weights(&model)?).context("--model must be a network of `grasp-train`")?;
-        let edge = Metadata::of(&model, &self.model)?.resolution as i64;
+        let edge = Metadata::from_model(&model, &self.model)?.resolution as i64;
         let published_p50_ms = self.median(published, edge)?;
         let p50_ms = self.median(model, edge)?;
         let report = LatencyReport { calls: self.calls, threads: self.threads, p50_ms, published_p50_ms };

@@ -93,7 +93,7 @@ impl Executor {
                 constants.insert(output_name(node, 0), constant(value, execution.device)?);
             }
         }
-        let (heads, upsampled, gelus) = (head_convolutions(graph), upsampled_convolutions(graph), Gelus::of(graph));
+        let (heads, upsampled, gelus) = (head_convolutions(graph), upsampled_convolutions(graph), Gelus::new(graph));
         Ok(Self { model, execution, parameters, constants, heads, upsampled, gelus, occupancy: None })
     }
 

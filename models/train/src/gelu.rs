@@ -18,7 +18,7 @@ pub(crate) struct Gelus {
 
 impl Gelus {
     /// Finds them. Values between the nodes must have no other reader.
-    pub fn of(graph: &GraphProto) -> Self {
+    pub fn new(graph: &GraphProto) -> Self {
         let mut found = Self::default();
         for erf in (0..graph.node.len()).filter(|&index| graph.node[index].op_type() == "Erf") {
             if let Some((nodes, last, x)) = gelu(graph, erf) {
@@ -72,7 +72,7 @@ mod tests {
         let model = Architecture::TransformerSmall.build(16, 0).unwrap();
         let graph = model.graph.unwrap();
         let erfs = graph.node.iter().filter(|node| node.op_type() == "Erf").count();
-        let gelus = Gelus::of(&graph);
+        let gelus = Gelus::new(&graph);
         assert!(erfs > 0);
         assert_eq!((gelus.inputs.len(), gelus.inner.len()), (erfs, 4 * erfs));
     }

@@ -120,7 +120,7 @@ struct TrainArgs {
     #[arg(long, value_enum, default_value_t = KeptWeights::Last)]
     keep: KeptWeights,
     /// Evaluate the model with this command. {} is replaced by the model's file. The command must print JSON objects
-    /// with `gsr` and `dr`, such as `grasp-sim bench --planner {} --rounds 40`.
+    /// with `gsr` and `dr`, such as `grasp-sim bench --json --planner {} --rounds 40`.
     #[arg(long, value_name = "COMMAND")]
     evaluate: Option<String>,
     /// Interval of --evaluate, epochs. The last epoch is always evaluated.

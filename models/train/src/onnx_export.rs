@@ -92,7 +92,7 @@ impl Export {
         let model = ModelProto::read(&self.from)?;
         let data = if self.data.is_empty() { None } else { Some(Dataset::open(&self.data)?) };
         if let Some(data) = &data {
-            let (resolution, needed) = (data.resolution(), Metadata::of(&model, &self.from)?.resolution);
+            let (resolution, needed) = (data.resolution(), Metadata::from_model(&model, &self.from)?.resolution);
             ensure!(
                 resolution == needed,
                 "--data has volumes of {resolution}³ voxels, but the network needs {needed}³"
@@ -118,14 +118,14 @@ impl Export {
         };
         let model = if self.average_rotations { averaged_over_rotations(&model)? } else { model };
         let mut model = if self.precision == Precision::Fp16 { with_half_weights(&model)? } else { model };
-        let mut metadata = Metadata::of(&model, &self.from)?;
+        let mut metadata = Metadata::from_model(&model, &self.from)?;
         metadata.name = self.out.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let mut note = |key: &str, value: &str| metadata.provenance.insert(key.to_owned(), value.to_owned());
         note("precision", self.precision.name());
         if self.average_rotations {
             note("averaged_over_rotations", "4");
         }
-        let calibration = Calibration::of(&model)?;
+        let calibration = Calibration::from_model(&model)?;
         metadata.write_to(&mut model);
         if calibration != Calibration::default() {
             calibration.write_to(&mut model);

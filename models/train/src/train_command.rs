@@ -252,7 +252,7 @@ fn initial_network(training: &TrainArgs) -> Result<(ModelProto, Metadata)> {
         (None, None) => anyhow::bail!("give --network or --from"),
     };
     let path = training.from.as_deref().unwrap_or(&training.out);
-    let mut metadata = Metadata::of(&model, path).with_context(|| path.display().to_string())?;
+    let mut metadata = Metadata::from_model(&model, path).with_context(|| path.display().to_string())?;
     // The rest is about the weights before this run.
     metadata.provenance.retain(|key, _| ["architecture", "orientation"].contains(&key.as_str()));
     let file_name = Metadata::defaults(&training.out, None).name;

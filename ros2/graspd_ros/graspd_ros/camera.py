@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from graspd import Camera
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 
@@ -37,27 +38,16 @@ def pixels(image: Image, types: dict[str, str], topic: str, needed: str) -> NDAr
     return rows[:, : image.width * kind.itemsize].copy().view(kind)
 
 
-def intrinsics(info: CameraInfo, image: Image, topic: str) -> NDArray[np.float64]:
-    """The matrix of a rectified image: `p`, or `k` if the driver leaves `p` empty."""
-    k = np.reshape(info.p, (3, 4))[:, :3] if info.p[0] else np.reshape(info.k, (3, 3))
-    if not k[0, 0]:
-        raise Refusal("INVALID_IMAGE", f"k on {topic} is 0: the camera is not calibrated")
-    # The matrix is that of the whole sensor, of which the driver may send a part (`roi`) with fewer pixels (`binning`).
-    # Pixel centres are at whole numbers.
-    binning = np.maximum([info.binning_x, info.binning_y], 1)
-    offset = np.array([info.roi.x_offset, info.roi.y_offset])
-    whole = np.array([info.roi.width or info.width, info.roi.height or info.height])
-    width, height = whole // binning
-    if (width, height) != (image.width, image.height):
+def intrinsics(info: CameraInfo, image: Image, topic: str) -> Camera:
+    """The camera of a rectified image, with the matrix `p`; or that of the lens, if the driver leaves `p` empty."""
+    try:
+        camera = Camera.from_info(info, rectified=bool(info.p[0]))
+        camera.check_size(image.width, image.height)
+    except ValueError as error:
         raise Refusal(
-            "INVALID_IMAGE",
-            f"the CameraInfo on {topic} is of {width} × {height} pixels, must be of the image, {image.width} × "
-            f"{image.height}: remap depth/camera_info to that of the depth image",
-        )
-    k = k.copy()
-    k[[0, 1], [0, 1]] /= binning
-    k[:2, 2] = (k[:2, 2] - offset + 0.5) / binning - 0.5
-    return k
+            "INVALID_IMAGE", f"the CameraInfo on {topic}: {error}; remap depth/camera_info to that of the depth image"
+        ) from None
+    return camera
 
 
 def points(cloud: PointCloud2, topic: str) -> NDArray:

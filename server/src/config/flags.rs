@@ -277,15 +277,6 @@ pub(crate) enum LogFormat {
 }
 
 /// A folder that can be read. Its files are read after the other flags.
-/// The models that come with graspd: in the prefix in which it is installed, or in the checkout from which it was built.
-pub(super) fn own_models() -> Option<PathBuf> {
-    let program = std::env::current_exe().ok().and_then(|program| program.canonicalize().ok());
-    let installed =
-        program.as_deref().and_then(|program| Some(program.parent()?.parent()?.join("share/graspd/models")));
-    let of_checkout = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo"));
-    [installed, of_checkout.canonicalize().ok()].into_iter().flatten().find(|folder| folder.is_dir())
-}
-
 fn model_folder(folder: PathBuf) -> Result<PathBuf, StoreError> {
     match fs::read_dir(&folder) {
         Ok(_) => Ok(folder),

@@ -2,7 +2,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use grasp::{Fusion, Volume};
+use grasp::Volume;
 use grasp_engine::{Detected, StageTimings};
 use nalgebra::{Isometry3, Translation3, Vector3};
 use serde_json::{Value, json};
@@ -194,7 +194,7 @@ impl RecentRequest {
             let Shown { pose, size, volumes, grasps, finger_depth, .. } = &**shown;
             let (mut vertices, mut triangles) = (Vec::new(), Vec::new());
             for volume in volumes {
-                let mesh = Fusion::of(volume).mesh();
+                let mesh = volume.mesh();
                 let shown_from_volume = pose.inverse() * volume.pose();
                 let first = vertices.len() as u32;
                 vertices.extend(mesh.vertices.iter().map(|vertex| shown_from_volume * vertex));

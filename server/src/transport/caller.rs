@@ -9,7 +9,7 @@ use crate::transport::connections::Peer;
 
 /// The caller of a request: by its token if the server checks tokens, otherwise by its address.
 pub(crate) fn of(extensions: &Extensions) -> Caller {
-    let by_address = || Peer::of(extensions).and_then(|peer| peer.address).map_or(Caller::Unknown, at);
+    let by_address = || Peer::from_extensions(extensions).and_then(|peer| peer.address).map_or(Caller::Unknown, at);
     extensions.get().copied().unwrap_or_else(by_address)
 }
 

@@ -123,7 +123,7 @@ pub(crate) struct Peer {
 
 impl Peer {
     /// The client that sent a request.
-    pub fn of(extensions: &Extensions) -> Option<&Self> {
+    pub fn from_extensions(extensions: &Extensions) -> Option<&Self> {
         extensions.get()
     }
 }

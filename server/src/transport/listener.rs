@@ -88,7 +88,8 @@ pub(crate) async fn serve(
             parts.extensions.insert(deadline);
         }
         // Every request belongs to a connection.
-        let share = Peer::of(&parts.extensions).map_or_else(|| budget.of_peer(None), |peer| peer.share.clone());
+        let share =
+            Peer::from_extensions(&parts.extensions).map_or_else(|| budget.of_peer(None), |peer| peer.share.clone());
         let body =
             RequestBody::new(parts.uri.path(), body, deadline, limits, share, Arc::clone(&metrics), drain.clone());
         http::Request::from_parts(parts, Body::new(body))

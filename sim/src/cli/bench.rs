@@ -5,8 +5,8 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-use anyhow::Context;
-use clap::{Args, ValueEnum};
+use anyhow::{Context, anyhow};
+use clap::Args;
 use grasp::{Clearance, DecodeParams, FINGER_DEPTH, Grasp};
 use grasp_models::{Choice, Options, Precision, Provider};
 use grasp_picture::{Picture, quality_color, save_sheet};
@@ -22,12 +22,12 @@ use super::{SceneArgs, parse_quality, parse_share, show};
 /// The scenes depend only on the seed, so that all planners are evaluated on the same scenes.
 #[derive(Args)]
 pub struct Bench {
-    /// Planner; can be repeated: `random`; the path of an .onnx network; `EVALUATOR.onnx:NETWORK.onnx`
-    /// (a network and the evaluator of its grasps); `grpc:ADDRESS` (a running graspd); `shaf` (the
-    /// highest candidate); `shaf:FILE` (the highest of a network's proposals with a quality above 0.5); `gpd:FILE`
-    /// (candidates scored by a classifier of `grasp-train classify`). `grpc` uses only --threshold and --force of the
-    /// options of decoding, `shaf:FILE` only --out-th, --no-border and --clear; `random`, `shaf` and `gpd` use none.
-    #[arg(long = "planner", required = true)]
+    /// Planner; can be repeated: a model that comes with graspd (`graspd`, `vgn-packed`, `gpd`, `shaf`); the path of an
+    /// .onnx network; `EVALUATOR.onnx:NETWORK.onnx` (a network and the evaluator of its grasps); `grpc:ADDRESS` (a
+    /// running graspd); `shaf:FILE` (the highest of a network's proposals with a quality above 0.5); `gpd:FILE`
+    /// (candidates scored by a classifier of `grasp-train classify`); `random`. `grpc` uses only --threshold and --force
+    /// of the options of decoding, `shaf:FILE` only --out-th, --no-border and --clear; `random`, `shaf` and `gpd` use none.
+    #[arg(long = "planner", required = true, value_name = "MODEL|FILE")]
     planners: Vec<String>,
 
     #[command(flatten)]
@@ -56,9 +56,9 @@ pub struct Bench {
     #[arg(long, default_value = "auto")]
     precision: Choice<Precision>,
 
-    /// Print a JSON object or a Markdown row per planner.
-    #[arg(long, value_enum, default_value = "json")]
-    format: Format,
+    /// Print a JSON object per planner instead of a Markdown table.
+    #[arg(long)]
+    json: bool,
 
     /// Also write every attempt to this file, as JSON lines: the grasp, the nearest object and the outcome.
     #[arg(long)]
@@ -72,12 +72,6 @@ pub struct Bench {
     /// Also draw the first six failures of the last planner into this file and print their outcomes.
     #[arg(long)]
     failures: Option<PathBuf>,
-}
-
-#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Format {
-    Json,
-    Markdown,
 }
 
 /// Decoding of a network's output; the defaults are those of GIGA's evaluation. A running graspd uses only the
@@ -162,7 +156,7 @@ impl Bench {
             seed: self.scene.seed,
         };
         let setup = format!(
-            "{}, objects {}{}, views {}, noise {} ({}){}, {} objects per scene, {} rounds, seed {}",
+            "{}, objects {}{}, views {}, noise {} ({}){}, {} objects per scene, {} {}, seed {}",
             self.scene.scene.name(),
             self.scene.objects.as_deref().unwrap_or("test"),
             self.scene.part.suffix(),
@@ -172,16 +166,21 @@ impl Bench {
             if benchmark.noise.is_scale_corrected { ", scale corrected" } else { "" },
             benchmark.count,
             benchmark.rounds,
+            if benchmark.rounds == 1 { "round" } else { "rounds" },
             benchmark.seed
         );
+        let planners: Vec<(&String, PlannerSpec)> = self
+            .planners
+            .iter()
+            .map(|name| Ok((name, name.parse().map_err(|reason: String| anyhow!("--planner: {reason}"))?)))
+            .collect::<anyhow::Result<_>>()?;
         let watcher = Watcher::new(&self)?;
         let params = self.decoding.params();
         let options = Options { provider: self.provider.0, precision: self.precision.0, ..Options::default() };
-        if self.format == Format::Markdown {
-            println!("{setup}, {} seeds, networks with {}\n\n{MARKDOWN_HEAD}", self.seeds, self.decoding);
+        if !self.json {
+            println!("{setup}, seeds: {}, networks with {}\n\n{MARKDOWN_HEAD}", self.seeds, self.decoding);
         }
-        for name in &self.planners {
-            let planner = PlannerSpec::from(name.as_str());
+        for (name, planner) in planners {
             let progress = ProgressBar::new(self.rounds * self.seeds).with_message(name.clone());
             let mut conditions = Vec::new();
             for seed in benchmark.seed..benchmark.seed + self.seeds {
@@ -194,21 +193,20 @@ impl Bench {
                 watcher.finish()?;
             }
             progress.finish_and_clear();
-            let whole = Summary::of(&conditions.concat());
-            let each: Vec<Summary> = conditions.iter().map(|rounds| Summary::of(rounds)).collect();
-            let spread = |figure: fn(&Summary) -> f64| Spread::of(&each.iter().map(figure).collect::<Vec<_>>());
+            let whole = Summary::new(&conditions.concat());
+            let each: Vec<Summary> = conditions.iter().map(|rounds| Summary::new(rounds)).collect();
+            let spread = |figure: fn(&Summary) -> f64| Spread::new(&each.iter().map(figure).collect::<Vec<_>>());
             let (gsr, dr) = (spread(|summary| summary.gsr), spread(|summary| summary.dr));
-            match self.format {
-                Format::Json => {
-                    let mut line = serde_json::to_value(&whole)?;
-                    line["seeds"] = json!({ "gsr": gsr, "dr": dr });
-                    line["planner"] = name.as_str().into();
-                    line["decoding"] = decoding(&planner, &params);
-                    line["provider"] = format!("{} {}", self.provider, self.precision).into();
-                    line["setup"] = setup.as_str().into();
-                    println!("{line}");
-                }
-                Format::Markdown => println!("{}", markdown(name, &whole, gsr, dr)),
+            if self.json {
+                let mut line = serde_json::to_value(&whole)?;
+                line["seeds"] = json!({ "gsr": gsr, "dr": dr });
+                line["planner"] = name.as_str().into();
+                line["decoding"] = decoding(&planner, &params);
+                line["provider"] = format!("{} {}", self.provider, self.precision).into();
+                line["setup"] = setup.as_str().into();
+                println!("{line}");
+            } else {
+                println!("{}", markdown(name, &whole, gsr, dr));
             }
             // After the figures, so that an error does not lose them.
             if let Some(path) = &self.failures {

@@ -40,11 +40,11 @@ impl Calibrate {
             input.unwrap_or_default(),
             gpd::INPUT
         );
-        let earlier = Calibration::of(&model).with_context(|| self.evaluator.display().to_string())?;
+        let earlier = Calibration::from_model(&model).with_context(|| self.evaluator.display().to_string())?;
         let all = fitted.after(&earlier);
         all.write_to(&mut model);
         model.write(&self.out)?;
-        let before = Reliability::of(&attempts);
+        let before = Reliability::new(&attempts);
         println!(
             "{} attempts, {:.1} % succeeded, mean quality {:.1} %, expected calibration error {:.1} %",
             attempts.len(),

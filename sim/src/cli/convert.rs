@@ -38,7 +38,7 @@ impl Convert {
         }
         let same = fs::canonicalize(&self.from).ok().is_some_and(|from| fs::canonicalize(&self.out).ok() == Some(from));
         ensure!(!same, "--from and --out are the same folder; use another --out");
-        match DataFormat::of(&self.from)? {
+        match DataFormat::from_folder(&self.from)? {
             DataFormat::Raw => self.fuse(&Setup::read(&self.from)?),
             DataFormat::Packed => self.copy(&Setup::read(&self.from)?),
             // VGN's and GIGA's own data sets have none.

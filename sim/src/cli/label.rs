@@ -91,7 +91,7 @@ impl Label {
             |number, scene| {
                 if let Some(scene) = scene {
                     if let Some(export) = &mut export {
-                        export.append(&Line::of(number, &scene))?;
+                        export.append(&Line::new(number, &scene))?;
                     }
                     writer.append(number, scene)?;
                 }
@@ -117,7 +117,7 @@ impl Label {
     /// Checks that this run continues that of the output folder, if there is one, without missing scenes.
     fn check_continuation(&self, config: &SceneConfig) -> anyhow::Result<()> {
         if self.out.is_dir()
-            && let Ok(found) = DataFormat::of(&self.out)
+            && let Ok(found) = DataFormat::from_folder(&self.out)
             && found != self.format.of_data()
         {
             bail!("{} has scenes in another format; use another --out, or the same --format", self.out.display());

@@ -77,7 +77,7 @@ impl Observe {
             observations: made.observations,
             noise: DepthNoise {
                 share: made.noise,
-                sensor: Sensor::of(&made.sensor)?,
+                sensor: Sensor::from_name(&made.sensor)?,
                 is_scale_corrected: made.correct_depth_scale,
             },
             seed: made.seed,

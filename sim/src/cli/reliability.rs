@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow, ensure};
 use clap::Args;
-use grasp_sim::reliability::{Attempt, Reliability};
+use grasp_sim::reliability::{Attempt, Bin, Reliability};
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
 use serde::Deserialize;
@@ -20,6 +20,10 @@ pub struct ReliabilityArgs {
     /// Output file of the diagram, PNG.
     #[arg(long)]
     out: Option<PathBuf>,
+
+    /// Print JSON: all bins of the diagram.
+    #[arg(long)]
+    json: bool,
 }
 
 fn parse_named(text: &str) -> Result<(String, PathBuf), String> {
@@ -31,9 +35,18 @@ impl ReliabilityArgs {
     pub fn run(self) -> anyhow::Result<()> {
         let mut found = Vec::new();
         for (name, path) in &self.attempts {
-            let reliability = Reliability::of(&read(path)?);
-            let line = serde_json::json!({ "name": name, "reliability": reliability });
-            println!("{line}");
+            let reliability = Reliability::new(&read(path)?);
+            if self.json {
+                println!("{}", serde_json::json!({ "name": name, "reliability": reliability }));
+            } else {
+                let Bin { attempts, lifted, quality } = reliability.whole;
+                println!(
+                    "{name}: {attempts} attempts, {:.1} % lifted, {:.1} % predicted; expected calibration error {:.3}",
+                    lifted as f64 / attempts.max(1) as f64 * 100.0,
+                    quality * 100.0,
+                    reliability.error
+                );
+            }
             found.push((name.as_str(), reliability));
         }
         match &self.out {

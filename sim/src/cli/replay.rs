@@ -42,6 +42,10 @@ pub struct Replay {
     /// succeeded only in the file.
     #[arg(long)]
     differences: Option<PathBuf>,
+
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
 }
 
 /// Pictures on the sheet of differences, and per row.
@@ -71,14 +75,22 @@ impl Replay {
         }
         let [successes, kept_successes, failures, kept_failures] =
             compared.iter().fold([0; 4], |sum, (counts, _)| std::array::from_fn(|i| sum[i] + counts[i]));
-        let report = serde_json::json!({
-            "scenes": scenes.len(),
-            "successes": successes,
-            "successes_kept": kept_successes,
-            "failures": failures,
-            "failures_kept": kept_failures,
-        });
-        println!("{report}");
+        if self.json {
+            let report = serde_json::json!({
+                "scenes": scenes.len(),
+                "successes": successes,
+                "successes_kept": kept_successes,
+                "failures": failures,
+                "failures_kept": kept_failures,
+            });
+            println!("{report}");
+        } else {
+            println!(
+                "{} scenes: {kept_successes} of {successes} successes and {kept_failures} of {failures} failures are the \
+                 same",
+                scenes.len()
+            );
+        }
         if let Some(path) = &self.differences {
             let differing = scenes.iter().zip(&compared).filter(|(_, (_, grasps))| !grasps.is_empty());
             let differences = differing.flat_map(|(scene, (_, grasps))| {

@@ -31,7 +31,7 @@ pub struct Stats {
 
 impl Stats {
     pub fn run(self) -> anyhow::Result<()> {
-        let statistics = Statistics::of(&Dataset::open(&self.folders)?);
+        let statistics = Statistics::new(&Dataset::open(&self.folders)?);
         let objects = match &self.export {
             Some(path) => by_object(&export::read(path)?),
             None => BTreeMap::new(),

@@ -284,7 +284,7 @@ impl Tables {
                 more.into_iter().for_each(|condition| add(condition, "", self.seed, false));
                 add(as_published.clone(), "", self.seed, true);
 
-                let planner = PlannerSpec::from(entry.planner.as_str());
+                let planner = entry.planner.parse::<PlannerSpec>().map_err(anyhow::Error::msg)?;
                 let runs_in_pybullet = pybullet_files.is_some()
                     && (matches!(planner, PlannerSpec::Random) || model(&planner, &self.models).is_some());
                 let test_objects = (TEST_OBJECTS.to_owned(), String::new());
@@ -350,7 +350,7 @@ impl Tables {
         pybullet: &mut PyBullet,
         progress: &ProgressBar,
     ) -> anyhow::Result<Measurement> {
-        let planner = PlannerSpec::from(task.planner.as_str());
+        let planner = task.planner.parse::<PlannerSpec>().map_err(anyhow::Error::msg)?;
         let model = model(&planner, &self.models);
         let summary =
             pybullet.run(&task.condition, model.as_ref(), self.folder(&task.condition), self.rounds, task.seed)?;
@@ -361,7 +361,7 @@ impl Tables {
 
     fn run_in_rapier(&self, task: &Task, progress: &ProgressBar) -> anyhow::Result<Measurement> {
         let benchmark = self.benchmark(&task.condition, task.seed)?;
-        let planner = PlannerSpec::from(task.planner.as_str());
+        let planner = task.planner.parse::<PlannerSpec>().map_err(anyhow::Error::msg)?;
         let params = params(task.condition.epsilon, task.condition.forced);
         let (mut summary, mut milliseconds) = (None, None);
         if task.timed {
@@ -376,14 +376,14 @@ impl Tables {
                 times.push(start.elapsed().as_secs_f64() * 1e3);
                 progress.inc(u64::from(number > 0));
             }
-            milliseconds = Spread::of(times.get(1..).unwrap_or_default());
+            milliseconds = Spread::new(times.get(1..).unwrap_or_default());
         } else {
             let rounds = benchmark.run(&planner, &params, &Options::default(), |event| {
                 if let Event::Round = event {
                     progress.inc(1);
                 }
             })?;
-            summary = Some(Summary::of(&rounds));
+            summary = Some(Summary::new(&rounds));
         }
         Ok(Measurement {
             key: task.key.clone(),
@@ -412,7 +412,7 @@ impl Tables {
             let Some(name) = path.file_name().filter(|_| entry.sha256.is_some() && !entry.planner.contains(':')) else {
                 continue;
             };
-            let metadata = Metadata::of(&ModelProto::read(path)?, path)?;
+            let metadata = Metadata::from_model(&ModelProto::read(path)?, path)?;
             let provenance = |key: &str| metadata.provenance.get(key).map_or_else(|| "?".to_owned(), |n| thousands(n));
             results.data.insert(name.to_string_lossy().into_owned(), (provenance("scenes"), provenance("grasps")));
         }

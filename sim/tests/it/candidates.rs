@@ -32,7 +32,8 @@ fn benchmark() -> Benchmark {
 }
 
 fn plan(spec: &str, observation: &Observation) -> Vec<grasp::Grasp> {
-    let mut planner = PlannerSpec::from(spec).build(&DecodeParams::benchmark(), &Options::default()).unwrap();
+    let mut planner =
+        spec.parse::<PlannerSpec>().unwrap().build(&DecodeParams::benchmark(), &Options::default()).unwrap();
     planner.plan(observation, &mut ChaCha8Rng::seed_from_u64(1)).unwrap()
 }
 
@@ -119,7 +120,9 @@ fn the_wrong_kind_of_network_is_refused_with_its_file_name() {
         (classifier.to_string(), "gpd.onnx", "a grasp network has the input `tsdf`"),
         ("gpd:nowhere.onnx".to_owned(), "nowhere.onnx", "No such file"),
     ] {
-        let error = PlannerSpec::from(spec.as_str())
+        let error = spec
+            .parse::<PlannerSpec>()
+            .unwrap()
             .build(&DecodeParams::benchmark(), &Options::default())
             .err()
             .unwrap()

@@ -215,7 +215,7 @@ fn an_export_can_be_replayed() {
     }
     // Replayed in the same scenes, grasps that succeeded without pose error succeed again.
     let all = lines.iter().map(|line| line.trials.len()).sum::<usize>();
-    let replayed = desk.run("replay scenes.jsonl --objects objects --contact forbid --out replayed.jsonl");
+    let replayed = desk.run("replay --json scenes.jsonl --objects objects --contact forbid --out replayed.jsonl");
     let report: Value = serde_json::from_str(replayed.trim()).unwrap();
     let count = |key: &str| report[key].as_u64().unwrap() as usize;
     assert_eq!(count("successes") + count("failures"), all);
@@ -259,7 +259,7 @@ fn statistics_count_every_grasp_once() {
 #[test]
 fn a_benchmark_reports_every_attempt() {
     let desk = Desk::new();
-    let bench = format!("bench --planner random --planner {NETWORK} --rounds 1 --seeds 2 --seed 3");
+    let bench = format!("bench --json --planner random --planner {NETWORK} --rounds 1 --seeds 2 --seed 3");
     let lines = desk.run(&format!("{bench} --attempts attempts.jsonl --pictures pictures"));
     let summaries: Vec<Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let attempts = fs::read_to_string(desk.path("attempts.jsonl")).unwrap();
@@ -292,14 +292,14 @@ fn a_benchmark_reports_every_attempt() {
     let of_network = attempts.iter().filter(|attempt| attempt["planner"] == summaries[1]["planner"]);
     let of_network: Vec<String> = of_network.map(|attempt| format!("{attempt}\n")).collect();
     fs::write(desk.path("one.jsonl"), of_network.concat()).unwrap();
-    let line = desk.run("reliability here=one.jsonl --out reliability.png");
+    let line = desk.run("reliability --json here=one.jsonl --out reliability.png");
     let reliability: Value = serde_json::from_str(&line).unwrap();
     let whole = &reliability["reliability"]["whole"];
     assert_eq!((&reliability["name"], whole["attempts"].as_u64()), (&"here".into(), Some(of_network.len() as u64)));
     assert!((0.0..=1.0).contains(&reliability["reliability"]["error"].as_f64().unwrap()));
     assert!(fs::read(desk.path("reliability.png")).unwrap().starts_with(b"\x89PNG"));
 
-    let rows = desk.run(&format!("bench --planner {NETWORK} --rounds 1 --seeds 2 --seed 3 --format markdown"));
+    let rows = desk.run(&format!("bench --planner {NETWORK} --rounds 1 --seeds 2 --seed 3"));
     let of_network = rows.lines().find(|line| line.contains("vgn-packed.onnx |")).unwrap();
     let gsr = format!("{:.1} ±", summaries[1]["seeds"]["gsr"]["mean"].as_f64().unwrap() * 100.0);
     assert!(of_network.contains(&gsr), "{of_network}: {gsr}");
@@ -511,6 +511,7 @@ fn errors_name_the_cause() {
         ("label --scenes 1 --out never --noise 2".to_owned(), "must be from 0 to 1"),
         ("label --scenes 1 --out never --observations 2 --format raw".to_owned(), "only --format packed"),
         ("label --scenes 3 --scene pile --points 6 --format processed --out half".to_owned(), "half/setup.json"),
+        ("bench --planner vgn-pakced --rounds 1".to_owned(), "Did you mean `vgn-packed`?"),
         ("bench --planner nowhere.onnx --rounds 1".to_owned(), "nowhere.onnx"),
         ("bench --planner grpc:127.0.0.1:1 --rounds 1".to_owned(), "127.0.0.1:1"),
         ("bench --planner random --rounds 1 --threshold 2".to_owned(), "must be greater than 0 and at most 1"),

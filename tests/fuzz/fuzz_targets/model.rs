@@ -23,7 +23,7 @@ fuzz_target!(|bytes: &[u8]| {
     file.iter_mut().skip(at).zip(rest).for_each(|(old, new)| *old = *new);
     for file in [rest, &file] {
         let Ok(model) = ModelProto::decode(file) else { continue };
-        let _ = Metadata::of(&model, Path::new("model.onnx"));
+        let _ = Metadata::from_model(&model, Path::new("model.onnx"));
         let _ = averaged_over_rotations(&model);
         let _ = with_half_weights(&model);
         if let Some(graph) = &model.graph {

@@ -119,7 +119,7 @@ fn integrate(view: &View) {
     }
     if let Ok(volume) = fusion.volume(Isometry3::identity()) {
         let _ = Warning::of_table(&volume, 0.05);
-        let mesh = Fusion::of(&volume).mesh();
+        let mesh = volume.mesh();
         assert!(mesh.triangles.iter().flatten().all(|&corner| (corner as usize) < mesh.vertices.len()));
     }
 }

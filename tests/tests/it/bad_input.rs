@@ -211,7 +211,7 @@ async fn the_model_and_its_version_must_be_loaded() {
     case.assert_refused(named(path, ""), Code::NotFound, &format!("options.model: `{path}` {not_found}")).await;
     case.assert_refused(named("mirror", "2"), Code::NotFound, &format!("options.version: `mirror 2` {not_found}"))
         .await;
-    let message = "options.version is `1`, which requires options.model";
+    let message = "options.version is `1`, but options.model is empty: name the model of this version";
     case.assert_refused(named("", "1"), Code::InvalidArgument, message).await;
 }
 

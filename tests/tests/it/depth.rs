@@ -178,13 +178,13 @@ async fn invalid_views_are_refused_with_the_field_and_the_value() {
     let millimetres = depth(&pose).iter().map(|metres| metres * 1e3).collect();
     refused(
         DepthView { depth: Depth::Metres(millimetres), ..good() },
-        "views[1].data is in metres, with a median above 20, must be metres but looks like millimetres",
+        "views[1].data: the median depth is above 20 m, so the values look like millimetres",
     )
     .await;
     let metres = depth(&pose).iter().map(|metres| metres.round() as u16).collect();
     refused(
         DepthView { depth: Depth::Millimetres(metres), ..good() },
-        "views[1].data is in millimetres, with a median below 20, must be millimetres but looks like metres",
+        "views[1].data: the median depth is below 20 mm, so the values look like metres",
     )
     .await;
     let behind = Extrinsics::CameraFromTask(Isometry3::translation(-0.15, -0.15, -1.0));
@@ -208,7 +208,7 @@ async fn invalid_views_are_refused_with_the_field_and_the_value() {
         let (code, message) = refusal(client.detect_from_depth(views, &workspace, low()).await);
         assert!(code == Code::InvalidArgument && message.starts_with(begins), "{code:?}: {message}");
     };
-    refused(&[], workspace, "views is a list of 0, must have from 1 to 64").await;
+    refused(&[], workspace, "views has 0 entries, must have from 1 to 64").await;
     refused(
         &[good()],
         Workspace { size: Some(0.5), ..workspace },

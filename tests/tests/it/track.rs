@@ -99,7 +99,7 @@ async fn an_invalid_view_ends_neither_the_stream_nor_the_volume() {
     assert_eq!(error.message, "half_life is 10, must be absent without a workspace");
 
     let (status, message) = code(client.track(Workspace::default()).await.unwrap().add(&[], low()).await);
-    assert_eq!((status, &*message), (Code::InvalidArgument, "views is a list of 0, must have from 1 to 64"));
+    assert_eq!((status, &*message), (Code::InvalidArgument, "views has 0 entries, must have from 1 to 64"));
 }
 
 #[tokio::test]

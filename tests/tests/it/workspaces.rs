@@ -329,7 +329,7 @@ async fn the_callers_grasps_are_scored_in_their_order() {
     let shaf = options(DetectOptions { model: "shaf".to_owned(), ..DetectOptions::default() });
     let refused = refusal(client.score(seen, &poses, shaf).await);
     assert_eq!(refused, "options.model is `shaf`, which has no network and cannot score");
-    assert!(refusal(client.score(seen, &[], options(checked)).await).starts_with("candidates is a list of 0"));
+    assert!(refusal(client.score(seen, &[], options(checked)).await).starts_with("candidates has 0 entries"));
     let [mut first, second] = views.clone();
     first.width = 0;
     let refused = refusal(

@@ -8,6 +8,7 @@ frame b into frame a. Arrays of voxels are indexed ``[x][y][z]``.
 from importlib.metadata import version
 
 from graspd import aio
+from graspd.camera import Camera
 from graspd.client import Client, Tracking
 from graspd.detection import Detection, Dropped, FoundTable, GeometryWarning, Grasp, Latency, Model, Score, Scores
 from graspd.errors import (
@@ -23,6 +24,7 @@ from graspd.errors import (
 )
 from graspd.geometry import Pose
 from graspd.options import Box, Candidate, CollisionCheck, Cone, Convention, Gripper, Options, Retreat
+from graspd.picture import Picture
 from graspd.retry import Retry
 from graspd.seen import CloudView, DepthView, Volume, Workspace
 
@@ -31,6 +33,7 @@ __version__ = version("graspd")
 __all__ = [
     "Aborted",
     "Box",
+    "Camera",
     "Candidate",
     "Client",
     "CloudView",
@@ -52,6 +55,7 @@ __all__ = [
     "Model",
     "NotFound",
     "Options",
+    "Picture",
     "Pose",
     "ResourceExhausted",
     "Retreat",

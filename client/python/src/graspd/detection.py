@@ -6,7 +6,9 @@ import html
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from graspd.geometry import Pose
+from graspd.geometry import Pose, PoseLike
+from graspd.picture import Picture, draw
+from graspd.seen import DepthView
 
 
 @dataclass(frozen=True)
@@ -178,6 +180,15 @@ class Detection:
         warnings = "".join(f", {warning.code}" for warning in self.warnings)
         seconds = f"{1e3 * self.latency.total:.0f} ms"
         return f"<Detection of {self.model} {self.version}: {counted(len(self), 'grasp')}{best}, {seconds}{warnings}>"
+
+    def show(
+        self, view: DepthView, frame_from_task: PoseLike | None = None, *, count: int = 10, finger_depth: float = 0.05
+    ) -> Picture:
+        """A picture of the best `count` grasps over a depth image of the request, which notebooks show and `Picture.save`
+        writes. `frame_from_task`: the workspace's `pose`, for a view with `camera_from_task`. `finger_depth`: length of the
+        fingers, metres. The grasps must have the default `Convention`."""
+        hands = [(grasp.pose, grasp.width, grasp.quality) for grasp in self.grasps[:count]]
+        return draw(reversed(hands), view, frame_from_task, finger_depth)
 
     def _repr_html_(self) -> str:
         columns = ["quality", "width (mm)", "position (m)", "quaternion xyzw", "object"]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from graspd.camera import Camera, intrinsic_matrix
 from graspd.geometry import PoseLike, Vector
 
 
@@ -40,15 +41,16 @@ class Volume:
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """A rectified depth image with its camera pose: one of `camera_from_task` and `frame_from_camera`. A single view may
+    """A depth image with its camera pose: one of `camera_from_task` and `frame_from_camera`. A single view may
     have neither if the workspace has `find_table`: the frame is then that of the camera."""
 
     depth: Any
     """``[row][column]`` or ``[row][column][1]``, an array or an image of PIL: distance along the optical axis, floats in
     metres or integers in millimetres. 0, NaN, infinity and masked pixels mean no reading."""
-    k: NDArray[np.floating[Any]]
-    """The 3 × 3 intrinsic matrix, pixels (ROS: ``CameraInfo.k``), or a 3 × 4 projection matrix without a translation. Pixel
-    centres have integer coordinates."""
+    k: NDArray[np.floating[Any]] | Camera
+    """The 3 × 3 intrinsic matrix, pixels, or a 3 × 4 projection matrix without a translation; or a `Camera`, which also knows
+    the size of its images and its distortion (ROS: ``Camera.from_info(message)``). Pixel centres have integer
+    coordinates."""
     _: KW_ONLY
     camera_from_task: PoseLike | None = None
     """``T_camera_task``: maps points of the task frame into the camera frame (z forward, x right, y down)."""
@@ -67,6 +69,8 @@ class DepthView:
         if self.labels is not None and np.shape(self.labels) not in (shape, shape[:2]):
             raise ValueError(f"labels must have the shape of depth, got {np.shape(self.labels)}")
         intrinsic_matrix(self.k)
+        if isinstance(self.k, Camera):
+            self.k.check_size(shape[1], shape[0])
         if self.camera_from_task is not None and self.frame_from_camera is not None:
             raise ValueError("a depth image has one of camera_from_task and frame_from_camera, got both")
 
@@ -85,24 +89,15 @@ class CloudView:
     labels: NDArray[np.integer[Any]] | None = None
     """``[…]``: label of the object of each point, whole numbers from 0 to 65535, or truth values; 0 is no object. None:
     unknown."""
+    scale: float = 1.0
+    """Unit of the points, metres: 0.001 for millimetres. `camera_position` is in metres."""
 
     def __post_init__(self) -> None:
+        if isinstance(self.scale, (bool, str)) or not (np.isfinite(self.scale) and self.scale > 0):
+            raise ValueError(f"scale is {self.scale!r}, must be a number above 0: 0.001 for points in millimetres")
         points = coordinates(self.points)
         if self.labels is not None and np.shape(self.labels) != points.shape[:-1]:
             raise ValueError(f"labels must be one for each point, got shape {np.shape(self.labels)}")
-
-
-def intrinsic_matrix(k: Any) -> NDArray[np.float64]:
-    """The 3 × 3 matrix of a 3 × 3 or a 3 × 4 matrix."""
-    matrix: NDArray[np.float64] = np.asarray(k, np.float64)
-    if matrix.size == 12:
-        matrix = matrix.reshape(3, 4)
-        if matrix[:, 3].any():
-            raise ValueError(f"k must be a 3 × 3 matrix; the fourth column is {matrix[:, 3].tolist()}, must be 0")
-        matrix = matrix[:, :3]
-    if matrix.size != 9:
-        raise ValueError(f"k must be a 3 × 3 matrix, got shape {matrix.shape}")
-    return matrix.reshape(3, 3)
 
 
 def coordinates(points: Any) -> NDArray[Any]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import struct
-import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any, TypeAlias, TypeVar
@@ -17,10 +15,12 @@ from numpy.typing import DTypeLike, NDArray
 
 from graspd import errors
 from graspd import grasp_pb2 as pb
+from graspd.camera import Camera, intrinsic_matrix
 from graspd.detection import Detection, Dropped, FoundTable, GeometryWarning, Grasp, Latency, Model, Score, Scores
 from graspd.geometry import Pose, PoseLike, Vector
 from graspd.options import Box, Candidate, CollisionCheck, Cone, Convention, Gripper, Options, Retreat
-from graspd.seen import CloudView, DepthView, Volume, Workspace, coordinates, intrinsic_matrix
+from graspd.png import png_file
+from graspd.seen import CloudView, DepthView, Volume, Workspace, coordinates
 
 Observation: TypeAlias = Volume | NDArray[Any] | DepthView | CloudView | Iterable[DepthView | CloudView]
 """A volume, depth images or point clouds."""
@@ -189,6 +189,11 @@ def depth_message(view: DepthView) -> pb.DepthView:
     image = np.ma.filled(view.depth, 0) if np.ma.isMA(view.depth) else np.asarray(view.depth)
     height, width = image.shape[:2]
     image = image.reshape(height, width)
+    labels = view.labels
+    if isinstance(view.k, Camera):
+        image = view.k.rectified(image)
+        if labels is not None:
+            labels = view.k.rectified(np.reshape(np.ma.filled(labels, 0), (height, width)))
     if np.issubdtype(image.dtype, np.integer):
         if image.size and not (0 <= image.min() and image.max() <= 65535):
             raise ValueError(
@@ -208,25 +213,11 @@ def depth_message(view: DepthView) -> pb.DepthView:
     return pb.DepthView(
         data=data,
         unit=unit,
-        labels=None if view.labels is None else labels_message(view.labels),
+        labels=given(labels_message, labels),
         camera=pb.Camera(width=width, height=height, k=intrinsic_matrix(view.k).ravel().tolist()),
         camera_from_task=pose_message(view.camera_from_task),
         frame_from_camera=pose_message(view.frame_from_camera),
     )
-
-
-def png_file(depth: NDArray[Any]) -> bytes:
-    """A PNG file of 16-bit grey values."""
-    height, width = depth.shape
-    rows = depth.astype(">u2").view(np.uint8).reshape(height, -1)
-    # Filter 2: differences to the row above.
-    filtered = np.insert(np.diff(rows, axis=0, prepend=np.uint8(0)), 0, 2, axis=1)
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(filtered.tobytes(), 1)) + chunk(b"IEND", b"")
 
 
 def labels_message(labels: Any) -> pb.Labels:
@@ -243,9 +234,12 @@ def labels_message(labels: Any) -> pb.Labels:
 
 
 def cloud_message(view: CloudView) -> pb.CloudView:
+    points = coordinates(view.points)
+    if view.scale != 1:
+        points = points * view.scale
     return pb.CloudView(
         labels=given(labels_message, view.labels),
-        points=coordinates(view.points).astype("<f4", copy=False).tobytes(),
+        points=points.astype("<f4", copy=False).tobytes(),
         camera_position=vector_message(view.camera_position),
         frame_from_cloud=pose_message(view.frame_from_cloud),
     )

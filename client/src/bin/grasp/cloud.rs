@@ -44,7 +44,7 @@ pub(crate) fn read(path: &Path, scale: Option<f64>) -> anyhow::Result<Vec<[f32; 
 }
 
 fn unscaled(path: &Path) -> anyhow::Result<Points> {
-    files::in_file(path, |path| match Format::of(path)? {
+    files::in_file(path, |path| match Format::from_path(path)? {
         Format::Pcd => pcd(path),
         Format::Ply => ply(path),
         Format::Png | Format::Tiff | Format::Exr => bail!("this is an image; for a depth image give --intrinsics"),

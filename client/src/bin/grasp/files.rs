@@ -35,7 +35,7 @@ pub(crate) enum Format {
 }
 
 impl Format {
-    pub fn of(path: &Path) -> anyhow::Result<Self> {
+    pub fn from_path(path: &Path) -> anyhow::Result<Self> {
         let mut first = Vec::new();
         File::open(path)?.take(8).read_to_end(&mut first)?;
         let starts = |magic: &[u8]| first.starts_with(magic);

@@ -54,7 +54,7 @@ impl Scale {
 /// Reads a depth image from a .png, .tiff, .exr or .npy file. Returns the depth, the width and the height.
 pub(crate) fn read(path: &Path, scale: Scale) -> anyhow::Result<(Depth, u32, u32)> {
     files::in_file(path, |path| {
-        let (depth, width, height) = match Format::of(path)? {
+        let (depth, width, height) = match Format::from_path(path)? {
             Format::Png => png(path)?,
             Format::Tiff => tiff(path)?,
             Format::Exr => exr(path)?,

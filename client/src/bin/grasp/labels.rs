@@ -28,7 +28,7 @@ impl Labels {
 /// Reads the labels of objects from a PNG with 8- or 16-bit grey values, or a .npy file with integers, truth values, or
 /// floats that are whole numbers.
 pub(crate) fn read(path: &Path) -> anyhow::Result<Labels> {
-    files::in_file(path, |path| match Format::of(path)? {
+    files::in_file(path, |path| match Format::from_path(path)? {
         Format::Png => png(path),
         Format::Other => npy(path),
         format => bail!("a file of the format {format:?}; labels must be PNG or .npy"),

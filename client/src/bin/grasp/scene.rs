@@ -308,7 +308,7 @@ fn found(workspace: &Workspace, detection: &Detection) -> anyhow::Result<Workspa
     Ok(Workspace { pose: pose.unwrap_or(workspace.pose), extent: workspace.extent.or(extent), ..*workspace })
 }
 
-/// By which the server multiplied the depths of a view.
+/// Factor by which the server multiplied the depths of a view.
 fn depth_factor(detection: &Detection, index: usize) -> f64 {
     detection.depth_factors.get(index).copied().unwrap_or(1.0)
 }
@@ -341,7 +341,7 @@ mod tests {
 
     use super::*;
 
-    /// By which the distances that the cameras measure must be multiplied.
+    /// Factor by which the distances that the cameras measure must be multiplied.
     const FACTOR: f64 = 1.02;
 
     /// Height of the camera and of the table below it, metres.
@@ -351,7 +351,7 @@ mod tests {
     fn drawn(scene: &Scene, depth_factors: &[f64]) -> f64 {
         let response = pb::DetectGraspsResponse { depth_factors: depth_factors.to_vec(), ..Default::default() };
         let detection = Detection::try_from(response).unwrap();
-        let surface = Fusion::of(&scene.volume(&detection).unwrap()).surface();
+        let surface = scene.volume(&detection).unwrap().surface();
         surface.iter().map(|point| point.position.z).sum::<f64>() / surface.len() as f64
     }
 

@@ -19,6 +19,9 @@ pub(crate) fn print(text: &str) -> anyhow::Result<bool> {
     }
 }
 
+/// Rows of a table. More would push the first ones out of sight.
+const ROWS: usize = 40;
+
 pub(crate) fn detection(detection: &Detection) -> String {
     let mut text = String::new();
     if detection.grasps.is_empty() {
@@ -28,7 +31,7 @@ pub(crate) fn detection(detection: &Detection) -> String {
         let columns = ["", "quality", "x m", "y m", "z m", "qx", "qy", "qz", "qw", "width m"];
         let columns = columns.into_iter().chain(has_objects.then_some("object"));
         let mut table = numbers(&columns.collect::<Vec<_>>());
-        for (rank, grasp) in detection.grasps.iter().enumerate() {
+        for (rank, grasp) in detection.grasps.iter().take(ROWS).enumerate() {
             let (position, rotation) = (grasp.pose.translation.vector, grasp.pose.rotation.coords);
             let pose = position.iter().chain(&rotation).map(|c| format!("{c:.4}"));
             let row = [(rank + 1).to_string(), format!("{:.3}", grasp.quality)].into_iter().chain(pose);
@@ -36,6 +39,9 @@ pub(crate) fn detection(detection: &Detection) -> String {
             table.add_row(right(row.chain([format!("{:.4}", grasp.width)]).chain(object)));
         }
         text += &format!("{table}\n");
+        if let Some(more @ 1..) = detection.grasps.len().checked_sub(ROWS) {
+            text += &format!("… {more} more; --json prints all of them\n");
+        }
     }
     if let Some(dropped) = &detection.dropped {
         let reasons = reasons(dropped).map(|(reason, voxels)| format!("{} {voxels}", reason.replace('_', " ")));
@@ -76,7 +82,7 @@ pub(crate) fn detection_json(detection: &Detection) -> String {
     let grasps = detection.grasps.iter().map(|grasp| {
         let (position, rotation) = (grasp.pose.translation.vector, grasp.pose.rotation.coords);
         json!({
-            "quality": grasp.quality,
+            "quality": exact(grasp.quality),
             "position": position.as_slice(),
             "orientation_xyzw": rotation.as_slice(),
             "width": grasp.width,
@@ -122,7 +128,7 @@ pub(crate) fn scores(scores: &Scores) -> String {
 pub(crate) fn scores_json(scores: &Scores) -> String {
     let score = |score: &Score| {
         json!({
-            "quality": score.quality,
+            "quality": exact(score.quality),
             "violations": violations(score),
             "object": score.object,
             "open_width": score.open_width,
@@ -138,6 +144,11 @@ pub(crate) fn scores_json(scores: &Scores) -> String {
         "warnings": scores.warnings.iter().map(warning_json).collect::<Vec<_>>(),
     });
     format!("{value:#}")
+}
+
+/// The shortest number that is read as the same `f32`: 0.95 instead of 0.949999988079071.
+fn exact(number: f32) -> Value {
+    number.to_string().parse::<f64>().map_or(Value::Null, Value::from)
 }
 
 /// The names of the violations of a score.
@@ -261,7 +272,7 @@ pub(crate) fn models_json(models: &[Model]) -> String {
             "voxel_size": model.voxel_size,
             "voxel_origin": model.voxel_origin,
             "camera_azimuth": model.camera_azimuth,
-            "threshold": model.threshold,
+            "threshold": exact(model.threshold),
             "provider": model.provider,
             "precision": model.precision,
             "sha256": model.sha256,

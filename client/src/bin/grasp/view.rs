@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{bail, ensure};
 use clap::Args;
-use grasp::{FINGER_DEPTH, Fusion, SurfaceMesh, SurfacePoint, TABLE_HEIGHT, Volume};
+use grasp::{FINGER_DEPTH, SurfaceMesh, SurfacePoint, TABLE_HEIGHT, Volume};
 use grasp_client::Detection;
 use grasp_picture::{Mesh, Picture, quality_color};
 use nalgebra::{Isometry3, Point3};
@@ -63,12 +63,11 @@ impl ViewArgs {
         depth: Option<f64>,
         detection: &Detection,
     ) -> anyhow::Result<&Path> {
-        let field = Fusion::of(volume);
         let (table, depth) = (table.unwrap_or(TABLE_HEIGHT), depth.unwrap_or(FINGER_DEPTH));
         if self.out.extension().is_some_and(|extension| extension == "mcap") {
-            record::write(&self.out, &placed(&field.surface(), volume.pose()), depth, detection)?;
+            record::write(&self.out, &placed(&volume.surface(), volume.pose()), depth, detection)?;
         } else {
-            draw(volume, field.mesh(), table, depth, detection).save(&self.out)?;
+            draw(volume, table, depth, detection).save(&self.out)?;
         }
         Ok(&self.out)
     }
@@ -81,13 +80,13 @@ fn placed(surface: &[SurfacePoint], pose: &Isometry3<f64>) -> Vec<SurfacePoint> 
 }
 
 /// Draws in the task frame. The camera is above a corner and sees the whole workspace.
-fn draw(volume: &Volume, mesh: SurfaceMesh, table: f64, depth: f64, detection: &Detection) -> Picture {
+fn draw(volume: &Volume, table: f64, depth: f64, detection: &Detection) -> Picture {
     let size = volume.voxel_size() * volume.resolution() as f64;
     let [width, height] = SIZE;
     let (eye, target) = (Point3::new(1.75, -1.1, 1.8) * size, Point3::new(0.5, 0.5, 0.4) * size);
     let mut picture = Picture::looking_at(width, height, 0.68, eye, target);
     frame(&mut picture, size, table);
-    let SurfaceMesh { vertices, triangles } = mesh;
+    let SurfaceMesh { vertices, triangles } = volume.mesh();
     picture.mesh(&Mesh { vertices, triangles }, &Isometry3::identity(), 1.0, [206, 204, 198]);
     for grasp in detection.grasps.iter().take(SHOWN).rev() {
         let pose = volume.pose().inverse() * grasp.pose;

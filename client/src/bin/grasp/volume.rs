@@ -13,7 +13,7 @@ const ARRAY: &str = "grid";
 
 /// Reads a volume from a .npy or .npz file, with its corner at `pose`.
 pub(crate) fn read(path: &Path, voxel_size: Option<f64>, pose: Isometry3<f64>) -> anyhow::Result<Volume> {
-    files::in_file(path, |path| match Format::of(path)? {
+    files::in_file(path, |path| match Format::from_path(path)? {
         Format::Png | Format::Tiff | Format::Exr => bail!("this is an image; for a depth image give --intrinsics"),
         Format::Pcd | Format::Ply => bail!("this is a point cloud; give --camera-position"),
         Format::Other => volume(files::array(path, ARRAY)?, voxel_size, pose),

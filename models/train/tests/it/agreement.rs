@@ -71,7 +71,7 @@ fn the_classifier_agrees_with_onnx_runtime() {
             normal: Vector3::x(),
         };
         let cloud = Cloud::new((0..300).map(|_| point()).collect::<Vec<_>>());
-        Image::of(&cloud, &Candidate { pose: Isometry3::identity(), width: 0.05, point: Point3::origin() })
+        Image::new(&cloud, &Candidate { pose: Isometry3::identity(), width: 0.05, point: Point3::origin() })
     };
     let images: Vec<Image> = (0..3).map(|_| image()).collect();
     let pixels: Vec<f32> = images.iter().flat_map(Image::pixels).map(|&value| f32::from(value) / 255.0).collect();

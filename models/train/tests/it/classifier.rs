@@ -34,7 +34,7 @@ fn push(number: u64, candidates: &mut Candidates) {
         false => SurfacePoint { position: Point3::new(x, along, 0.04 + offset), normal: Vector3::z() },
     });
     let candidate = Candidate { pose: Isometry3::identity(), width: 0.02, point: Point3::origin() };
-    candidates.push(number / 4, &Image::SHAPE, Image::of(&Cloud::new(points), &candidate).pixels(), success);
+    candidates.push(number / 4, &Image::SHAPE, Image::new(&Cloud::new(points), &candidate).pixels(), success);
 }
 
 fn candidate_file(folder: &Path, count: u64) -> PathBuf {
@@ -117,9 +117,9 @@ fn a_trained_classifier_plans_in_the_benchmark() {
         rounds: 2,
         seed: 1,
     };
-    let planner = PlannerSpec::from(format!("gpd:{}", path.display()).as_str());
+    let planner = format!("gpd:{}", path.display()).parse::<PlannerSpec>().unwrap();
     let rounds = benchmark.run(&planner, &DecodeParams::benchmark(), &Options::default(), |_| ()).unwrap();
-    let summary = Summary::of(&rounds);
+    let summary = Summary::new(&rounds);
     assert!(summary.rounds == 2 && summary.objects >= 2, "{summary:?}");
     assert!(summary.attempts > 0 || summary.nothing_proposed == 2, "{summary:?}");
 }
@@ -156,7 +156,7 @@ fn an_evaluator_separates_full_from_empty_volumes() {
     let output = classify(folder.path(), arguments);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let path = folder.path().join("evaluator.onnx");
-    let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
+    let metadata = Metadata::from_model(&ModelProto::read(&path).unwrap(), &path).unwrap();
     assert_eq!((&*metadata.name, metadata.network.as_deref()), ("evaluator", Some("vgn-packed")));
     let mut evaluator = Classifier::load(&path, &Patch::SHAPE, &Options::default()).unwrap();
     let volumes = [filled(0.75), filled(0.25)];

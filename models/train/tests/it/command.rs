@@ -79,7 +79,7 @@ fn fine_tuning_uses_the_defaults_of_the_initial_network() {
         let output = command(folder.path(), &arguments).output().unwrap();
         assert!(output.status.success(), "{}", stderr(&output));
         let path = folder.path().join("out.onnx");
-        let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
+        let metadata = Metadata::from_model(&ModelProto::read(&path).unwrap(), &path).unwrap();
         let settings: serde_json::Value = serde_json::from_str(&metadata.provenance["settings"]).unwrap();
         assert_eq!((&settings["batch"], &settings["learning_rate"]), (&batch.into(), &learning_rate.into()), "{from}");
         assert_eq!(settings["quality"], "label", "{from}");
@@ -109,7 +109,7 @@ fn a_teacher_is_recorded_and_another_voxel_origin_is_an_error() {
     let output = train(folder.path(), "--out out.onnx --epochs 1 --teacher start.onnx --teacher-weight 2");
     assert!(output.status.success(), "{}", stderr(&output));
     let path = folder.path().join("out.onnx");
-    let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
+    let metadata = Metadata::from_model(&ModelProto::read(&path).unwrap(), &path).unwrap();
     assert_eq!(metadata.provenance["teacher"], "vgn 1 at 2");
     let output = train(folder.path(), "--out out.onnx --epochs 1 --teacher start.onnx --voxel-origin center");
     assert!(!output.status.success() && stderr(&output).contains("give --voxel-origin"), "{}", stderr(&output));
@@ -130,7 +130,7 @@ fn a_run_ends_after_the_patience_of_the_evaluation() {
     let rates: Vec<f64> = records.iter().map(|record| record.benchmark.unwrap().gsr).collect();
     assert_eq!(rates, [0.9, 0.8, 0.7], "two consecutive results were not better");
     let path = folder.path().join("out.onnx");
-    let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
+    let metadata = Metadata::from_model(&ModelProto::read(&path).unwrap(), &path).unwrap();
     assert_eq!(metadata.provenance["epochs"], "1");
     assert_eq!(metadata.provenance["evaluation"], "GSR 0.900, DR 0.900");
     // A resumed run that has ended does nothing.
@@ -176,7 +176,7 @@ fn ctrl_c_writes_a_checkpoint() {
     let checkpoint = Checkpoint::read(&folder.path().join("out.state")).unwrap();
     assert!(checkpoint.steps > 0 && checkpoint.epoch < 100_000);
     let path = folder.path().join("out.onnx");
-    let metadata = Metadata::of(&ModelProto::read(&path).unwrap(), &path).unwrap();
+    let metadata = Metadata::from_model(&ModelProto::read(&path).unwrap(), &path).unwrap();
     assert_eq!(metadata.provenance["steps"], checkpoint.steps.to_string(), "both are of the same step");
 }
 
@@ -280,7 +280,7 @@ fn an_exported_classifier_keeps_its_calibration() {
     let output =
         command(folder.path(), "export --from calibrated.onnx --precision fp16 --out half.onnx").output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
-    assert_eq!(Calibration::of(&read("half.onnx")), Ok(calibration));
+    assert_eq!(Calibration::from_model(&read("half.onnx")), Ok(calibration));
 }
 
 #[test]

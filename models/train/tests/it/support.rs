@@ -39,7 +39,7 @@ pub fn scene(seed: u64, n: usize) -> Scene {
 // Each test file compiles this module, and not all of them use this.
 #[allow(dead_code)]
 pub fn dataset(scenes: u64, n: usize) -> Dataset {
-    Dataset::of((0..scenes).map(|seed| scene(seed, n)).collect()).unwrap()
+    Dataset::new((0..scenes).map(|seed| scene(seed, n)).collect()).unwrap()
 }
 
 /// Their provenance.

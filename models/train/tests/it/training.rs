@@ -206,14 +206,14 @@ fn a_student_matches_its_teacher_where_there_are_no_trials() {
         epoch(&mut teacher_run);
     }
     let teacher_model = teacher_run.model();
-    let mut metadata = Metadata::of(&teacher_model, &path).unwrap();
+    let mut metadata = Metadata::from_model(&teacher_model, &path).unwrap();
     metadata.voxel_origin = VoxelOrigin::Center;
     let mut file = teacher_model.clone();
     metadata.write_to(&mut file);
     file.write(&path).unwrap();
 
     // The student's scenes are not in the teacher's data. Most voxels near their surfaces have no trial.
-    let scenes = || Dataset::of((100..108).map(|seed| support::scene(seed, N)).collect()).unwrap();
+    let scenes = || Dataset::new((100..108).map(|seed| support::scene(seed, N)).collect()).unwrap();
     let teacher = || Teacher::load(&path, &Options::default(), 10.0).unwrap();
     let start = || {
         let model = Architecture::Vgn.build(N, 1).unwrap();
@@ -329,7 +329,7 @@ fn completion_of_shapes_needs_scenes_with_their_occupancy() {
     };
     let settings = TrainingSettings { occupancy: 1.0, ..settings() };
     let start = |known: u64| {
-        let dataset = Dataset::of((0..8).map(|seed| scene(seed, seed < known)).collect()).unwrap();
+        let dataset = Dataset::new((0..8).map(|seed| scene(seed, seed < known)).collect()).unwrap();
         Trainer::new(Architecture::Vgn.build(N, 0).unwrap(), dataset, settings.clone(), EXECUTION)
     };
     let error = start(0).err().unwrap().to_string();
@@ -340,7 +340,7 @@ fn completion_of_shapes_needs_scenes_with_their_occupancy() {
 #[test]
 fn a_checkpoint_of_another_run_is_refused() {
     let scenes = || (0..4).map(|seed| support::scene(seed, N)).collect::<Vec<_>>();
-    let dataset = || Dataset::of(scenes()).unwrap();
+    let dataset = || Dataset::new(scenes()).unwrap();
     let checkpoint = trainer(dataset(), &settings(), EXECUTION).checkpoint();
     let refused = |error| matches!(error, Err(TrainError::Checkpoint(CheckpointError::Settings { .. })));
     let mut other = trainer(dataset(), &TrainingSettings { seed: 6, ..settings() }, EXECUTION);
@@ -352,7 +352,7 @@ fn a_checkpoint_of_another_run_is_refused() {
     shared[3].trials[0].share = 0.5;
     "other".clone_into(&mut renamed[3].id);
     for scenes in [relabelled, shared, renamed] {
-        let mut other = trainer(Dataset::of(scenes).unwrap(), &settings(), EXECUTION);
+        let mut other = trainer(Dataset::new(scenes).unwrap(), &settings(), EXECUTION);
         assert!(refused(other.resume(&checkpoint)), "the same number of scenes, but other scenes");
     }
     let short = Checkpoint { sums: vec![0.0; 3], ..checkpoint.clone() };
@@ -367,7 +367,7 @@ fn a_checkpoint_of_another_run_is_refused() {
 
 #[test]
 fn a_run_without_scenes_is_refused() {
-    let empty = Dataset::of(Vec::new()).unwrap();
+    let empty = Dataset::new(Vec::new()).unwrap();
     let model = Architecture::Vgn.build(N, 0).unwrap();
     let error = Trainer::new(model, empty, settings(), EXECUTION).err().unwrap();
     assert!(error.to_string().contains("no training scenes"), "{error}");
@@ -487,7 +487,7 @@ fn the_quality_converges_to_the_share() {
     scenes.iter_mut().for_each(|scene| scene.trials[0].share = 0.5);
     let last_loss = |quality: QualityTarget| {
         let settings = TrainingSettings { quality, batch: 8, learning_rate: 1e-3, warmup: 10, ..settings() };
-        let mut trainer = trainer(Dataset::of(scenes.clone()).unwrap(), &settings, EXECUTION);
+        let mut trainer = trainer(Dataset::new(scenes.clone()).unwrap(), &settings, EXECUTION);
         (0..80).map(|_| epoch(&mut trainer)).last().unwrap().loss_quality
     };
     let (label, share) = (last_loss(QualityTarget::Label), last_loss(QualityTarget::Share));

@@ -62,7 +62,7 @@ pub(super) fn batch(
 ) -> Result<(usize, Values<'_>), RequestError> {
     let [InferInputTensor { name, datatype, shape, contents, .. }] = &request.inputs[..] else {
         let needed = format_args!("must contain exactly one tensor, `{INPUT}`");
-        return Err(RequestError::invalid("inputs", format_args!("a list of {}", request.inputs.len()), needed));
+        return Err(RequestError::of_length("inputs", request.inputs.len(), needed));
     };
     if name != INPUT {
         return Err(RequestError::invalid(
@@ -99,12 +99,11 @@ pub(super) fn batch(
         ([], Some(contents)) => Values::Numbers(&contents.fp32_contents),
         (raw, contents) => {
             let given = usize::from(contents.is_some());
-            let value = format_args!("a list of {} with {given} of contents", raw.len());
-            return Err(RequestError::invalid(
-                "raw_input_contents",
-                value,
-                "the tensor's values must be in exactly one of raw_input_contents[0] and inputs[0].contents",
-            ));
+            let needed = format_args!(
+                "and inputs[0].contents {given}: the tensor's values must be in exactly one of raw_input_contents[0] and \
+                 inputs[0].contents"
+            );
+            return Err(RequestError::of_length("raw_input_contents", raw.len(), needed));
         }
     };
     if values.len() == expected {

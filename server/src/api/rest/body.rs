@@ -49,7 +49,8 @@ async fn receive(body: &mut Body, parts: &Parts, limits: Limits) -> Result<Messa
     if let Some(bytes) = announced.filter(|bytes| *bytes > limits.message_bytes) {
         return Err(limits.too_large(bytes));
     }
-    let peer = Peer::of(&parts.extensions).ok_or_else(|| Status::internal("the request belongs to no connection"))?;
+    let peer = Peer::from_extensions(&parts.extensions)
+        .ok_or_else(|| Status::internal("the request belongs to no connection"))?;
     let mut received = peer.share.clone().message();
     let started = Instant::now();
     loop {

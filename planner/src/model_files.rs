@@ -1,14 +1,18 @@
-//! The files of a model folder, and the planners that they make.
-
 use std::path::Path;
 
 use grasp_models::{Entry, EntryError, Scan, StoreError};
-use grasp_planner::ModelSpec;
 
-use crate::fingerprints::{CLASSIFIERS, EVALUATORS};
+use crate::ModelSpec;
 
-/// The planners of a model folder.
-pub(crate) struct ModelFiles {
+/// Subfolder of a model folder with GPD's classifiers.
+pub const CLASSIFIERS: &str = "classifiers";
+
+/// Subfolder of a model folder with the evaluators of networks' grasps.
+pub const EVALUATORS: &str = "evaluators";
+
+/// The files of a model folder, and the planners that they make.
+pub struct ModelFiles {
+    /// The planners; SHAF, which needs no file, is the last.
     pub specs: Vec<ModelSpec>,
     /// Errors of the files that cannot be served.
     pub rejected: Vec<EntryError>,
@@ -16,6 +20,9 @@ pub(crate) struct ModelFiles {
 
 impl ModelFiles {
     /// Reads the networks in the folder, and the files in its subfolders. Each file has at most `max_bytes`.
+    ///
+    /// # Errors
+    /// [`StoreError`] if a folder cannot be read, or holds no network.
     pub fn read(directory: &Path, max_bytes: u64) -> Result<Self, StoreError> {
         let Scan { entries, rejected } = Scan::read(directory, max_bytes)?;
         let files = Self::with_networks(directory, entries, max_bytes)?;
@@ -23,6 +30,9 @@ impl ModelFiles {
     }
 
     /// Reads the files in the subfolders, and combines them with networks that were read before.
+    ///
+    /// # Errors
+    /// [`StoreError`] if a subfolder cannot be read.
     pub fn with_networks(directory: &Path, networks: Vec<Entry>, max_bytes: u64) -> Result<Self, StoreError> {
         let classifiers = subfolder(&directory.join(CLASSIFIERS), max_bytes)?;
         let evaluators = subfolder(&directory.join(EVALUATORS), max_bytes)?;

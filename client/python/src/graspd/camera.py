@@ -1,0 +1,161 @@
+"""Cameras as ROS and calibration files describe them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+PLUMB_BOB = (4, 5, 8, 12)
+"""Numbers of the coefficients of `plumb_bob`, `rational_polynomial` and its form with thin prisms, in OpenCV's order."""
+
+POLYNOMIAL = ("plumb_bob", "rational_polynomial", "thin_prism", "radtan", "brown_conrady", "pinhole")
+FISHEYE = ("equidistant", "fisheye", "kannala_brandt4")
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """The intrinsics of a camera, the size of its images and the distortion of its lens: `DepthView.k` in place of a matrix.
+    Images of another size are refused, and distorted ones are rectified before they are sent."""
+
+    k: NDArray[np.floating[Any]]
+    """The 3 × 3 intrinsic matrix, pixels, or a 3 × 4 projection matrix without a translation."""
+    _: KW_ONLY
+    size: tuple[int, int] | None = None
+    """Width and height of the images, pixels; None: any."""
+    distortion: Sequence[float] = ()
+    """Coefficients in the order of OpenCV and ROS: 4, 5, 8 or 12, or 4 of `equidistant`. Empty or 0: none."""
+    distortion_model: str = "plumb_bob"
+    """``plumb_bob``, ``rational_polynomial``, or ``equidistant`` for OpenCV's fisheye."""
+
+    def __post_init__(self) -> None:
+        intrinsic_matrix(self.k)
+        if not self._is_distorted():
+            return
+        count = len(self.distortion)
+        is_known = count in PLUMB_BOB if self.distortion_model in POLYNOMIAL else self.distortion_model in FISHEYE and count == 4
+        if not is_known:
+            raise ValueError(
+                f"distortion {self.distortion_model!r} with {count} coefficients is not supported: rectify the image, and "
+                "give the intrinsics of the rectified one"
+            )
+
+    @classmethod
+    def from_info(cls, info: Any, *, rectified: bool = False) -> Camera:
+        """From a ``CameraInfo`` of ROS 1 or 2: a message, or a dictionary with its fields. `rectified`: for the images of
+        ``image_rect`` topics, which have the matrix `p` and no distortion. A part of the sensor (`roi`) and combined pixels
+        (`binning`) are taken into account."""
+
+        def field(*names: str) -> Any:
+            of = info.get if isinstance(info, Mapping) else lambda name: getattr(info, name, None)
+            value = next((value for value in map(of, names) if value is not None), None)
+            # The files of camera_calibration have matrices with rows, cols and data.
+            return value["data"] if isinstance(value, Mapping) and "data" in value else value
+
+        matrix = field("p", "P", "projection_matrix") if rectified else field("k", "K", "camera_matrix")
+        if matrix is None:
+            raise ValueError(f"a CameraInfo must have {'p' if rectified else 'k'}, got {info!r}")
+        k = intrinsic_matrix(matrix).copy()
+        if not k[0, 0]:
+            raise ValueError("the matrix of the CameraInfo is 0: the camera is not calibrated")
+        roi = field("roi")
+        x, y, cropped_width, cropped_height = (number_of(roi, name) for name in ["x_offset", "y_offset", "width", "height"])
+        binning = np.maximum([int(field(name) or 0) for name in ["binning_x", "binning_y"]], 1)
+        # The matrix is that of the whole sensor. Pixel centres are at whole numbers.
+        k[[0, 1], [0, 1]] /= binning
+        k[:2, 2] = (k[:2, 2] - (x, y) + 0.5) / binning - 0.5
+        width = cropped_width or int(field("width", "image_width") or 0)
+        height = cropped_height or int(field("height", "image_height") or 0)
+        distortion = field("d", "D", "distortion_coefficients")
+        return cls(
+            k,
+            size=(width // int(binning[0]), height // int(binning[1])) if width and height else None,
+            distortion=() if rectified or distortion is None else tuple(float(value) for value in distortion),
+            distortion_model=str(field("distortion_model") or "plumb_bob"),
+        )
+
+    @classmethod
+    def read(cls, path: str | PathLike[str], *, rectified: bool = False) -> Camera:
+        """From a file with a ``CameraInfo``: JSON, or YAML as ``ros2 topic echo`` and camera_calibration write it. YAML needs
+        the package PyYAML."""
+        text = Path(path).read_text()
+        if Path(path).suffix == ".json":
+            return cls.from_info(json.loads(text), rectified=rectified)
+        import yaml
+
+        return cls.from_info(next(yaml.safe_load_all(text)), rectified=rectified)
+
+    def check_size(self, width: int, height: int) -> None:
+        """Raises `ValueError` if images of this camera have another size."""
+        if self.size is None or self.size == (width, height):
+            return
+        scale = width / self.size[0]
+        if abs(scale * self.size[1] - height) <= 1:
+            k = (intrinsic_matrix(self.k) * scale).round(4)
+            advice = f"if the image was scaled, fx, fy, cx, cy are {k[0, 0]:g}, {k[1, 1]:g}, {k[0, 2]:g}, {k[1, 2]:g}"
+        else:
+            advice = "if the image was cropped, subtract the left and upper margin from cx and cy"
+        raise ValueError(
+            f"the intrinsics are of images of {self.size[0]} × {self.size[1]} pixels, the image has {width} × {height}; {advice}"
+        )
+
+    def rectified(self, image: NDArray[Any]) -> NDArray[Any]:
+        """The image ``[row][column]`` without the distortion of the lens. Each pixel has the value of the nearest one, so that
+        depths are not mixed over edges; 0 outside of the image."""
+        if not self._is_distorted():
+            return image
+        height, width = image.shape
+        (fx, _, cx), (_, fy, cy), _ = intrinsic_matrix(self.k)
+        v, u = np.mgrid[:height, :width]
+        x, y = self._distorted((u - cx) / fx, (v - cy) / fy)
+        u, v = np.rint(fx * x + cx), np.rint(fy * y + cy)
+        is_inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        seen = np.zeros_like(image)
+        seen[is_inside] = image[v[is_inside].astype(int), u[is_inside].astype(int)]
+        return seen
+
+    def _is_distorted(self) -> bool:
+        return any(self.distortion)
+
+    def _distorted(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where the lens shows the points that a pinhole camera shows at (x, y), both for a focal length of 1, by the
+        formulas of OpenCV (modules calib3d and fisheye)."""
+        r2 = x * x + y * y
+        if self.distortion_model in FISHEYE:
+            r = np.sqrt(r2)
+            theta = np.arctan(r)
+            powers = np.stack([theta ** (2 * power) for power in range(5)], axis=-1)
+            scale = theta * (powers @ [1.0, *self.distortion]) / np.maximum(r, 1e-9)
+            scale = np.where(r > 1e-9, scale, 1.0)
+            return x * scale, y * scale
+        k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = [*self.distortion, *[0.0] * (12 - len(self.distortion))]
+        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        return (
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + r2 * s2),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + r2 * s4),
+        )
+
+
+def number_of(roi: Any, name: str) -> int:
+    """A number of a region of interest; 0 if there is none."""
+    value = roi.get(name) if isinstance(roi, Mapping) else getattr(roi, name, None)
+    return int(value or 0)
+
+
+def intrinsic_matrix(k: Any) -> NDArray[np.float64]:
+    """The 3 × 3 matrix of a 3 × 3 or a 3 × 4 matrix, or of a camera."""
+    matrix: NDArray[np.float64] = np.asarray(k.k if isinstance(k, Camera) else k, np.float64)
+    if matrix.size == 12:
+        matrix = matrix.reshape(3, 4)
+        if matrix[:, 3].any():
+            raise ValueError(f"k must be a 3 × 3 matrix; the fourth column is {matrix[:, 3].tolist()}, must be 0")
+        matrix = matrix[:, :3]
+    if matrix.size != 9:
+        raise ValueError(f"k must be a 3 × 3 matrix, got shape {matrix.shape}")
+    return matrix.reshape(3, 3)
