@@ -237,14 +237,16 @@ async fn each_detection_replaces_the_one_before_and_late_viewers_get_the_newest(
 
     replace(&file, &[[11, 10, 9]]);
     viewer.receive_until(|viewer| viewer.grasps() == 1).await;
-    let mut late = Viewer::connect(&watch.url).await;
-    late.receive_until(|viewer| viewer.topics() == topics).await;
-    assert_eq!((late.grasps(), late.fingertips()), (1, viewer.fingertips()));
-    assert_eq!(late.points("/hands").len(), 4 * 33);
-
     std::fs::write(&file, "not an array").unwrap();
     viewer.receive_until(|viewer| !viewer.errors.is_empty()).await;
     assert!(viewer.errors["detection"].contains("volume.npy") && viewer.grasps() == 1, "{:?}", viewer.errors);
+
+    let mut late = Viewer::connect(&watch.url).await;
+    late.receive_until(|viewer| viewer.topics() == topics && !viewer.errors.is_empty()).await;
+    assert_eq!((late.grasps(), late.fingertips()), (1, viewer.fingertips()));
+    assert_eq!(late.points("/hands").len(), 4 * 33);
+    assert_eq!(late.errors, viewer.errors);
+
     replace(&file, &[[4, 5, 6], [11, 10, 9]]);
     for viewer in [&mut viewer, &mut late] {
         viewer.receive_until(|viewer| viewer.grasps() == 2 && viewer.errors.is_empty()).await;

@@ -16,14 +16,14 @@ use crate::messages::Message;
 /// Where the server listens by default: the address that Foxglove proposes for a connection.
 pub(crate) const DEFAULT_ADDRESS: &str = "127.0.0.1:8765";
 
-/// Messages that wait for a slow viewer. The oldest are dropped: it needs only the newest of each topic.
+/// Largest number of messages queued for a viewer. Beyond it the oldest are dropped; newer ones of the same topics follow.
 const BACKLOG: usize = 32;
 
-/// The error of the newest detection, among the messages to the user that a viewer lists.
+/// Id of the status message with the error of the newest detection.
 const STATUS: &str = "detection";
 
-/// Time limit of the goodbye to the viewers.
-const GOODBYE: Duration = Duration::from_secs(1);
+/// Time limit for closing the connections.
+const CLOSE_LIMIT: Duration = Duration::from_secs(1);
 
 /// Host and port to listen on.
 #[derive(Clone, Debug, PartialEq)]
@@ -38,10 +38,18 @@ pub(crate) struct Live {
     topics: Arc<Topics>,
 }
 
-/// The newest message of each topic. A viewer gets it when it subscribes to the topic.
+/// What a viewer gets when it subscribes to a topic.
 struct Topics {
     context: Arc<Context>,
-    newest: Mutex<BTreeMap<&'static str, (Arc<RawChannel>, Message)>>,
+    newest: Mutex<Newest>,
+}
+
+#[derive(Default)]
+struct Newest {
+    /// The newest message of each topic, with its channel.
+    messages: BTreeMap<&'static str, (Arc<RawChannel>, Message)>,
+    /// Why a later detection failed.
+    error: Option<String>,
 }
 
 impl Live {
@@ -75,10 +83,12 @@ impl Live {
 
     /// Shows a detection instead of the one before.
     pub fn publish(&self, messages: Vec<Message>) -> anyhow::Result<()> {
-        self.server.remove_status(vec![STATUS.to_owned()]);
         let mut newest = self.topics.newest();
+        if newest.error.take().is_some() {
+            self.server.remove_status(vec![STATUS.to_owned()]);
+        }
         for message in messages {
-            let channel = match newest.remove(message.topic) {
+            let channel = match newest.messages.remove(message.topic) {
                 Some((channel, _)) => channel,
                 None => self
                     .topics
@@ -89,25 +99,26 @@ impl Live {
                     .build_raw()?,
             };
             send(&channel, &message, None);
-            newest.insert(message.topic, (channel, message));
+            newest.messages.insert(message.topic, (channel, message));
         }
         Ok(())
     }
 
-    /// Shows that the newest detection failed. The one before stays in view.
+    /// Shows why a detection failed. The detection before stays in view.
     pub fn publish_error(&self, error: &str) {
-        self.server.publish_status(Status::error(error).with_id(STATUS));
+        self.server.publish_status(status(error));
+        self.topics.newest().error = Some(error.to_owned());
     }
 
     /// Closes the connections.
     pub async fn stop(self) {
         // A viewer that reads nothing does not keep the program running.
-        let _ = tokio::time::timeout(GOODBYE, self.server.stop().wait()).await;
+        let _ = tokio::time::timeout(CLOSE_LIMIT, self.server.stop().wait()).await;
     }
 }
 
 impl Topics {
-    fn newest(&self) -> MutexGuard<'_, BTreeMap<&'static str, (Arc<RawChannel>, Message)>> {
+    fn newest(&self) -> MutexGuard<'_, Newest> {
         self.newest.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -115,10 +126,18 @@ impl Topics {
 impl ServerListener for Topics {
     fn on_subscribe(&self, client: Client, channel: ChannelView) {
         // The lock is held during sending, so that no older message follows a newer one.
-        if let Some((channel, message)) = self.newest().get(channel.topic()) {
+        let newest = self.newest();
+        if let Some((channel, message)) = newest.messages.get(channel.topic()) {
             send(channel, message, client.sink_id());
         }
+        if let Some(error) = &newest.error {
+            client.send_status(status(error));
+        }
     }
+}
+
+fn status(error: &str) -> Status {
+    Status::error(error).with_id(STATUS)
 }
 
 /// Sends a message to one viewer, or to all that have subscribed.
