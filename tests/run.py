@@ -84,14 +84,13 @@ class Steps:
 
 
 def main(name: Optional[str]) -> int:
-    steps = Steps(4 if name else 7)
+    steps = Steps(3 if name else 6)
     environment = compiling(dict(os.environ))
     if not name:
         steps.run("format", cargo, ["fmt", "--all", "--check"], environment)
     # Beside compilation, which needs the processor while they need the network.
     downloads = Downloads()
-    steps.run("compile programs", cargo, ["build", *WORKSPACE, "--bins", "--example", "detect"], environment)
-    programs = steps.run("compile tests", test_programs, environment)
+    programs = steps.run("compile", compiled_tests, environment)
     environment.update(steps.run("downloads", downloads.wait))
     outcome = steps.run("tests", run_tests, programs, name, testing(environment))
     if not name and not outcome.failed:
@@ -133,9 +132,11 @@ def cargo(arguments: List[str], environment: Dict[str, str]) -> None:
         raise Failure(f"cargo {arguments[0]} failed")
 
 
-def test_programs(environment: Dict[str, str]) -> List[TestProgram]:
-    """Compiles the test programs."""
-    command = [CARGO, "test", *WORKSPACE, "--lib", "--bins", "--tests", "--no-run", "--message-format", "json-render-diagnostics"]
+def compiled_tests(environment: Dict[str, str]) -> List[TestProgram]:
+    """Compiles the programs and the tests, and returns the latter. In one command, because the tests need more features of some
+    dependencies: apart, these and all that depends on them would be compiled twice."""
+    targets = ["--bins", "--tests", "--example", "detect"]
+    command = [CARGO, "build", *WORKSPACE, *targets, "--message-format", "json-render-diagnostics"]
     output = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True)
     if output.returncode:
         raise Failure("the tests do not compile")

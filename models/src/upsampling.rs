@@ -221,6 +221,7 @@ impl SmallKernel {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::onnx::DimensionValue;
     use crate::{Architecture, Orientation, averaged_over_rotations};
 
     #[test]

@@ -23,7 +23,7 @@ fn volume() -> Volume {
     blobs(RESOLUTION, Isometry3::identity(), &[[4, 5, 6], [11, 10, 9]])
 }
 
-fn write<T: npyz::AutoSerialize>(path: &Path, order: npyz::Order, values: impl IntoIterator<Item = T>) {
+pub(crate) fn write<T: npyz::AutoSerialize>(path: &Path, order: npyz::Order, values: impl IntoIterator<Item = T>) {
     let mut writer = npyz::WriteOptions::new()
         .default_dtype()
         .order(order)
@@ -67,7 +67,7 @@ fn run(server: &Server, args: &[&str]) -> Output {
     command.args(args).args(unchecked).env("GRASP_SERVER", server.grpc().to_string()).output().unwrap()
 }
 
-fn text(bytes: &[u8]) -> &str {
+pub(crate) fn text(bytes: &[u8]) -> &str {
     std::str::from_utf8(bytes).unwrap()
 }
 
@@ -179,7 +179,7 @@ async fn errors_of_the_client_library_name_the_field() {
     assert_eq!(client.detect(&volume(), named).await.unwrap_err().field(), Some("options.model"));
 }
 
-fn pose(value: &Value) -> Isometry3<f64> {
+pub(crate) fn pose(value: &Value) -> Isometry3<f64> {
     let numbers = |key: &str| -> Vec<f64> {
         value[key]
             .as_array()
@@ -355,7 +355,7 @@ async fn ctrl_c_ends_a_bench_with_what_was_measured() {
 }
 
 /// Depth images of two cameras in each supported format: paths of the images, and flags with intrinsics and poses.
-fn depth_files(folder: &Path) -> Vec<Vec<String>> {
+pub(crate) fn depth_files(folder: &Path) -> Vec<Vec<String>> {
     let path = |name: &str| folder.join(name).to_str().unwrap().to_owned();
     let cameras = [camera(30.0, -90.0), camera(45.0, 60.0)];
     let shape = [CAMERA.height as u64, CAMERA.width as u64];
@@ -465,7 +465,7 @@ fn points(task_from_camera: &Isometry3<f64>) -> Vec<Point3<f64>> {
     depth(&task_from_camera.inverse()).into_iter().enumerate().map(point).collect()
 }
 
-fn cloud_files(folder: &Path) -> [Vec<String>; 2] {
+pub(crate) fn cloud_files(folder: &Path) -> [Vec<String>; 2] {
     let path = |name: &str| folder.join(name).to_str().unwrap().to_owned();
     let cameras = [camera(30.0, -90.0), camera(45.0, 60.0)].map(|pose| pose.inverse());
     let [mut own, mut placed] = [["--camera-position", "0,0,0"].map(str::to_owned).to_vec(), Vec::new()];
@@ -643,12 +643,13 @@ fn view_writes_pictures_and_recordings() {
     let recording = view("grasps.mcap", &images);
     let messages: Vec<_> = mcap::MessageStream::new(&recording).unwrap().map(Result::unwrap).collect();
     let topics: Vec<_> = messages.iter().map(|message| message.channel.topic.as_str()).collect();
-    assert_eq!(topics, ["/surface", "/grasps", "/hands"]);
+    assert_eq!(topics, ["/cloud", "/surface", "/workspace", "/grasps", "/hands"]);
     let schemas = messages.iter().map(|message| message.channel.schema.as_ref().unwrap().name.clone());
-    assert_eq!(schemas.collect::<Vec<_>>(), ["foxglove.PointCloud", "foxglove.SceneUpdate", "foxglove.PointCloud"]);
-    let clouds = [0, 2].map(|index: usize| PointCloud::decode(&*messages[index].data).unwrap());
+    let [cloud, scene] = ["foxglove.PointCloud", "foxglove.SceneUpdate"];
+    assert_eq!(schemas.collect::<Vec<_>>(), [cloud, cloud, scene, scene, cloud]);
+    let clouds = [0, 1, 4].map(|index: usize| PointCloud::decode(&*messages[index].data).unwrap());
     assert!(clouds.iter().all(|cloud| cloud.data.len() > 1000 * cloud.point_stride as usize));
-    let scene = SceneUpdate::decode(&*messages[1].data).unwrap();
+    let scene = SceneUpdate::decode(&*messages[3].data).unwrap();
     assert!(scene.entities.len() > 5);
     assert_eq!(scene.entities[0].lines[0].points.len(), 8);
 }

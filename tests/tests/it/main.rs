@@ -12,6 +12,7 @@ mod hanging;
 mod health;
 mod limits;
 mod listen;
+mod live;
 mod metrics;
 mod overload;
 mod property;

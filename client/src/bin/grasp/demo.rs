@@ -3,7 +3,9 @@ use std::io::Cursor;
 use std::path::PathBuf;
 
 use clap::Args;
-use grasp_client::{Access, Client, DepthView, Error, Extrinsics, FindTable, LocalServer, Options, Workspace};
+use grasp_client::{
+    Access, Client, DepthView, DetectOptions, Error, Extrinsics, FindTable, LocalServer, Options, Workspace,
+};
 use nalgebra::Isometry3;
 
 use crate::image;
@@ -46,7 +48,7 @@ impl Demo {
         };
         let detection = scene.detect(&client, Options::default()).await?;
         show::print(&if json { show::detection_json(&detection) } else { show::detection(&detection) })?;
-        let picture = self.view.write(&scene.volume(&detection)?, None, None, &detection)?;
+        let picture = self.view.write(&scene, &DetectOptions::default(), &detection)?;
         eprintln!("grasp: the picture is {}", picture.display());
         drop(client);
         if let Some(server) = server {

@@ -11,6 +11,8 @@ mod export;
 mod files;
 mod image;
 mod labels;
+mod live;
+mod messages;
 mod numbers;
 mod overlay;
 mod pose;
@@ -21,6 +23,7 @@ mod show;
 mod table;
 mod view;
 mod volume;
+mod watch;
 
 use std::env;
 use std::fs;
@@ -50,6 +53,7 @@ use crate::replay::Replay;
 use crate::scene::SceneArgs;
 use crate::table::Table;
 use crate::view::ViewArgs;
+use crate::watch::Watch;
 
 /// Detects grasps with a graspd server.
 #[derive(Parser)]
@@ -170,23 +174,6 @@ struct Detect {
 }
 
 #[derive(Args)]
-struct Watch {
-    #[command(flatten)]
-    scene: SceneArgs,
-
-    #[command(flatten)]
-    detect: DetectArgs,
-
-    /// Interval at which the files are checked for changes, seconds.
-    #[arg(long, value_name = "SECONDS", default_value_t = 0.1, value_parser = positive)]
-    every: f64,
-
-    /// Exit after this many detections. Default: no limit.
-    #[arg(long, value_name = "N")]
-    count: Option<u64>,
-}
-
-#[derive(Args)]
 struct Score {
     #[command(flatten)]
     scene: SceneArgs,
@@ -301,37 +288,7 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             write(moveit, &export::moveit)?;
             write(isaac, &|detection| export::isaac(detection, opening))?;
         }
-        Command::Watch(Watch { scene: args, detect, every, count }) => {
-            let detect = detect.read()?;
-            let client = connect().await?;
-            let stamps = || args.files().map(|path| fs::metadata(path)?.modified()).collect::<io::Result<Vec<_>>>();
-            let (mut seen, mut answers) = (None, 0);
-            // A missing file is not an error: it may be written later.
-            if let Some(missing) = args.files().find(|path| !path.exists()) {
-                eprintln!("grasp: {} not found; waiting for it", missing.display());
-            }
-            while count.is_none_or(|count| answers < count) {
-                let now = stamps().ok();
-                if now.is_some() && now != seen {
-                    let answer = async {
-                        let scene = args.read()?;
-                        anyhow::Ok(scene.detect(&client, options(&args, detect.clone())).await?)
-                    };
-                    match answer.await {
-                        Ok(detection) => {
-                            if !print(&detection)? {
-                                break;
-                            }
-                            answers += 1;
-                        }
-                        // The error may be gone at the next change: an incomplete file, or a server that restarts.
-                        Err(error) => eprintln!("grasp: {error:#}; waiting for a file to change"),
-                    }
-                    seen = now;
-                }
-                tokio::time::sleep(Duration::from_secs_f64(every)).await;
-            }
-        }
+        Command::Watch(watch) => watch.run(connect, json).await?,
         Command::Score(Score { scene: args, detect, grasps }) => {
             let (scene, detect, grasps) = (args.read()?, detect.read()?, grasps.candidates()?);
             let scores = scene.score(&connect().await?, &grasps, options(&args, detect)).await?;
@@ -341,13 +298,8 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             // The drawing needs the finger base frame, so that --origin and --closing do not apply.
             let (scene, detect) = (args.read()?, DetectOptions { convention: None, ..detect.read()? });
             view.check(&scene)?;
-            let table = detect.collision.and_then(|collision| collision.table_height);
-            let depth = detect.gripper.as_ref().map(|gripper| gripper.finger_depth);
-            let detection = scene.detect(&connect().await?, options(&args, detect)).await?;
-            let path = match view.write_over_color(&scene, depth, &detection)? {
-                Some(path) => path,
-                None => view.write(&scene.volume(&detection)?, table, depth, &detection)?,
-            };
+            let detection = scene.detect(&connect().await?, options(&args, detect.clone())).await?;
+            let path = view.write(&scene, &detect, &detection)?;
             let grasps = detection.grasps.len();
             show::print(&if json {
                 json!({ "grasps": grasps, "file": path }).to_string()

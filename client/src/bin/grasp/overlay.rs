@@ -43,7 +43,7 @@ impl Overlay {
 
     /// Adds the edges of the workspace and the outline of the table at `height`, metres.
     pub fn workspace(&mut self, height: f64) -> &mut Self {
-        frame(&mut self.0, WORKSPACE_SIZE, height);
+        frame(&mut self.0, WORKSPACE_SIZE, Some(height));
         self
     }
 

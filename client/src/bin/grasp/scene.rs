@@ -2,13 +2,13 @@ use std::path::PathBuf;
 
 use anyhow::{Context, bail, ensure};
 use clap::Args;
-use grasp::{Fusion, RESOLUTION, Volume, WORKSPACE_SIZE};
+use grasp::{Fusion, Intrinsics, RESOLUTION, Volume, WORKSPACE_SIZE};
 use grasp_client::{
     Candidate, Client, CloudView, Depth, DepthView, Detection, Error, Extrinsics, FindTable, Observation, Options,
     Scores, Workspace,
 };
-use grasp_perception::{View, overview, seen_from};
-use nalgebra::Isometry3;
+use grasp_perception::{Cloud, View, overview, seen_from};
+use nalgebra::{Isometry3, Point3, Vector3};
 
 use crate::camera::{self, Camera};
 use crate::image::{self, Scale};
@@ -266,6 +266,50 @@ impl Scene {
         client.score_candidates(observation, candidates, options).await
     }
 
+    /// Pose of the workspace in the frame of the grasps (`T_frame_task`), and its lengths, metres.
+    pub fn workspace(&self, detection: &Detection) -> anyhow::Result<(Isometry3<f64>, Vector3<f64>)> {
+        let workspace = match self {
+            Self::Volume(volume) => {
+                return Ok((*volume.pose(), Vector3::repeat(volume.voxel_size() * volume.resolution() as f64)));
+            }
+            Self::Depth(_, workspace) | Self::Clouds(_, workspace) => found(workspace, detection)?,
+        };
+        let [x, y] = workspace.extent.unwrap_or([WORKSPACE_SIZE; 2]);
+        Ok((workspace.pose, Vector3::new(x, y, WORKSPACE_SIZE)))
+    }
+
+    /// About `most` of the points that the cameras measured, in the frame of the grasps, with depths corrected as in the
+    /// server; `None` for a volume.
+    pub fn points(&self, detection: &Detection, most: usize) -> anyhow::Result<Option<Vec<Point3<f64>>>> {
+        let mut points = Vec::new();
+        match self {
+            Self::Volume(_) => return Ok(None),
+            Self::Depth(views, workspace) => {
+                let workspace = found(workspace, detection)?;
+                let pixels: usize = views.iter().map(|view| view.width as usize * view.height as usize).sum();
+                let every = (pixels as f64 / most as f64).sqrt().ceil().max(1.0) as usize;
+                for (index, view) in views.iter().enumerate() {
+                    let mut view = depth_view(view, index, &workspace)?;
+                    view.image.scale(depth_factor(detection, index));
+                    let frame_from_camera = workspace.pose * view.camera_from_task.inverse();
+                    let Intrinsics { width, height, .. } = view.intrinsics();
+                    let rows = (0..height).step_by(every);
+                    let pixels = rows.flat_map(|v| (0..width).step_by(every).map(move |u| (u, v)));
+                    points.extend(pixels.filter_map(|(u, v)| Some(frame_from_camera * view.image.point(u, v)?)));
+                }
+            }
+            Self::Clouds(views, _) => {
+                let every = views.iter().map(|view| view.points.len()).sum::<usize>().div_ceil(most).max(1);
+                for (index, view) in views.iter().enumerate() {
+                    let mut cloud = cloud_view(view, index)?;
+                    cloud.scale(depth_factor(detection, index));
+                    points.extend(cloud.points.into_iter().step_by(every));
+                }
+            }
+        }
+        Ok(Some(points))
+    }
+
     /// The volume to draw: the given one, or the fused images or points, with depths corrected as in the server.
     pub fn volume(&self, detection: &Detection) -> anyhow::Result<Volume> {
         let (views, workspace) = match self {
@@ -319,10 +363,14 @@ pub(crate) fn depth_view(view: &DepthView, index: usize, workspace: &Workspace) 
     Ok(frame.map_err(|error| error.inside(format_args!("views[{index}]")))?)
 }
 
+/// Cloud `index` in the frame of the grasps, as the server reads it.
+fn cloud_view(view: &CloudView, index: usize) -> anyhow::Result<Cloud> {
+    Ok(grasp_proto::cloud(&view.into()).map_err(|error| error.inside(format_args!("views[{index}]")))?)
+}
+
 /// Renders cloud `index`, whose distances from its camera are multiplied by `factor`, to a depth image.
 fn rendered_view(view: &CloudView, index: usize, workspace: &Workspace, factor: f64) -> anyhow::Result<View> {
-    let cloud = grasp_proto::cloud(&view.into()).map_err(|error| error.inside(format_args!("views[{index}]")))?;
-    let mut cloud = cloud.in_task(&workspace.pose);
+    let mut cloud = cloud_view(view, index)?.in_task(&workspace.pose);
     cloud.scale(factor);
     let seen = match workspace.extent {
         // As the server does.
@@ -337,7 +385,6 @@ fn rendered_view(view: &CloudView, index: usize, workspace: &Workspace, factor: 
 #[cfg(test)]
 mod tests {
     use grasp_client::pb;
-    use nalgebra::{Point3, Vector3};
 
     use super::*;
 

@@ -2,12 +2,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{bail, ensure};
 use clap::Args;
-use grasp::{FINGER_DEPTH, SurfaceMesh, SurfacePoint, TABLE_HEIGHT, Volume};
-use grasp_client::Detection;
+use grasp::{DetectParams, SurfaceMesh, Volume};
+use grasp_client::{DetectOptions, Detection};
 use grasp_picture::{Mesh, Picture, quality_color};
 use nalgebra::{Isometry3, Point3};
 
 use crate::drawing::{SHOWN, frame};
+use crate::files::has_extension;
+use crate::messages::messages;
 use crate::overlay::Overlay;
 use crate::record;
 use crate::scene::Scene;
@@ -40,57 +42,35 @@ impl ViewArgs {
         Ok(())
     }
 
-    /// Draws the grasps over the colour image, if one is given. Returns the path of the picture.
-    pub fn write_over_color(
-        &self,
-        scene: &Scene,
-        depth: Option<f64>,
-        detection: &Detection,
-    ) -> anyhow::Result<Option<&Path>> {
-        let Some(color) = &self.color else { return Ok(None) };
-        let (view, pose) = scene.first_view(detection)?;
-        let mut overlay = Overlay::of_color(color, view.intrinsics(), view.camera_from_task)?;
-        overlay.grasps(detection, &pose, depth.unwrap_or(FINGER_DEPTH)).save(&self.out)?;
-        Ok(Some(&self.out))
-    }
-
-    /// Draws or records the observed surface and the grasps. `table` is the height of the table above the volume's
-    /// bottom and `depth` the length of the fingers, metres; `None` means the default.
-    pub fn write(
-        &self,
-        volume: &Volume,
-        table: Option<f64>,
-        depth: Option<f64>,
-        detection: &Detection,
-    ) -> anyhow::Result<&Path> {
-        let (table, depth) = (table.unwrap_or(TABLE_HEIGHT), depth.unwrap_or(FINGER_DEPTH));
-        if self.out.extension().is_some_and(|extension| extension == "mcap") {
-            record::write(&self.out, &placed(&volume.surface(), volume.pose()), depth, detection)?;
+    /// Draws or records the observation and the grasps, which must be at the finger base. `options` are those of the
+    /// request. Returns the path of the file.
+    pub fn write(&self, scene: &Scene, options: &DetectOptions, detection: &Detection) -> anyhow::Result<&Path> {
+        let params = DetectParams::try_from(options)?;
+        if let Some(color) = &self.color {
+            let (view, pose) = scene.first_view(detection)?;
+            let mut overlay = Overlay::of_color(color, view.intrinsics(), view.camera_from_task)?;
+            overlay.grasps(detection, &pose, params.finger_depth()).save(&self.out)?;
+        } else if has_extension(&self.out, "mcap") {
+            record::write(&self.out, &messages(scene, options, detection)?)?;
         } else {
-            draw(volume, table, depth, detection).save(&self.out)?;
+            draw(&scene.volume(detection)?, &params, detection).save(&self.out)?;
         }
         Ok(&self.out)
     }
 }
 
-/// The surface points in the frame of `pose`.
-fn placed(surface: &[SurfacePoint], pose: &Isometry3<f64>) -> Vec<SurfacePoint> {
-    let point = |point: &SurfacePoint| SurfacePoint { position: pose * point.position, normal: pose * point.normal };
-    surface.iter().map(point).collect()
-}
-
 /// Draws in the task frame. The camera is above a corner and sees the whole workspace.
-fn draw(volume: &Volume, table: f64, depth: f64, detection: &Detection) -> Picture {
+fn draw(volume: &Volume, params: &DetectParams, detection: &Detection) -> Picture {
     let size = volume.voxel_size() * volume.resolution() as f64;
     let [width, height] = SIZE;
     let (eye, target) = (Point3::new(1.75, -1.1, 1.8) * size, Point3::new(0.5, 0.5, 0.4) * size);
     let mut picture = Picture::looking_at(width, height, 0.68, eye, target);
-    frame(&mut picture, size, table);
+    frame(&mut picture, size, params.table);
     let SurfaceMesh { vertices, triangles } = volume.mesh();
     picture.mesh(&Mesh { vertices, triangles }, &Isometry3::identity(), 1.0, [206, 204, 198]);
     for grasp in detection.grasps.iter().take(SHOWN).rev() {
         let pose = volume.pose().inverse() * grasp.pose;
-        picture.gripper(&pose, grasp.width, depth, quality_color(f64::from(grasp.quality)));
+        picture.gripper(&pose, grasp.width, params.finger_depth(), quality_color(f64::from(grasp.quality)));
     }
     picture
 }
