@@ -126,7 +126,7 @@ impl ModelFolder {
             let names: BTreeSet<&str> = networks.map(ModelSpec::name).collect();
             let available = || names.iter().copied().collect::<Vec<_>>().join(", ");
             ensure!(
-                names.contains(&**default),
+                names.contains(ModelSpec::current_name(files.specs.iter(), default)),
                 "--default-model is `{default}`, which is not in the model folder; available: {}",
                 available()
             );
@@ -390,14 +390,16 @@ impl ModelFolder {
 
     fn replace(&self, models: Vec<Arc<Model>>, defaults: &[DefaultName]) {
         let before = self.models.now();
-        let is_served =
-            |name: &str| models.iter().any(|model| model.spec.network().is_some() && model.spec.name() == name);
+        let current_name = |name| ModelRegistry::current_name(&models, name);
+        let is_served = |name: &str| {
+            models.iter().any(|model| model.spec.network().is_some() && model.spec.name() == current_name(name))
+        };
         let default = defaults.iter().find(|default| is_served(&default.name));
         // The name is not logged: if the file `default` is a link to another file, it is that file's content.
         for DefaultName { setting, .. } in defaults.iter().take_while(|default| !is_served(&default.name)) {
             warn!("the model named by {setting} is not served; another model is the default instead");
         }
-        let default = default.map(|default| default.name.clone());
+        let default = default.map(|default| current_name(&default.name).to_owned());
         self.models.replace(models, default.as_deref());
         let now = self.models.now();
         let labels = |models: &[Arc<Model>]| models.iter().map(|model| model.labels()).collect::<Vec<_>>();

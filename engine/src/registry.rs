@@ -59,12 +59,19 @@ impl ModelRegistry {
         unknown_of(field, requested, &describe(&served.iter().collect::<Vec<_>>(), |model| model.label.clone()))
     }
 
+    /// The name of the model that is called `name`, or was called so before it was renamed.
+    #[must_use]
+    pub fn current_name<'a>(served: &'a [Arc<Model>], name: &'a str) -> &'a str {
+        ModelSpec::current_name(served.iter().map(|model| &model.spec), name)
+    }
+
     /// The network with this name, which `field` of the request has, and version. Planners without a network are not found.
     ///
     /// # Errors
     /// [`RequestError`] with the available ones.
     pub fn network(&self, field: &'static str, name: &str, version: &str) -> Result<Arc<Model>, RequestError> {
         let served = self.now();
+        let name = Self::current_name(&served, name);
         let networks = || served.iter().filter(|model| model.spec.network().is_some());
         let is_named =
             |model: &&Arc<Model>| model.spec.name() == name && (version.is_empty() || model.spec.version() == version);
@@ -103,12 +110,14 @@ impl ModelRegistry {
             let model = networks.iter().find(|model| fits(model)).map(|&model| Arc::clone(model));
             return model.ok_or_else(|| wrong(&describe(&networks, accepted)));
         }
+        let requested = format!("{name} {version}");
+        let name = Self::current_name(&served, name);
         let is_named =
             |model: &&Arc<Model>| model.spec.name() == name && (version.is_empty() || model.spec.version() == version);
         let is_known = served.iter().any(|model| model.spec.name() == name);
         let model = served.iter().find(is_named).ok_or_else(|| {
             let field = if is_known { "options.version" } else { "options.model" };
-            self.unknown(field, format!("{name} {version}").trim_end())
+            self.unknown(field, requested.trim_end())
         })?;
         if fits(model) { Ok(Arc::clone(model)) } else { Err(wrong(&accepted(model))) }
     }

@@ -13,6 +13,8 @@ use crate::onnx::{DimensionValue, ModelProto, StringStringEntryProto, ValueInfoP
 pub struct Metadata {
     /// Name of the model in requests.
     pub name: String,
+    /// Name that the model had before; requests may still use it.
+    pub former_name: Option<String>,
     /// Version: numbers separated by dots.
     pub version: String,
     /// Voxels along an edge of its volumes.
@@ -44,6 +46,7 @@ impl Metadata {
         let resolution = resolution.unwrap_or(RESOLUTION);
         Self {
             name: path.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
+            former_name: None,
             version: "1".to_owned(),
             resolution,
             voxel_size: WORKSPACE_SIZE / resolution as f64,
@@ -75,6 +78,7 @@ impl Metadata {
             let Some(key) = key.strip_prefix(PREFIX) else { continue };
             match key {
                 "name" => metadata.name = printable("name", value)?,
+                "former_name" => metadata.former_name = Some(printable("former_name", value)?),
                 "version" => metadata.version = printable("version", value)?,
                 "resolution" => {
                     let resolution = parse("resolution", &value, "a whole number of voxels above 0", |&n| n > 0)?;
@@ -129,6 +133,9 @@ impl Metadata {
             model.metadata_props.push(StringStringEntryProto { key, value: Some(value) });
         };
         put("name", self.name.clone());
+        if let Some(name) = &self.former_name {
+            put("former_name", name.clone());
+        }
         put("version", self.version.clone());
         put("resolution", self.resolution.to_string());
         put("voxel_size", self.voxel_size.to_string());

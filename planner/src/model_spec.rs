@@ -53,6 +53,15 @@ impl ModelSpec {
         self.entry().map_or("shaf", |entry| &entry.metadata.name)
     }
 
+    /// The name of the planner that is called `name`, or was called so before it was renamed; `name` if there is none.
+    #[must_use]
+    pub fn current_name<'a>(specs: impl Iterator<Item = &'a Self> + Clone, name: &'a str) -> &'a str {
+        let was_called = |spec: &&Self| spec.entry().is_some_and(|entry| entry.metadata.former_name.as_deref() == Some(name));
+        let is_current = specs.clone().any(|spec| spec.name() == name);
+        let renamed = || specs.clone().find(was_called).map(Self::name);
+        if is_current { name } else { renamed().unwrap_or(name) }
+    }
+
     /// Version of the model in requests.
     #[must_use]
     pub fn version(&self) -> &str {

@@ -67,7 +67,7 @@ fn planners() -> Vec<(&'static str, Box<dyn Planner>, DecodeParams)> {
     let proposals = NetworkPlanner::load(&zoo("vgn-packed.onnx"), &Options::default()).unwrap();
     let evaluated = Network::load(&zoo("vgn-packed.onnx"), &Options::default()).unwrap();
     let of_evaluated = Evaluator::decode_params(evaluated.metadata());
-    let evaluator = Evaluator::load(&zoo("evaluators/graspd.onnx"), &Options::default()).unwrap();
+    let evaluator = Evaluator::load(&zoo("evaluators/vgn-refined.onnx"), &Options::default()).unwrap();
     vec![
         ("network", Box::new(network), decode),
         ("evaluator", Box::new(NetworkPlanner::new(evaluated, Some(evaluator))), of_evaluated),
@@ -155,7 +155,7 @@ fn classifiers_run_beside_int8_networks() {
     let ranges = quantized_activations(&network).into_iter().map(range).collect();
     with_int8(&network, &ranges).unwrap().write(&folder.path().join("vgn-packed.onnx")).unwrap();
     let network = entry(folder.path(), "vgn-packed");
-    let evaluated = ModelSpec::Evaluated { network, evaluator: entry(&zoo("evaluators"), "graspd") };
+    let evaluated = ModelSpec::Evaluated { network, evaluator: entry(&zoo("evaluators"), "vgn-refined") };
     let (planners, backend) = evaluated.load(&int8, 2).unwrap();
     assert_eq!((planners.len(), backend.precision), (2, Precision::Int8));
 }

@@ -353,13 +353,14 @@ impl GrpcInferenceService for InferenceApi {
         let oip::ModelStatisticsRequest { name, version } = request.into_inner();
         self.calls.check_started().map_err(|error| status(&error, ""))?;
         let served = self.models.now();
+        let name = ModelRegistry::current_name(&served, &name);
         let is_requested = |model: &&Arc<Model>| {
             model.spec.network().is_some()
                 && (name.is_empty() || model.spec.name() == name)
                 && (version.is_empty() || model.spec.version() == version)
         };
         if !name.is_empty() {
-            self.network("name", &name, &version).map_err(|error| status(&error, ""))?;
+            self.network("name", name, &version).map_err(|error| status(&error, ""))?;
         }
         let model_stats = served.iter().filter(is_requested).map(|model| statistics(model)).collect();
         Ok(Response::new(oip::ModelStatisticsResponse { model_stats }))

@@ -22,7 +22,7 @@ use super::{SceneArgs, parse_quality, parse_share, show};
 /// The scenes depend only on the seed, so that all planners are evaluated on the same scenes.
 #[derive(Args)]
 pub struct Bench {
-    /// Planner; can be repeated: a model that comes with graspd (`graspd`, `vgn-packed`, `gpd`, `shaf`); the path of an
+    /// Planner; can be repeated: a model that comes with graspd (`vgn-refined`, `vgn-packed`, `gpd`, `shaf`); the path of an
     /// .onnx network; `EVALUATOR.onnx:NETWORK.onnx` (a network and the evaluator of its grasps); `grpc:ADDRESS` (a
     /// running graspd); `shaf:FILE` (the highest of a network's proposals with a quality above 0.5); `gpd:FILE`
     /// (candidates scored by a classifier of `grasp-train classify`); `random`. `grpc` uses only --threshold and --force

@@ -15,6 +15,7 @@ fn named(name: &str, folder: &Path) -> Result<PlannerSpec, String> {
     /// Similarity of a name that was probably meant.
     const SIMILAR: f64 = 0.8;
     let specs = ModelFiles::read(folder, MAX_MODEL_BYTES).map_err(|error| error.to_string())?.specs;
+    let name = ModelSpec::current_name(specs.iter(), name);
     // The versions of a name are in ascending order.
     if let Some(spec) = specs.iter().rfind(|spec| spec.name() == name) {
         let file = || spec.path().map(PathBuf::from).unwrap_or_default();
@@ -44,8 +45,9 @@ mod tests {
         let zoo = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo"));
         let network = zoo.join("vgn-packed.onnx");
         assert_eq!(named("vgn-packed", zoo), Ok(PlannerSpec::Network(network.clone())));
-        let evaluator = zoo.join("evaluators/graspd.onnx");
-        assert_eq!(named("graspd", zoo), Ok(PlannerSpec::Evaluated { evaluator, network }));
+        let refined = PlannerSpec::Evaluated { evaluator: zoo.join("evaluators/vgn-refined.onnx"), network };
+        assert_eq!(named("vgn-refined", zoo), Ok(refined.clone()));
+        assert_eq!(named("graspd", zoo), Ok(refined), "its former name");
         assert_eq!(named("gpd", zoo), Ok(PlannerSpec::Gpd(zoo.join("classifiers/gpd.onnx"))));
         assert_eq!(named("shaf", zoo), Ok(PlannerSpec::Highest));
         let error = named("vgn-pakced", zoo).unwrap_err();

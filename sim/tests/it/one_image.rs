@@ -21,7 +21,7 @@ const SEEN: usize = 400;
 fn planner() -> NetworkPlanner {
     let zoo = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/zoo");
     let network = Network::load(&zoo.join("vgn-packed.onnx"), &Options::default()).unwrap();
-    let evaluator = Evaluator::load(&zoo.join("evaluators/graspd.onnx"), &Options::default()).unwrap();
+    let evaluator = Evaluator::load(&zoo.join("evaluators/vgn-refined.onnx"), &Options::default()).unwrap();
     NetworkPlanner::new(network, Some(evaluator))
 }
 

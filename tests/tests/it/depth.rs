@@ -374,7 +374,7 @@ async fn an_evaluator_scores_the_grasps_of_its_network() {
     let zoo = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo"));
     let evaluators = server.models().join("evaluators");
     std::fs::create_dir(&evaluators).unwrap();
-    std::fs::copy(zoo.join("evaluators/graspd.onnx"), evaluators.join("graspd.onnx")).unwrap();
+    std::fs::copy(zoo.join("evaluators/vgn-refined.onnx"), evaluators.join("vgn-refined.onnx")).unwrap();
     server.reload().unwrap();
     server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 1.0).await;
     let client = server.client().await;
@@ -387,7 +387,7 @@ async fn an_evaluator_scores_the_grasps_of_its_network() {
     std::fs::copy(zoo.join("vgn-packed.onnx"), &network).unwrap();
     server.reload().unwrap();
     server.wait_for("graspd_reloads_total{outcome=\"ok\"}", 1.0).await;
-    assert_eq!(names().await, ["mirror", "vgn-packed", "graspd", "shaf"]);
+    assert_eq!(names().await, ["mirror", "vgn-packed", "vgn-refined", "shaf"]);
     let models = client.list_models().await.unwrap();
     assert!(models[2].provenance["network"].starts_with("vgn-packed 4, sha256 "), "{:?}", models[2].provenance);
     assert_eq!((models[2].resolution, models[2].threshold), (40, 0.5));
@@ -397,7 +397,7 @@ async fn an_evaluator_scores_the_grasps_of_its_network() {
         let detect = DetectOptions { model: model.to_owned(), threshold: Some(0.01), ..DetectOptions::default() };
         client.detect_from_depth(&views, &Workspace::default(), with_options(detect)).await.unwrap()
     };
-    let Detection { grasps: evaluated, latency, .. } = detect("graspd").await;
+    let Detection { grasps: evaluated, latency, .. } = detect("vgn-refined").await;
     assert!(latency.evaluation > 0.0, "{latency:?}");
     let stages = [latency.queue, latency.preprocessing, latency.fusion, latency.inference, latency.postprocessing];
     assert!(stages.iter().sum::<f64>() + latency.evaluation <= latency.total, "{latency:?}");
@@ -408,6 +408,7 @@ async fn an_evaluator_scores_the_grasps_of_its_network() {
     assert!((server.metric(&series) - latency.evaluation).abs() < 1e-9);
     assert!(!evaluated.is_empty() && evaluated.is_sorted_by(|a, b| a.quality >= b.quality));
     assert_at_the_block(&evaluated[0]);
+    // Its former name.
     assert_same(&detect("graspd").await.grasps, &evaluated);
     let qualities = |grasps: &[Proposal]| grasps.iter().map(|grasp| grasp.quality).collect::<Vec<_>>();
     let alone = detect("vgn-packed").await;
@@ -418,7 +419,7 @@ async fn an_evaluator_scores_the_grasps_of_its_network() {
     std::fs::remove_file(&network).unwrap();
     server.reload().unwrap();
     server.wait_for("graspd_reloads_total{outcome=\"failed\"}", 2.0).await;
-    assert_eq!(names().await, ["mirror", "graspd", "shaf"]);
+    assert_eq!(names().await, ["mirror", "vgn-refined", "shaf"]);
 }
 
 #[tokio::test]
@@ -426,7 +427,7 @@ async fn a_model_with_an_evaluator_can_be_the_default() {
     let zoo = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo"));
     let folder = tempfile::tempdir().unwrap();
     std::fs::create_dir(folder.path().join("evaluators")).unwrap();
-    for file in ["vgn-packed.onnx", "evaluators/graspd.onnx"] {
+    for file in ["vgn-packed.onnx", "evaluators/vgn-refined.onnx"] {
         std::fs::copy(zoo.join(file), folder.path().join(file)).unwrap();
     }
     let models = folder.path().to_str().unwrap();
@@ -437,7 +438,7 @@ async fn a_model_with_an_evaluator_can_be_the_default() {
     };
     let server = start("graspd").unwrap();
     let client = Client::connect(server.grpc().to_string()).await.unwrap();
-    assert_eq!(client.list_models().await.unwrap()[0].name, "graspd");
+    assert_eq!(client.list_models().await.unwrap()[0].name, "vgn-refined");
     assert!(start("shaf").is_err(), "it has no network");
 }
 

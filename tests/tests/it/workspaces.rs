@@ -34,7 +34,7 @@ async fn server(args: &[&str]) -> (Server, Client) {
     let server = Server::run(&[TestModel::new("mirror")], args);
     let zoo = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/zoo"));
     std::fs::create_dir(server.models().join("evaluators")).unwrap();
-    for file in ["vgn-packed.onnx", "evaluators/graspd.onnx"] {
+    for file in ["vgn-packed.onnx", "evaluators/vgn-refined.onnx"] {
         std::fs::copy(zoo.join(file), server.models().join(file)).unwrap();
     }
     server.reload().unwrap();
@@ -44,7 +44,7 @@ async fn server(args: &[&str]) -> (Server, Client) {
 }
 
 fn options(detect: DetectOptions) -> Options {
-    let model = if detect.model.is_empty() { "graspd".to_owned() } else { detect.model.clone() };
+    let model = if detect.model.is_empty() { "vgn-refined".to_owned() } else { detect.model.clone() };
     Options { detect: DetectOptions { model, ..detect }, ..Options::default() }
 }
 
@@ -71,7 +71,7 @@ fn box_of(grasp: &Proposal) -> Option<u32> {
 #[tokio::test]
 async fn a_large_workspace_has_the_grasps_of_all_objects() {
     let (server, client) = server(&[]).await;
-    for model in ["graspd", "shaf"] {
+    for model in ["vgn-refined", "shaf"] {
         let detect = DetectOptions { model: model.to_owned(), explain: true, ..DetectOptions::default() };
         let detection = client.detect_from_depth(&views(), &tabletop(), options(detect)).await.unwrap();
         for number in 1..=4 {
@@ -92,7 +92,7 @@ async fn a_large_workspace_has_the_grasps_of_all_objects() {
             assert!(!positions().any(same), "{model}: two cubes give the same grasp");
         }
     }
-    let cubes = server.metric("graspd_batch_size_sum{model=\"graspd 4\"}");
+    let cubes = server.metric("graspd_batch_size_sum{model=\"vgn-refined 4\"}");
     assert!((4.0..15.0).contains(&cubes), "{cubes} of 15 cubes have an object");
 
     // A single cube has the grasps of the box in it.
@@ -304,7 +304,7 @@ async fn the_callers_grasps_are_scored_in_their_order() {
     let seen = Observation::Depth(&views, &workspace);
     let checked = DetectOptions { collision: collision(pb::collision_check::Mode::Flag, false), ..Default::default() };
     let scores = client.score(seen, &candidates, options(checked.clone())).await.unwrap();
-    assert_eq!((scores.model.as_str(), scores.scores.len()), ("graspd", 3));
+    assert_eq!((scores.model.as_str(), scores.scores.len()), ("vgn-refined", 3));
     let violations = |index: usize| scores.scores[index].violations().collect::<Vec<_>>();
     assert_eq!(scores.scores[0].quality, 0.0);
     assert_eq!(violations(0), [Violation::Quality, Violation::Region]);
