@@ -13,7 +13,7 @@ use axum::body::Body;
 use axum::extract::{Path, Request, State};
 use axum::http::header::{CONTENT_TYPE, ORIGIN, RETRY_AFTER};
 use axum::http::request::Parts;
-use axum::http::{HeaderValue, Method, StatusCode, Uri};
+use axum::http::{Extensions, HeaderValue, Method, StatusCode, Uri};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
@@ -277,23 +277,10 @@ async fn statistics(State(rest): State<Rest>, name: String, version: String) -> 
 
 /// Detects grasps in depth images.
 async fn detect(State(rest): State<Rest>, request: Request) -> Reply<Response> {
-    let (mut parts, body) = request.into_parts();
-    let deadline = deadline::read(&parts.headers).unwrap_or_else(|| Deadline(Instant::now() + TIMEOUT));
-    parts.extensions.insert(deadline);
-    let body = read(body, &parts, rest.limits).await.inspect_err(|status| rest.metrics.ended("", status.code()))?;
-    let parse = move || {
-        let body = body;
-        detect::request(&body.bytes)
-    };
-    let message = rest.convert(deadline, parse).await.and_then(|parsed| parsed);
-    let message = message.inspect_err(|status| rest.metrics.ended("", status.code()))?;
-    let reply = rest.grasps.detect_grasps_from_depth(grpc(parts, message)).await?;
-    let (_, reply, extensions) = reply.into_parts();
+    let (parts, deadline, message) = rest.receive(request, detect::request).await?;
+    let (_, reply, extensions) = rest.grasps.detect_grasps_from_depth(grpc(parts, message)).await?.into_parts();
     let bytes = rest.convert(deadline, move || detect::response(&reply)).await??;
-    let mut response = http::Response::new(tonic::body::Body::new(Body::from(bytes)));
-    *response.extensions_mut() = extensions;
-    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/json"));
-    Ok(keep_permit(response, rest.limits).map(Body::new))
+    Ok(rest.reply(extensions, "application/json", bytes))
 }
 
 async fn infer(
@@ -301,31 +288,50 @@ async fn infer(
     Path(Model { model, version }): Path<Model>,
     request: Request,
 ) -> Reply<Response> {
-    let (mut parts, body) = request.into_parts();
-    let deadline = deadline::read(&parts.headers).unwrap_or_else(|| Deadline(Instant::now() + TIMEOUT));
-    parts.extensions.insert(deadline);
-    let header_length = parts.headers.get(HEADER_LENGTH).cloned();
-    let body = read(body, &parts, rest.limits).await.inspect_err(|status| rest.metrics.ended("", status.code()))?;
-    let parse = move || {
-        // The whole body, so that it is dropped when it is parsed, and no longer counts as being received.
-        let body = body;
-        InferRequest::parse(&body.bytes, header_length.as_ref())
-    };
-    let parsed = rest.convert(deadline, parse).await.inspect_err(|status| rest.metrics.ended("", status.code()))?;
-    let parsed = parsed.inspect_err(|status| rest.metrics.ended("", status.code()))?;
+    let header_length = request.headers().get(HEADER_LENGTH).cloned();
+    let parse = move |body: &[u8]| InferRequest::parse(body, header_length.as_ref());
+    let (parts, deadline, parsed) = rest.receive(request, parse).await?;
     let (message, binary) = parsed.into_message(model, version);
     let (_, message, extensions) = rest.inference.model_infer(grpc(parts, message)).await?.into_parts();
     let (content_type, header_length, bytes) = rest.convert(deadline, move || response(message, &binary)).await?;
-    let mut response = http::Response::new(tonic::body::Body::new(Body::from(bytes)));
-    *response.extensions_mut() = extensions;
-    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static(content_type));
+    let mut response = rest.reply(extensions, content_type, bytes);
     if let Some(length) = header_length {
         response.headers_mut().insert(HEADER_LENGTH, HeaderValue::from(length));
     }
-    Ok(keep_permit(response, rest.limits).map(Body::new))
+    Ok(response)
 }
 
 impl Rest {
+    /// Reads the body of a request and parses it.
+    async fn receive<T: Send + 'static>(
+        &self,
+        request: Request,
+        parse: impl FnOnce(&[u8]) -> Result<T, Status> + Send + 'static,
+    ) -> Result<(Parts, Deadline, T), Status> {
+        let (mut parts, body) = request.into_parts();
+        let deadline = deadline::read(&parts.headers).unwrap_or_else(|| Deadline(Instant::now() + TIMEOUT));
+        parts.extensions.insert(deadline);
+        let parsed = async {
+            let body = read(body, &parts, self.limits).await?;
+            let parse = move || {
+                // The whole body, so that it is dropped when it is parsed, and no longer counts as being received.
+                let body = body;
+                parse(&body.bytes)
+            };
+            self.convert(deadline, parse).await?
+        };
+        let parsed = parsed.await.inspect_err(|status| self.metrics.ended("", status.code()))?;
+        Ok((parts, deadline, parsed))
+    }
+
+    /// The response to a call.
+    fn reply(&self, extensions: Extensions, content_type: &'static str, bytes: Vec<u8>) -> Response {
+        let mut response = http::Response::new(tonic::body::Body::new(Body::from(bytes)));
+        *response.extensions_mut() = extensions;
+        response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static(content_type));
+        keep_permit(response, self.limits).map(Body::new)
+    }
+
     /// Runs a conversion on a thread for blocking tasks: megabytes of JSON would block those of the async runtime. A bounded
     /// number of requests wait for it, at most until their deadline.
     async fn convert<T: Send + 'static>(
