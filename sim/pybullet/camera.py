@@ -94,7 +94,7 @@ def enlarging(pixels: int) -> Array:
 def points(view: DepthView) -> Array:
     """x, y, z of each pixel in the task frame, `[row][column][3]`, metres."""
     rows, columns = np.indices(view.depth.shape)
-    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(view.k).T
+    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(np.asarray(view.k)).T
     task_from_camera = np.linalg.inv(np.asarray(view.camera_from_task))
     seen: Array = (rays * view.depth[..., None]) @ task_from_camera[:3, :3].T + task_from_camera[:3, 3]
     return seen

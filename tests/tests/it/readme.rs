@@ -84,7 +84,7 @@ fn every_command_of_the_readme_works() {
     let output = command.output().unwrap();
     let (stdout, stderr) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert!(output.status.success(), "{stdout}\n{stderr}");
-    for expected in ["vgn-packed", "graspd_", "\"gsr\"", "\"planner\":\"random\""] {
+    for expected in ["vgn-packed", "graspd_", "GSR %", "| random |"] {
         assert!(stdout.contains(expected), "`{expected}` is missing from:\n{stdout}\n{stderr}");
     }
 }
