@@ -390,16 +390,16 @@ impl ModelFolder {
 
     fn replace(&self, models: Vec<Arc<Model>>, defaults: &[DefaultName]) {
         let before = self.models.now();
-        let current_name = |name| ModelRegistry::current_name(&models, name);
         let is_served = |name: &str| {
-            models.iter().any(|model| model.spec.network().is_some() && model.spec.name() == current_name(name))
+            let name = ModelRegistry::current_name(&models, name);
+            models.iter().any(|model| model.spec.network().is_some() && model.spec.name() == name)
         };
         let default = defaults.iter().find(|default| is_served(&default.name));
         // The name is not logged: if the file `default` is a link to another file, it is that file's content.
         for DefaultName { setting, .. } in defaults.iter().take_while(|default| !is_served(&default.name)) {
             warn!("the model named by {setting} is not served; another model is the default instead");
         }
-        let default = default.map(|default| current_name(&default.name).to_owned());
+        let default = default.map(|default| ModelRegistry::current_name(&models, &default.name).to_owned());
         self.models.replace(models, default.as_deref());
         let now = self.models.now();
         let labels = |models: &[Arc<Model>]| models.iter().map(|model| model.labels()).collect::<Vec<_>>();

@@ -87,6 +87,7 @@ impl Architecture {
         ];
         let metadata = Metadata {
             name: self.name().to_owned(),
+            former_name: None,
             version: "1".to_owned(),
             resolution,
             voxel_size: grasp::WORKSPACE_SIZE / resolution as f64,

@@ -56,7 +56,8 @@ impl ModelSpec {
     /// The name of the planner that is called `name`, or was called so before it was renamed; `name` if there is none.
     #[must_use]
     pub fn current_name<'a>(specs: impl Iterator<Item = &'a Self> + Clone, name: &'a str) -> &'a str {
-        let was_called = |spec: &&Self| spec.entry().is_some_and(|entry| entry.metadata.former_name.as_deref() == Some(name));
+        let was_called =
+            |spec: &&Self| spec.entry().is_some_and(|entry| entry.metadata.former_name.as_deref() == Some(name));
         let is_current = specs.clone().any(|spec| spec.name() == name);
         let renamed = || specs.clone().find(was_called).map(Self::name);
         if is_current { name } else { renamed().unwrap_or(name) }

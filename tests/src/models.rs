@@ -180,6 +180,7 @@ impl TestModel {
             voxel_size: grasp::WORKSPACE_SIZE / self.resolution as f64,
             voxel_origin: grasp::VoxelOrigin::Corner,
             camera_azimuth: self.camera_azimuth,
+            former_name: None,
             network: None,
             provenance: BTreeMap::from([("data".to_owned(), "none".to_owned())]),
         };

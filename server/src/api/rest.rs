@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use ::grasp::on_a_line;
-use axum::body::Body;
+use axum::body::{Body, Bytes};
 use axum::extract::{Path, Request, State};
 use axum::http::header::{CONTENT_TYPE, ORIGIN, RETRY_AFTER};
 use axum::http::request::Parts;
@@ -277,7 +277,7 @@ async fn statistics(State(rest): State<Rest>, name: String, version: String) -> 
 
 /// Detects grasps in depth images.
 async fn detect(State(rest): State<Rest>, request: Request) -> Reply<Response> {
-    let (parts, deadline, message) = rest.receive(request, detect::request).await?;
+    let (parts, deadline, message) = rest.receive(request, |body| detect::request(body)).await?;
     let (_, reply, extensions) = rest.grasps.detect_grasps_from_depth(grpc(parts, message)).await?.into_parts();
     let bytes = rest.convert(deadline, move || detect::response(&reply)).await??;
     Ok(rest.reply(extensions, "application/json", bytes))
@@ -289,7 +289,7 @@ async fn infer(
     request: Request,
 ) -> Reply<Response> {
     let header_length = request.headers().get(HEADER_LENGTH).cloned();
-    let parse = move |body: &[u8]| InferRequest::parse(body, header_length.as_ref());
+    let parse = move |body: &Bytes| InferRequest::parse(body, header_length.as_ref());
     let (parts, deadline, parsed) = rest.receive(request, parse).await?;
     let (message, binary) = parsed.into_message(model, version);
     let (_, message, extensions) = rest.inference.model_infer(grpc(parts, message)).await?.into_parts();
@@ -306,7 +306,7 @@ impl Rest {
     async fn receive<T: Send + 'static>(
         &self,
         request: Request,
-        parse: impl FnOnce(&[u8]) -> Result<T, Status> + Send + 'static,
+        parse: impl FnOnce(&Bytes) -> Result<T, Status> + Send + 'static,
     ) -> Result<(Parts, Deadline, T), Status> {
         let (mut parts, body) = request.into_parts();
         let deadline = deadline::read(&parts.headers).unwrap_or_else(|| Deadline(Instant::now() + TIMEOUT));

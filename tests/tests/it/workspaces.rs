@@ -111,7 +111,10 @@ async fn cubes_that_margins_fill_are_refused_before_they_need_memory() {
     };
     for (size, margin) in [(0.1, 0.0), (0.02, 0.0), (0.2, 0.1)] {
         let message = refused(size, margin).await;
-        assert!(message.starts_with("workspace.extent: cubes with an edge of") && message.contains("options.margin"), "{message}");
+        assert!(
+            message.starts_with("workspace.extent: cubes with an edge of") && message.contains("options.margin"),
+            "{message}"
+        );
     }
     let message = refused(0.1001, 0.0).await;
     assert!(message.contains("which needs 400") && message.contains("at most 100"), "{message}");
