@@ -11,6 +11,7 @@ use crate::{Evaluator, Gpd, NetworkPlanner, Planner, Shaf};
 
 /// A planner of a model folder by name and version, before it is loaded.
 #[derive(Clone, Debug, PartialEq)]
+#[allow(clippy::large_enum_variant, reason = "a model folder has few of them")]
 pub enum ModelSpec {
     /// A network.
     Network(Entry),

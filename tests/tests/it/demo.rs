@@ -16,7 +16,7 @@ fn the_demo_detects_executes_and_draws_grasps_and_stops_its_server() {
     let output = command.arg("--picture").arg(&picture).output().unwrap();
     let (stdout, stderr) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert!(output.status.success(), "{stdout}{stderr}");
-    for expected in ["grasps from graspd", "latency: queue", "the best one, executed:", "graspd stopped cleanly"] {
+    for expected in ["grasps from vgn-refined", "latency: queue", "the best one, executed:", "graspd stopped cleanly"] {
         assert!(stdout.contains(expected), "`{expected}` is missing from:\n{stdout}");
     }
     assert!(fs::read(&picture).unwrap().starts_with(b"\x89PNG"));
