@@ -87,8 +87,10 @@ class Camera:
         text = Path(path).read_text()
         if Path(path).suffix == ".json":
             return cls.from_info(json.loads(text), rectified=rectified)
-        import yaml
-
+        try:
+            import yaml
+        except ImportError as error:
+            raise ImportError(f"{path}: reading YAML needs the package PyYAML") from error
         return cls.from_info(next(yaml.safe_load_all(text)), rectified=rectified)
 
     def check_size(self, width: int, height: int) -> None:

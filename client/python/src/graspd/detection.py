@@ -107,8 +107,8 @@ class GeometryWarning:
     detected all the same."""
 
     code: str
-    """One of NO_TABLE, TABLE_TILTED, TABLE_HEIGHT, MOSTLY_UNSEEN, VIEWS_DISAGREE, CAMERA_DISTANCE, CAMERA_ANGLE and
-    DEPTH_SCALE; the number of a code that only a newer server knows."""
+    """One of NO_TABLE, TABLE_TILTED, TABLE_HEIGHT, MOSTLY_UNSEEN, VIEWS_DISAGREE, CAMERA_DISTANCE, CAMERA_ANGLE, DEPTH_SCALE,
+    OBJECTS_LEFT_OUT and DEPTHS_CORRECTED; the number of a code that only a newer server knows."""
     message: str
     """What was found, and what to check."""
     figures: Mapping[str, float]
