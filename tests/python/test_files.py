@@ -138,6 +138,9 @@ class FilesTest(unittest.TestCase):
         self.assert_refused(self.detect("depth.png", "--labels", "mask.npy", "--objects", "1"), "[60, 160]", "120 × 160")
 
     def test_other_files_are_named(self):
+        whole = (self.folder / "channel.npy").read_bytes()
+        (self.folder / "cut.npy").write_bytes(whole[: len(whole) // 2])
+        self.assert_refused(self.detect("cut.npy"), "cut.npy: the file is cut short")
         files.pickled(self.folder / "dict.npy")
         self.assert_refused(self.detect("dict.npy"), "pickled", "save")
         for name, content in {"a.jpg": b"\xff\xd8\xff\xe0\0\x10JFIF", "a.h5": b"\x89HDF\r\n\x1a\n"}.items():

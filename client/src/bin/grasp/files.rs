@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{self, BufReader, Cursor, Read};
 use std::path::Path;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow, bail};
 use npyz::half::f16;
 use npyz::npz::{NpzArchive, file_name_from_array_name};
 use npyz::{Deserialize, NpyFile, Order, TypeChar};
@@ -58,9 +58,14 @@ impl Format {
     }
 }
 
-/// Adds the path to the error of `read`.
+/// Adds the path to the error of `read`, and says what it means that the file ends too early.
 pub(crate) fn in_file<T>(path: &Path, read: impl FnOnce(&Path) -> anyhow::Result<T>) -> anyhow::Result<T> {
-    read(path).with_context(|| path.display().to_string())
+    let is_cut_short = |error: &anyhow::Error| {
+        let of_reading = error.downcast_ref::<io::Error>().map(io::Error::kind);
+        error.chain().len() == 1 && of_reading == Some(io::ErrorKind::UnexpectedEof)
+    };
+    let read = read(path).map_err(|error| if is_cut_short(&error) { anyhow!("the file is cut short") } else { error });
+    read.with_context(|| path.display().to_string())
 }
 
 pub(crate) fn has_extension(path: &Path, wanted: &str) -> bool {
