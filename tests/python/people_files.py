@@ -14,6 +14,12 @@ K = scene.K
 DEPTH = scene.depth(CAMERA_FROM_TASK)
 MILLIMETRES = np.rint(DEPTH * 1000).astype(np.uint16)
 POINTS = (scene.rays() * DEPTH[..., None]).astype(np.float32)
+# Coefficients of distortion, by model.
+LENSES = {
+    "plumb_bob": [-0.25, 0.08, 0.001, -0.001, 0.0],
+    "rational_polynomial": [0.4, -0.1, 0.0005, 0.0005, 0.01, 0.7, -0.1, 0.02],
+    "equidistant": [0.02, -0.01, 0.003, -0.001],
+}
 ON_BLOCK = np.abs(DEPTH - scene.depth(CAMERA_FROM_TASK, with_block=False)) > 1e-3
 
 

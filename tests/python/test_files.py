@@ -87,12 +87,7 @@ class FilesTest(unittest.TestCase):
 
     def test_lenses(self):
         """The depth image of a lens with distortion gives the grasps of one without."""
-        lenses = {
-            "plumb_bob": [-0.25, 0.08, 0.001, -0.001, 0.0],
-            "rational_polynomial": [0.4, -0.1, 0.0005, 0.0005, 0.01, 0.7, -0.1, 0.02],
-            "equidistant": [0.02, -0.01, 0.003, -0.001],
-        }
-        for model, d in lenses.items():
+        for model, d in files.LENSES.items():
             with self.subTest(model):
                 np.save(self.folder / "seen.npy", files.distorted(d, model))
                 (self.folder / "lens.yaml").write_text(files.camera_info(d=d, model=model))

@@ -929,12 +929,7 @@ class CameraTest(ServerTest):
     INFO = {"width": scene.WIDTH, "height": scene.HEIGHT, "distortion_model": "plumb_bob", "k": scene.K.ravel().tolist()}
 
     def test_lenses_are_rectified(self):
-        lenses = {
-            "plumb_bob": [-0.25, 0.08, 0.001, -0.001, 0.0],
-            "rational_polynomial": [0.4, -0.1, 0.0005, 0.0005, 0.01, 0.7, -0.1, 0.02],
-            "equidistant": [0.02, -0.01, 0.003, -0.001],
-        }
-        for model, d in lenses.items():
+        for model, d in people_files.LENSES.items():
             with self.subTest(model):
                 info = types.SimpleNamespace(**self.INFO | {"d": d, "distortion_model": model})
                 seen = people_files.distorted(d, model)
