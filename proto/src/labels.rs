@@ -24,8 +24,8 @@ pub(crate) fn of_points(labels: &pb::Labels, count: usize) -> Result<Vec<u16>, R
         }
     };
     if labels.data.len() != count * size {
-        let (got, kind) = (labels.data.len() / size, labels.r#type().as_str_name());
-        let reason = format_args!("{got} labels ({kind}, {} bytes), must be {count}", labels.data.len());
+        let (got, kind) = (labels.data.len(), labels.r#type().as_str_name());
+        let reason = format_args!("{got} bytes; {count} labels need {} ({kind})", count * size);
         return Err(RequestError::refused("data", reason));
     }
     Ok(match size {
@@ -54,7 +54,7 @@ mod tests {
     #[test]
     fn invalid_labels_are_named() {
         let refused = |labels: &pb::Labels| of_image(labels, 3, 2).unwrap_err().to_string();
-        assert_eq!(refused(&labels(&[0; 5], pb::LabelType::U8)), "data: 5 labels (LABEL_TYPE_U8, 5 bytes), must be 6");
+        assert_eq!(refused(&labels(&[0; 5], pb::LabelType::U8)), "data: 5 bytes; 6 labels need 6 (LABEL_TYPE_U8)");
         assert_eq!(
             refused(&labels(&[0; 6], pb::LabelType::Unspecified)),
             "type is 0, must be LABEL_TYPE_U8 (1), LABEL_TYPE_U16 (2) or LABEL_TYPE_PNG (3)"

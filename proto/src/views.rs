@@ -267,7 +267,7 @@ mod tests {
         assert_eq!(converted.labels, Some((0..12).collect()));
         assert_eq!(
             refused(|view| view.labels = labels(vec![1; 11])),
-            "views[1].labels.data: 11 labels (LABEL_TYPE_U8, 11 bytes), must be 12"
+            "views[1].labels.data: 11 bytes; 12 labels need 12 (LABEL_TYPE_U8)"
         );
     }
 

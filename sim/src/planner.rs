@@ -111,7 +111,7 @@ impl FromStr for PlannerSpec {
 
     /// A file is a path with the extension `.onnx`. Other texts are names of the models that come with graspd.
     fn from_str(text: &str) -> Result<Self, String> {
-        let is_file = |text: &str| text.ends_with(".onnx") || Path::new(text).exists();
+        let is_file = |text: &str| text.ends_with(".onnx") || Path::new(text).is_file();
         Ok(match text.split_once(':') {
             _ if text == "random" => Self::Random,
             _ if text == "shaf" => Self::Highest,
