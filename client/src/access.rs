@@ -8,8 +8,8 @@ use tonic::service::Interceptor;
 use tonic::transport::{Certificate, ClientTlsConfig, Identity};
 use tonic::{Code, Request, Status, TimeoutExpired};
 
-/// TLS, authentication, retries and time limit of a connection. The default is no TLS, no token, a single attempt and no
-/// time limit.
+/// TLS, authentication, retries and time limit of a connection. The default is no TLS, no token, a single attempt and
+/// no time limit.
 ///
 /// TLS is used when the address begins with `https://`, or when a CA or an identity is set.
 #[derive(Clone, Default)]
@@ -23,7 +23,7 @@ pub struct Access {
     /// When failed calls are retried.
     pub retry: Retry,
     /// Time limit of each attempt of a call whose options have none. It is sent to the server as the deadline. It does
-    /// not apply to streams and tracking. `None`: no limit.
+    /// not apply to streams or tracking. `None`: no limit.
     pub timeout: Option<Duration>,
 }
 

@@ -52,7 +52,7 @@ pub struct Client {
 pub enum Health {
     /// Ready for requests.
     Serving,
-    /// Warming up or shutting down.
+    /// Warming up or shutting down, or all sessions of a model hang or fail.
     NotServing,
 }
 
@@ -147,8 +147,8 @@ impl Client {
         .try_into()
     }
 
-    /// Detects grasps in depth images. The server fuses them into the cube `workspace`. Transient failures are retried
-    /// according to [`Retry`].
+    /// Detects grasps in depth images. The server fuses them into `workspace`. Transient failures are retried according
+    /// to [`Retry`].
     ///
     /// # Errors
     /// [`Error::Refused`] with the status of the last attempt; [`Error::Reply`] for an invalid reply.
@@ -169,8 +169,8 @@ impl Client {
         .try_into()
     }
 
-    /// Detects grasps in point clouds, one per camera. The server fuses them into the cube `workspace`. Transient
-    /// failures are retried according to [`Retry`].
+    /// Detects grasps in point clouds, one per camera. The server fuses them into `workspace`. Transient failures are
+    /// retried according to [`Retry`].
     ///
     /// # Errors
     /// [`Error::Refused`] with the status of the last attempt; [`Error::Reply`] for an invalid reply.
@@ -191,9 +191,9 @@ impl Client {
         .try_into()
     }
 
-    /// Scores the caller's grasps in an observation: `candidates` are `T_frame_grasp`, in the convention of the options.
-    /// Their widths are unknown; [`score_candidates`](Self::score_candidates) takes widths, too. Transient failures are
-    /// retried according to [`Retry`].
+    /// Scores the caller's grasps in an observation: `candidates` are `T_frame_grasp`, in the convention of the
+    /// options. Their widths are unknown; [`score_candidates`](Self::score_candidates) takes widths, too. Transient
+    /// failures are retried according to [`Retry`].
     ///
     /// # Errors
     /// [`Error::Refused`] with the status of the last attempt.
@@ -228,11 +228,11 @@ impl Client {
         Ok(response.await?.into())
     }
 
-    /// Finds the table in a view, and the workspace over what stands on it. Of `workspace` only the size, the extent and
-    /// the gravity of `find_table` are used; of `options` only `request_id`, `frame_id`, `stamp` and `timeout`.
-    /// `table_height` is the height of the table above the bottom of the workspace, metres, from 0 to 0.3; `None`: 0.05.
-    /// A depth image needs [`Extrinsics::FrameFromCamera`](crate::Extrinsics::FrameFromCamera). Transient failures are
-    /// retried according to [`Retry`].
+    /// Finds the table in a view, and the workspace over what stands on it. Of `workspace` only the size, the extent
+    /// and the gravity of `find_table` are used; of `options` only `request_id`, `frame_id`, `stamp` and `timeout`.
+    /// `table_height` is the height of the table above the bottom of the workspace, metres, from 0 to 0.3; `None`:
+    /// 0.05. A depth image needs [`Extrinsics::FrameFromCamera`](crate::Extrinsics::FrameFromCamera). Transient
+    /// failures are retried according to [`Retry`].
     ///
     /// # Errors
     /// [`Error::Refused`] with the status of the last attempt, also if the view shows no table; [`Error::Reply`] for an
@@ -424,11 +424,13 @@ pub struct Tracking {
 }
 
 impl Tracking {
-    /// Adds views to the volume and detects grasps in everything observed so far. Calls are not retried. If the returned
-    /// future is dropped before it is ready, the views may have been added, and the next call waits for both replies.
+    /// Adds views to the volume and detects grasps in everything observed so far. Calls are not retried. If the
+    /// returned future is dropped before it is ready, the views may have been added, and the next call waits for both
+    /// replies.
     ///
     /// # Errors
-    /// [`Error::Refused`]. An invalid view does not end the tracking. If [`Error::views_added`], retry without the views.
+    /// [`Error::Refused`]. An invalid view does not end the tracking. If [`Error::views_added`], retry without the
+    /// views.
     pub async fn add(&mut self, views: &[DepthView], options: Options) -> Result<Detection, Error> {
         while self.unanswered > 0 {
             // The result of a cancelled call.
@@ -457,7 +459,7 @@ impl Tracking {
     }
 }
 
-/// The status of an attempt whose time limit has passed. It has no source, so that it is not retried.
+/// The status of an attempt whose time limit has passed. It has no source, so it is not retried.
 fn expired(limit: Duration) -> Status {
     Status::deadline_exceeded(format!("no reply within {limit:?}; raise the time limit, or check the server's load"))
 }

@@ -111,8 +111,8 @@ impl From<Isometry3<f64>> for Candidate {
     }
 }
 
-/// The cube that views are fused into and in which grasps are detected, or the part of a table that is covered with such
-/// cubes.
+/// The cube that views are fused into and in which grasps are detected, or the part of a table that is covered with
+/// such cubes.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Workspace {
     /// `T_frame_task`: pose of the task frame (origin at a corner of the cube, z up) in the frame `frame_id`.
@@ -123,16 +123,16 @@ pub struct Workspace {
     pub extent: Option<[f64; 2]>,
     /// Find the table in the first depth image or point cloud instead of using `pose`.
     pub find_table: Option<FindTable>,
-    /// Multiply the depths of each view by one factor, so that the table is at its height. `None`: in depth images whose
-    /// table is level and at most 3 cm from its height. `Some(true)` is an error with `find_table`.
+    /// Multiply the depths of each view by one factor, so that the table is at its height. `None`: in depth images
+    /// whose table is level and at most 3 cm from its height. `Some(true)` is an error with `find_table`.
     pub correct_depth_scale: Option<bool>,
 }
 
 /// A search for the table in an observation: the workspace is placed over what stands on it.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct FindTable {
-    /// Direction of gravity in the frame `frame_id`, of any length above 0. `None`: unknown; a wall that fills the image
-    /// is then taken for a table.
+    /// Direction of gravity in the frame `frame_id`, of any length above 0. `None`: unknown; a wall that fills the
+    /// image is then taken for a table.
     pub gravity: Option<[f64; 3]>,
 }
 

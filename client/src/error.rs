@@ -85,8 +85,8 @@ impl Error {
         }
     }
 
-    /// Whether the views of a request of [`Tracking`](crate::Tracking) are in the volume although it was refused: repeat the
-    /// request without them.
+    /// Whether the views of a request of [`Tracking`](crate::Tracking) are in the volume although it was refused:
+    /// repeat the request without them.
     #[must_use]
     pub fn views_added(&self) -> bool {
         matches!(self, Self::Refused { views_added: true, .. })
@@ -121,7 +121,7 @@ const CONNECTION_ERRORS: [(&str, &str); 4] = [
     ("NotValidForName", "its certificate is for another name: use that name in the address, or another certificate"),
 ];
 
-/// Messages of calls to something that is not gRPC, by the transport.
+/// The transport's messages for calls to something that is not gRPC.
 const NOT_GRPC: [&str; 2] = ["transport error", "h2 protocol error: http2 error"];
 
 impl From<Status> for Error {

@@ -74,7 +74,7 @@ impl LocalServer {
     /// Blocks until the server is ready.
     ///
     /// # Errors
-    /// [`LocalServerError`] when the process exits before.
+    /// [`LocalServerError`] when the process exits before it is ready.
     pub fn wait_ready(&mut self) -> Result<(), LocalServerError> {
         loop {
             let line = self.read_line()?;

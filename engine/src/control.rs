@@ -32,7 +32,7 @@ pub(crate) struct Command {
     pub done: oneshot::Sender<Result<(), RequestError>>,
 }
 
-/// Most requests that wait until the one before them is done.
+/// Maximum number of requests that wait for the one before them.
 const WAITING: usize = 8;
 
 /// Retry hint if too many requests wait: loading and warming up a model takes seconds.

@@ -61,7 +61,7 @@ pub struct Score {
 pub enum Violation {
     /// The quality is below the threshold.
     Quality,
-    /// The hand does not open as wide.
+    /// The hand does not open that wide.
     Width,
     /// Outside of the volume, the workspace or the region.
     Region,
@@ -147,7 +147,8 @@ impl Detection {
             merged.volumes.extend(volumes);
         }
         all.sort_by(|(_, a), (_, b)| b.grasp.quality.total_cmp(&a.grasp.quality));
-        // Each cube without a grasp above the threshold gives its best one, with `force`.
+        // With `force`, each cube without a grasp above the threshold returns its best one. One of these is kept, if
+        // there is no other grasp.
         let is_forced = |(_, detected): &(usize, Detected)| detected.grasp.quality < threshold;
         let forced = all.iter().position(is_forced).map_or(0, |first| all.len() - first.max(1));
         all.truncate(all.len() - forced);

@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use grasp::Priority;
 
-/// Waiting jobs. Callers are served in turn, and the jobs of a caller in their order; jobs with batch
-/// priority are served when no normal one waits, and now and then before one.
+/// Waiting jobs. Callers are served in turn, and the jobs of a caller in their order; jobs with batch priority are
+/// served when no normal job waits, or after [`OVERTAKING`] normal ones.
 pub(crate) struct FairQueue<T> {
     /// The callers with waiting jobs, in the order in which they are served: with normal and with batch priority.
     of_class: [VecDeque<CallerQueue<T>>; 2],
@@ -29,8 +29,8 @@ struct Waiting<T> {
 }
 
 impl<T> Waiting<T> {
-    /// When a batch with this job must start if it waits at most `delay` for further jobs: not later than halfway to the
-    /// job's deadline.
+    /// When a batch with this job must start if it waits at most `delay` for further jobs: not later than halfway to
+    /// the job's deadline.
     fn start_by(&self, delay: Duration) -> Instant {
         let half = self.deadline.map(|deadline| deadline.saturating_duration_since(self.since) / 2);
         self.since + half.map_or(delay, |half| half.min(delay))
@@ -42,13 +42,13 @@ impl<T> Waiting<T> {
 pub enum Caller {
     /// SHA-256 of the access token.
     Token([u8; 32]),
-    /// The address of the client; of IPv6 the network of 64 bits, because a client can use all of its addresses.
+    /// The address of the client; for IPv6 its /64 network, because a client can use all addresses in it.
     Address(IpAddr),
     /// Neither is known.
     Unknown,
 }
 
-/// Who sent a request, and when it has to be done.
+/// Who sent a request, and when it must be answered.
 #[derive(Clone, Copy, Debug)]
 pub struct RequestMetadata {
     /// The sender.
@@ -119,7 +119,7 @@ impl<T> FairQueue<T> {
         longest(class).filter(|(length, _)| *length >= own + 2).and_then(|(_, index)| self.newest(class, index))
     }
 
-    /// Whether `count` new jobs of a caller, after `before` that need no place of another, can all [displace
+    /// Whether `count` new jobs of a caller, which follow `before` new ones that found free places, can all [displace
     /// one](Self::displaced_by).
     pub fn can_displace(&self, request: RequestMetadata, before: usize, count: usize) -> bool {
         let class = request.priority as usize;

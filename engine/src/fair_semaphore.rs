@@ -10,8 +10,8 @@ use crate::model::Model;
 use crate::observer::Refusal;
 use crate::scheduler::{Refused, Scheduler, Service};
 
-/// A semaphore whose waiting requests get the permits in the order of a `Scheduler`, for work on the CPU that needs much
-/// memory: the conversion of a request and the fusion of its views. A bounded number of requests wait.
+/// A semaphore whose waiting requests get the permits in the order of a `Scheduler`, for work on the CPU that needs
+/// much memory: the conversion of a request and the fusion of its views. A bounded number of requests wait.
 #[derive(Clone)]
 pub struct FairSemaphore(Arc<Scheduler<oneshot::Sender<Permit>>>);
 
@@ -62,7 +62,7 @@ impl FairSemaphore {
     fn pass_on(&self) {
         while let Some(next) = self.0.try_take() {
             if let Err(mut permit) = next.send(Permit(Some(self.clone()))) {
-                // The request has been cancelled. Freed here and not when it is dropped, which would recurse.
+                // The request has been cancelled. Freed here: freeing it on drop would recurse.
                 permit.0 = None;
                 self.0.free();
             }

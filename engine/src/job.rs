@@ -20,7 +20,7 @@ pub struct SessionOutput<T> {
     pub queue: Duration,
     /// Time of the network.
     pub inference: Duration,
-    /// None for models without an evaluator.
+    /// Time of the evaluator; None for models without one.
     pub evaluation: Option<Duration>,
     /// Time of the decoding.
     pub postprocessing: Duration,

@@ -1,8 +1,8 @@
-//! The engine: serves the planners of a model folder. It knows neither gRPC nor Prometheus: errors are
+//! The engine: serves the planners of a model folder. It is independent of gRPC and Prometheus: errors are
 //! [`RequestError`](grasp::RequestError)s, and what is counted goes to an [`Observer`].
 //!
-//! A request becomes one scene per cube. [`Model::detect`] puts the scenes into the model's queue; a session thread takes
-//! batches from it, runs the planner, and sends each result to its [`Reply`].
+//! A request becomes one scene per cube. [`Model::detect`] puts the scenes into the model's queue; a session thread
+//! takes batches from it, runs the planner, and sends each result to its [`Reply`].
 
 #![warn(missing_docs)]
 

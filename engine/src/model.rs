@@ -67,7 +67,8 @@ impl Model {
         let started = Instant::now();
         let (planners, backend) = spec.load(&options, sessions)?;
         let observer = observer.model(&label);
-        // Created before the threads, so that an early return drops it, which closes the queue and ends started threads.
+        // Created before the threads, so that an early return drops it, which closes the queue and ends started
+        // threads.
         let model = Self {
             input: spec.input(),
             spec,
@@ -133,7 +134,7 @@ impl Model {
         self.push(scenes, |sender| Task::Grasps(Arc::clone(params), sender), request, span)
     }
 
-    /// Queues the scenes of a request, whose candidates are to be scored, as [`detect`](Self::detect).
+    /// Queues the scenes of a request whose candidates are to be scored, like [`detect`](Self::detect).
     ///
     /// # Errors
     /// [`RequestError`] if the queue is full, or the reply would be too late.
@@ -149,7 +150,7 @@ impl Model {
         self.push(scenes, task, request, span)
     }
 
-    /// Queues the volumes of a request for the network's raw output, as [`detect`](Self::detect).
+    /// Queues the volumes of a request for the network's raw output, like [`detect`](Self::detect).
     ///
     /// # Errors
     /// [`RequestError`] if the queue is full, or the reply would be too late.
@@ -294,12 +295,13 @@ impl Model {
         match refusal {
             Refusal::Full | Refusal::Deadline => self.overloaded(reason),
             Refusal::Displaced => self.overloaded(&format!(
-                "{reason}, and this request was displaced by one with a higher priority, or of a caller with fewer requests"
+                "{reason}, and this request was displaced by one with a higher priority, or from a caller with fewer \
+                 requests"
             )),
         }
     }
 
-    /// An error with a hint when to retry.
+    /// An error with a retry hint.
     #[must_use]
     pub fn overloaded(&self, reason: &str) -> RequestError {
         let pace = self.service_time.get().mean / u32::try_from(self.sessions).unwrap_or(u32::MAX);

@@ -83,7 +83,8 @@ impl Loads {
 }
 
 impl ModelFolder {
-    /// The folder, and what clients change its models with. No model is loaded once `stopping` is cancelled.
+    /// The folder, and the control with which clients change its models. No model is loaded once `stopping` is
+    /// cancelled.
     pub fn new(
         settings: FolderSettings,
         models: Arc<ModelRegistry>,
@@ -108,7 +109,7 @@ impl ModelFolder {
         (folder, control)
     }
 
-    /// The models that are being loaded.
+    /// A handle that waits for models that are being loaded.
     pub fn loads(&self) -> Loads {
         self.loads.clone()
     }
@@ -206,7 +207,7 @@ impl ModelFolder {
         }
     }
 
-    /// Notes which model a client has unloaded or loaded. Answers the command and returns None if it is refused.
+    /// Records which model a client has unloaded or loaded. Answers the command and returns None if it is refused.
     fn begin(&self, mut command: Command) -> Option<Command> {
         let Command { name, change, was_unloaded, .. } = &mut command;
         let name = &*name;
@@ -352,7 +353,7 @@ impl ModelFolder {
             warn!("a reload ended after a later one had begun; it changes nothing");
             return self.observer.reloaded(Reload::Superseded);
         }
-        // If an unloading has been answered with an error meanwhile, the model remains served.
+        // If the request to unload a model has been answered with an error meanwhile, the model remains served.
         let still_unloaded = self.unloaded().clone();
         let is_kept = |model: &&Arc<Model>| {
             let is_rejected = model.spec.path().is_some_and(|path| rejected.iter().any(|rejected| rejected == path));
@@ -414,7 +415,7 @@ fn not_changed(reason: impl Into<String>) -> RequestError {
     RequestError::new(Code::FailedPrecondition, reason)
 }
 
-/// The name of a default model, and the setting that it is from.
+/// The name of a default model, and the setting that it comes from.
 struct DefaultName {
     name: String,
     setting: &'static str,

@@ -15,7 +15,7 @@ pub struct ModelRegistry {
 /// A model of the folder that is not served.
 #[derive(Clone, Debug)]
 pub struct Unavailable {
-    /// The file's name, if the file cannot be read.
+    /// Name of the model, or of its file if the name of the model is not known.
     pub name: String,
     /// Why it is not served.
     pub reason: String,
@@ -52,20 +52,21 @@ impl ModelRegistry {
         *self.unavailable.write().unwrap_or_else(PoisonError::into_inner) = models;
     }
 
-    /// The error for a model that is not served; `field` of the request has its name.
+    /// The error for a model that is not served; `field` of the request names it.
     #[must_use]
     pub fn unknown(&self, field: &'static str, requested: &str) -> RequestError {
         let served = self.now();
         unknown_of(field, requested, &describe(&served.iter().collect::<Vec<_>>(), |model| model.label.clone()))
     }
 
-    /// The name of the model that is called `name`, or was called so before it was renamed.
+    /// The present name of the model whose name is `name`, or was before it was renamed.
     #[must_use]
     pub fn current_name<'a>(served: &'a [Arc<Model>], name: &'a str) -> &'a str {
         ModelSpec::current_name(served.iter().map(|model| &model.spec), name)
     }
 
-    /// The network with this name, which `field` of the request has, and version. Planners without a network are not found.
+    /// The network with this name and version; `field` of the request has the name. Planners without a network are not
+    /// found.
     ///
     /// # Errors
     /// [`RequestError`] with the available ones.
@@ -123,7 +124,7 @@ impl ModelRegistry {
     }
 }
 
-/// The error for a model that is not served; `field` has its name.
+/// The error for a model that is not served; `field` names it.
 fn unknown_of(field: &'static str, requested: &str, available: &str) -> RequestError {
     let message = format!("{field}: `{}` not found; available: {available}", on_a_line(requested));
     RequestError { field: Some(field.into()), ..RequestError::new(Code::NotFound, message) }

@@ -8,7 +8,7 @@ pub(crate) struct RetryHints {
     last: Mutex<Option<Instant>>,
 }
 
-/// Shortest hint: its unit.
+/// Shortest hint, and the unit of hints.
 const SHORTEST: Duration = Duration::from_millis(1);
 
 /// Distance between two retries, relative to the time between two free places: some requests come from other callers.

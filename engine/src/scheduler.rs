@@ -8,8 +8,8 @@ use crate::observer::ModelObserver;
 
 /// A bounded queue of jobs for the sessions of a model, or of requests for the permits of a
 /// [`FairSemaphore`](crate::FairSemaphore). Callers are served in turn, and the jobs of a caller in their order. If the
-/// queue is full, a job of a caller with few jobs displaces the newest job of the caller with the most. Jobs that cannot be
-/// done before their deadline are refused.
+/// queue is full, a job of a caller with few jobs displaces the newest job of the caller with the most. Jobs that
+/// cannot be done before their deadline are refused.
 pub(crate) struct Scheduler<T> {
     state: Mutex<State<T>>,
     /// Signals a new job or the closing of the queue.
@@ -65,7 +65,7 @@ pub(crate) struct Service {
 pub(crate) enum Refused {
     /// There are not enough places for all jobs of the request.
     Full,
-    /// The job would be done only after its deadline: the estimated time until then.
+    /// The job would be done only after its deadline: the estimated time until it is done.
     TooLate(Duration),
 }
 
@@ -82,8 +82,9 @@ impl<T> Scheduler<T> {
         }
     }
 
-    /// Appends the jobs of a request, or refuses all of them immediately. `service` is the expected time of one job. The
-    /// second value are the jobs that the new ones displace. Must not be called after [`close`](Self::close).
+    /// Appends the jobs of a request, or refuses all of them immediately. `service` is the expected time of one job.
+    /// The second value is the list of the jobs that the new ones displace. Must not be called after
+    /// [`close`](Self::close).
     pub fn push(
         self: &Arc<Self>,
         jobs: Vec<T>,
@@ -118,7 +119,7 @@ impl<T> Scheduler<T> {
 
     /// Whether there are places for all jobs of a request, and time.
     fn admit(&self, state: &State<T>, jobs: usize, request: RequestMetadata, service: Service) -> Result<(), Refused> {
-        // An idle server accepts every job, so that its expectation cannot become wrong for ever.
+        // An idle server accepts every job, so that a wrong estimate is corrected by new measurements.
         if let Some(deadline) = request.deadline
             && state.free == 0
         {

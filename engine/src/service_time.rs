@@ -9,7 +9,7 @@ pub(crate) struct ServiceTime(Mutex<Times>);
 struct Times {
     /// The time of a batch divided by its number of scenes: how fast the queue advances.
     scene: Mean,
-    /// How long a scene takes, because it is done with its batch.
+    /// How long a scene takes: it is done when its batch is.
     batch: Mean,
 }
 
@@ -21,7 +21,7 @@ struct Mean {
     values: f64,
 }
 
-/// Number of values that the mean of the service time remembers.
+/// The means are over about this many of the latest values.
 const MEMORY: f64 = 8.0;
 
 impl Mean {
@@ -29,7 +29,7 @@ impl Mean {
     fn add(&mut self, seconds: f64) {
         self.values = (self.values + 1.0).min(MEMORY);
         let difference = seconds - self.seconds;
-        // The difference from the initial value is no deviation.
+        // The difference from the initial value is not a deviation.
         if self.values > 1.0 {
             self.deviation += (difference.abs() - self.deviation) / self.values;
         }
@@ -57,8 +57,8 @@ impl ServiceTime {
         times.batch.add(duration.as_secs_f64());
     }
 
-    /// The mean is at least one millisecond, the unit of the retry hint. Two mean deviations above that of a batch are,
-    /// for a normal distribution, exceeded by one in twenty.
+    /// The mean is at least one millisecond, the unit of the retry hint. For a normal distribution, one batch in twenty
+    /// takes longer than the mean plus two mean deviations.
     pub fn get(&self) -> Service {
         let Times { scene, batch } = *self.times();
         let mean = Duration::from_secs_f64(scene.seconds).max(Duration::from_millis(1));

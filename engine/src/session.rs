@@ -29,7 +29,7 @@ pub(crate) struct Session {
     pub statistics: Arc<Statistics>,
     pub health: Arc<SessionHealth>,
     pub service_time: Arc<ServiceTime>,
-    /// For the time of one volume in the warm-up.
+    /// Receives the time of one volume in the warm-up.
     pub warmed_up: mpsc::SyncSender<Result<Duration, RequestError>>,
 }
 
@@ -52,7 +52,8 @@ struct Batch<'a> {
 
 impl Batch<'_> {
     /// Counts the time of the batch although its result is not sent, if it is longer than expected: otherwise the
-    /// expectation would not change if all jobs of the batches expire. The time of an inference that hung is not typical.
+    /// expected time would never grow if all jobs expire. The time of an inference that hung is not counted, because it
+    /// is not typical.
     fn note_delay(&self) {
         let time = self.taken.elapsed();
         if time > self.service_time.get().long && !self.health.is_hanging() {
@@ -60,7 +61,7 @@ impl Batch<'_> {
         }
     }
 
-    /// Counts the outcome of a scene. That of a request that has expired is not the session's.
+    /// Counts the outcome of a scene. Requests that expired are not counted: the session did not fail.
     fn note_outcome(&mut self, error: Option<&RequestError>) {
         match error {
             None => self.succeeded = Some(true),
@@ -86,8 +87,8 @@ impl Drop for Batch<'_> {
 }
 
 impl Session {
-    /// Warms the planner up, and serves the queue until it is closed. Both on this thread, because a CUDA graph belongs to
-    /// the thread that has recorded it.
+    /// Warms the planner up, and serves the queue until it is closed. Both on this thread, because a CUDA graph belongs
+    /// to the thread that has recorded it.
     pub fn run(mut self) {
         let warmed_up = match &mut self.planner {
             Loaded::Network(network) => warm_up(network, self.batching.max),
@@ -103,7 +104,7 @@ impl Session {
         let batching = if matches!(self.planner, Loaded::Single(_)) { single } else { self.batching };
         while let Some(mut jobs) = self.scheduler.take(batching) {
             let now = Instant::now();
-            // While others wait, a job that would end after its deadline is dropped before its inference.
+            // While other jobs wait, a job that would end after its deadline is dropped before its inference.
             let long = self.service_time.get().long;
             let until = if self.scheduler.waiting() > 0 { now + long } else { now };
             let expired = |job: &mut Job| job.deadline.is_some_and(|deadline| deadline <= until);
@@ -229,7 +230,7 @@ fn plan(planner: &mut dyn Planner, defaults: DecodeParams, job: Job, mut batch: 
 }
 
 /// Ends the post-processing, which began at `started` and contains the evaluation, and sends its result. The job's part
-/// of the span ends before: otherwise a server that stops after the reply could lose the span.
+/// of the span ends before that: otherwise a server that stops after the reply could lose the span.
 fn send_result<T: Send + 'static>(
     reply: Sender<T>,
     span: Span,

@@ -14,13 +14,13 @@ pub(crate) struct SessionHealth {
     batch: Mutex<Option<Batch>>,
     /// When the latest batch ended, milliseconds since 1970.
     latest: AtomicU64,
-    /// Number of the latest batches that failed, one after another.
+    /// Number of the latest batches that failed in a row.
     failures: AtomicU32,
     /// Counts the model's sessions that hang.
     observer: Arc<dyn ModelObserver>,
 }
 
-/// Failed batches, one after another, after which a session counts as failing: fewer may be due to their scenes.
+/// Number of failed batches in a row after which a session counts as failing: fewer may be due to their scenes.
 const FAILURES: u32 = 10;
 
 struct Batch {

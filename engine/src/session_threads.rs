@@ -14,7 +14,7 @@ use crate::scheduler::Scheduler;
 use crate::session::Session;
 use crate::session_health::SessionHealth;
 
-/// The session threads of all models, also of those that are no longer served.
+/// The session threads of all models, including those that are no longer served.
 #[derive(Default)]
 pub struct SessionThreads(Mutex<Vec<SessionThread>>);
 
@@ -44,8 +44,8 @@ impl SessionThreads {
         Ok(())
     }
 
-    /// Watches the sessions, without end. An inference that takes longer than `timeout` hangs. `healthy` receives what
-    /// `is_healthy` returns: whether each served model has a session that neither hangs nor fails.
+    /// Watches the sessions; never returns. An inference that takes longer than `timeout` hangs. `healthy` receives
+    /// what `is_healthy` returns: whether each served model has a session that neither hangs nor fails.
     pub async fn watch(
         self: Arc<Self>,
         is_healthy: impl Fn() -> bool,

@@ -36,7 +36,7 @@ impl StageTimings {
     }
 }
 
-/// Numbers and durations of a model's requests since it is served.
+/// Numbers and durations of a model's requests since it has been served.
 #[derive(Debug, Default)]
 pub struct Statistics {
     succeeded: AtomicU64,

@@ -1,7 +1,8 @@
 use grasp::DepthImage;
 use nalgebra::{Isometry3, Matrix2, Point3, Vector2, Vector3};
 
-/// Factors that are searched. The benchmark's noise has a standard deviation of 3.2 %, so three of it are within.
+/// Factors that are searched. The benchmark's noise has a standard deviation of 3.2 %, so the range covers three
+/// standard deviations.
 const RANGE: [f64; 2] = [0.9, 1.1];
 
 /// Bins of the histogram over [`RANGE`]: 0.2 % each.
@@ -10,10 +11,10 @@ const BINS: usize = 100;
 /// The histogram is summed over this many bins on either side: the noise of a camera spreads a plane over about 1 %.
 const SPREAD: usize = 2;
 
-/// The factor is the mean of those within this distance of it.
+/// The factor is the mean of the measured factors within this distance of it.
 const NEAR: f64 = 0.01;
 
-/// Points this near to the factor are those of the table, with its tilt.
+/// Points whose factor is this near to that of the table belong to the table, even if it is tilted.
 const NEAR_PLANE: f64 = 0.025;
 
 /// Share of the largest peak from which a smaller factor is preferred: nothing lies below the table, and the tops of
@@ -24,38 +25,39 @@ const PREFERRED: f64 = 0.3;
 const SMALLEST_SHARE: f64 = 0.05;
 const SMALLEST_COUNT: usize = 50;
 
-/// How far beyond the workspace the table is searched, metres: objects hide much of it within.
+/// How far beyond the workspace the table is searched for, metres: objects hide much of it inside the workspace.
 const AROUND: f64 = 0.15;
 
-/// Pixels of an image that are used, about.
+/// About this many pixels of an image are used.
 const PIXELS: usize = 20_000;
 
 /// Whether to correct the scale of the depths of a request, so that the table is at its height.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum DepthScale {
-    /// Of each depth image whose table is level and at most 3 cm above or below its height. Without a table nothing is
-    /// corrected.
+    /// Corrects each depth image whose table is level and at most 3 cm above or below its height. Without a table
+    /// nothing is corrected.
     #[default]
     Auto,
-    /// Of each depth image and point cloud whose table is within 10 % of its distance.
+    /// Corrects each depth image and point cloud whose table is within 10 % of its distance.
     Correct,
-    /// Of none.
+    /// Corrects nothing.
     Keep,
 }
 
-/// Changes of the scale that are left out in [`DepthScale::Auto`]: 1.5 mm at 0.6 m, less than a measurement's noise.
+/// Smaller changes of the scale are not applied in [`DepthScale::Auto`]: 1.5 mm at 0.6 m, less than a measurement's
+/// noise.
 const NEGLIGIBLE: f64 = 0.0025;
 
-/// Largest distance of the table from its height in [`DepthScale::Auto`], metres. A table farther away is more likely at
-/// another height than the caller said.
+/// Largest distance of the table from its height in [`DepthScale::Auto`], metres. A larger distance more likely means
+/// that the table is at another height than the caller gave.
 const LARGEST_SHIFT: f64 = 0.03;
 
-/// Largest tilt of the table in [`DepthScale::Auto`], radians: 1.5°. A larger one is an error of the camera's pose or of its
-/// intrinsics, and so is its height.
+/// Largest tilt of the table in [`DepthScale::Auto`], radians: 1.5°. A larger one is an error of the camera's pose or
+/// of its intrinsics, and so is its height.
 const LARGEST_TILT: f64 = 1.5 * std::f64::consts::PI / 180.0;
 
-/// The [`image_depth_factor`] for [`DepthScale::Auto`]: 1 if the change is negligible, `None` if the error is none of
-/// the scale.
+/// The [`image_depth_factor`] for [`DepthScale::Auto`]: 1 if the change is negligible, `None` if the error is not one
+/// of scale.
 #[must_use]
 pub fn plausible_depth_factor(
     image: &DepthImage,
@@ -82,7 +84,8 @@ pub fn measured_shift(factor: f64, eye: &Point3<f64>, table: f64) -> f64 {
     (eye.z - table) * (1.0 - 1.0 / factor)
 }
 
-/// The angle between the z axis and the plane that fits points best along z, radians; `None` if the points lie on a line.
+/// The angle between the z axis and the plane that fits points best along z, radians; `None` if the points lie on a
+/// line.
 fn tilt(points: impl Iterator<Item = Point3<f64>>) -> Option<f64> {
     let points: Vec<_> = points.collect();
     let mean = points.iter().map(|point| point.coords).sum::<Vector3<f64>>() / points.len() as f64;
@@ -96,7 +99,8 @@ fn tilt(points: impl Iterator<Item = Point3<f64>>) -> Option<f64> {
     Some(slope.norm().atan())
 }
 
-/// The [`depth_factor`] of an image. `camera_from_task` is `T_camera_task`; `table` and `extent` as there.
+/// The [`depth_factor`] of an image. `camera_from_task` is `T_camera_task`; `table` and `extent` are as in that
+/// function.
 #[must_use]
 pub fn image_depth_factor(
     image: &DepthImage,
@@ -108,9 +112,9 @@ pub fn image_depth_factor(
     depth_factor(sampled(image, camera_from_task), &eye, table, extent)
 }
 
-/// Points of an image, task frame.
+/// Points of an image in the task frame.
 fn sampled(image: &DepthImage, camera_from_task: &Isometry3<f64>) -> impl Iterator<Item = Point3<f64>> {
-    // Odd, so that the pixels are not in few columns.
+    // Odd, so that the samples are spread over all columns.
     let every = (image.depth().len() / PIXELS) | 1;
     image.points_of_every(every, camera_from_task).map(|point| point.position)
 }
@@ -140,7 +144,7 @@ pub fn depth_factor(
     });
     let factors: Vec<f64> = factors.collect();
     let mut factor = lowest_peak(&factors)?;
-    // The mean of the values near a mean moves to where they are densest.
+    // Mean shift: the mean of the values near it moves to where they are densest.
     for _ in 0..5 {
         let near = factors.iter().filter(|value| (*value - factor).abs() <= NEAR);
         let (sum, count) = near.fold((0.0, 0), |(sum, count), value| (sum + value, count + 1));
@@ -203,7 +207,7 @@ mod tests {
                         && (-1e-9..=size.z + 1e-9).contains(&(p.z - table))
                 };
                 let t = [top, front].into_iter().filter(|t| is_on(*t)).fold(1.0, f64::min);
-                // Sines of the index, as a noise that is always the same; their sum is about normal.
+                // Deterministic noise: sines of the index, whose sum is about normally distributed.
                 let sines = [12.9898, 78.233, 37.719].map(|frequency: f64| (frequency * i as f64).sin());
                 let t = t / factor + noise * sines.iter().sum::<f64>() / ray.norm();
                 EYE + t * ray

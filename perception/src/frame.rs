@@ -19,8 +19,8 @@ pub enum CameraPose {
     InTask(Isometry3<f64>),
     /// `T_frame_camera`, in the caller's frame.
     InFrame(Isometry3<f64>),
-    /// Nothing. Only with [`Workspace::find_table`](crate::Workspace::find_table) and a single frame, whose camera is then
-    /// the caller's frame.
+    /// Nothing. Only with [`Workspace::find_table`](crate::Workspace::find_table) and a single frame, whose camera is
+    /// then the caller's frame.
     Unknown,
 }
 

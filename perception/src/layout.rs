@@ -16,8 +16,8 @@ pub(crate) struct Part {
 }
 
 impl Part {
-    /// Smallest sensible distance of the inner part from the sides of its cube, metres. An object that a side cuts looks like a thinner
-    /// one: of grasps within 5 cm of a side, more than half were bad.
+    /// Smallest sensible distance of the inner part from the sides of its cube, metres. An object that a side cuts
+    /// looks like a thinner one: of grasps within 5 cm of a side, more than half were bad.
     pub const MARGIN: f64 = OBJECT_MARGIN;
 
     /// The number of cubes that [`cover`](Self::cover) returns. It is not an integer type, because it may be huge if
@@ -52,7 +52,7 @@ fn count(extent: f64, size: f64, margin: f64) -> f64 {
     (extent / length - 1e-9).ceil().max(1.0)
 }
 
-/// The fewest evenly spaced intervals of `size` whose inner parts cover those from 0 to `extent`.
+/// The fewest evenly spaced intervals of `size` whose inner parts cover the interval from 0 to `extent`.
 fn intervals(extent: f64, size: f64, margin: f64) -> Vec<Interval> {
     let count = count(extent, size, margin);
     let part = extent / count;
@@ -63,8 +63,9 @@ fn intervals(extent: f64, size: f64, margin: f64) -> Vec<Interval> {
     (0..count as u32).map(interval).collect()
 }
 
-/// The fewest squares, about, that hold objects on a table with a margin around them: the corners of cubes with an edge of
-/// `size`, the most valuable first, at most `limit`, and the number of objects of which no part is in one. Lengths in metres.
+/// Covers the objects on a table, with a margin around them, with about the fewest cubes with an edge of `size`.
+/// Returns the corners of at most `limit` cubes, the most valuable first, and the number of objects of which no part is
+/// in a cube. Lengths in metres.
 ///
 /// Objects that are too large for one cube are divided among several.
 pub(crate) fn cover_objects(objects: &[Object], size: f64, margin: f64, limit: usize) -> (Vec<[f64; 2]>, usize) {
@@ -99,7 +100,7 @@ pub(crate) fn cover_objects(objects: &[Object], size: f64, margin: f64, limit: u
     (corners, left_out.len())
 }
 
-/// Most parts that are distributed among cubes, which bounds the time.
+/// Maximum number of parts that are distributed among cubes, which bounds the time.
 const MAX_UNITS: usize = 128;
 
 /// Edge of the parts of large objects, metres.

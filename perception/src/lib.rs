@@ -1,7 +1,7 @@
 //! Perception: from what the cameras saw to the scenes of a planner.
 //!
 //! Data flow: [`Frames`] + [`Workspace`] → [`Observation`] (in the task frame) → cubes → [`Scenes`]. [`perceive`] does
-//! it for one request, and a [`Track`] for a stream of requests. This crate does no I/O and starts no threads.
+//! this for one request, and a [`Track`] for a stream of requests. This crate does no I/O and starts no threads.
 //!
 //! Conventions are those of the crate [`grasp`].
 

@@ -25,7 +25,7 @@ pub enum Observation {
     Clouds(Vec<Cloud>),
 }
 
-/// Labelled pixels of an image, and points of a cloud for its scale, that are used, about.
+/// About this many labelled pixels of an image, and points of a cloud for its scale, are used.
 const SAMPLES: usize = 100_000;
 
 impl Frames {
@@ -58,9 +58,9 @@ impl Observation {
         }
     }
 
-    /// Corrects the scale of the distances in each depth image where the table shows that it is wrong. Returns the factors,
-    /// and warnings about those that moved the table visibly. Point clouds may be merged from several cameras, so theirs is
-    /// not corrected. `extent` is that of the workspace, metres.
+    /// Corrects the scale of the distances in each depth image where the table shows that it is wrong. Returns the
+    /// factors, and warnings about those that moved the table visibly. Point clouds may be merged from several cameras,
+    /// so theirs is not corrected. `extent` is that of the workspace, metres.
     pub(crate) fn correct_plausible_depth_scale(&mut self, table: f64, extent: [f64; 2]) -> (Vec<f64>, Vec<Warning>) {
         let Self::Depth(views) = self else { return Default::default() };
         let (mut factors, mut warnings) = (Vec::new(), Vec::new());
@@ -133,8 +133,8 @@ impl Observation {
         }
     }
 
-    /// The objects that the labels of the views show, of which `wanted` are to be grasped, or all surfaces if it is `None`.
-    /// `None` without labels.
+    /// The objects that the labels of the views show. Those in `wanted` are to be grasped, or all surfaces if it is
+    /// `None`. Returns `None` without labels.
     pub(crate) fn objects(
         &self,
         frame_from_task: &Isometry3<f64>,
@@ -159,7 +159,7 @@ fn labelled(view: &View) -> impl Iterator<Item = (Point3<f64>, u16)> {
     let labels = view.labels.as_deref().unwrap_or_default();
     let width = view.intrinsics().width;
     let task_from_camera = view.camera_from_task.inverse();
-    // Odd, so that the pixels are not in few columns.
+    // Odd, so that the samples are spread over all columns.
     let pixels = labels.iter().enumerate().step_by((labels.len() / SAMPLES) | 1);
     pixels.filter_map(move |(pixel, &label)| {
         let point = view.image.point(pixel % width, pixel / width)?;

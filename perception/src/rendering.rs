@@ -9,16 +9,17 @@ const SIZES: [usize; 2] = [48, 320];
 /// Points of one pixel whose depths differ by more than this belong to different surfaces, metres.
 const LAYER: f32 = 0.01;
 
-/// An overview shows this share of the points. The others, such as a few points on the horizon, would make the rest small.
+/// An overview shows this share of the points. The others, such as a few points on the horizon, would make the rest
+/// small.
 const NEARLY_ALL: f64 = 0.97;
 
-/// Range of the tangent of half of the angle of view of an overview.
+/// Range of the tangent of half the angle of view of an overview.
 const TANGENTS: [f64; 2] = [0.05, 2.0];
 
 /// Cosine of the largest angle between the z axis of the frame of a camera and the direction of its points.
 const MOSTLY_ALONG: f64 = 0.7;
 
-/// Number of neighbours with depth, of eight, from which an empty pixel is filled.
+/// An empty pixel is filled if at least this many of its eight neighbours have depth.
 const FILLED_BY: usize = 5;
 
 /// Renders a depth image of points as a camera at `eye` sees them. Points and eye are in the task frame; the image
@@ -40,9 +41,10 @@ pub fn seen_from(points: &[Point3<f64>], eye: &Point3<f64>, size: f64) -> Option
     render(points, look_at(eye, &centre), tangent)
 }
 
-/// Renders a depth image of nearly all points as a camera at `eye` sees them; `camera_from_task` of the view is the pose
-/// of the frame of the points in the frame of this camera. If that frame looks like the frame of a camera (the points lie
-/// along its z axis), the image has the same right, otherwise z points up in it. Returns `None` if no point is in view.
+/// Renders a depth image of nearly all points as a camera at `eye` sees them; `camera_from_task` of the view maps the
+/// frame of the points into that of this camera. If the points lie along the z axis of their frame, as in a camera
+/// frame, the x axis points to the right in the image; otherwise the z axis points up. Returns `None` if no point is in
+/// view.
 #[must_use]
 pub fn overview(points: &[Point3<f64>], eye: &Point3<f64>) -> Option<View> {
     let middle = Point3::from([0, 1, 2].map(|axis| quantile(points.iter().map(|point| point[axis]), 0.5)));
@@ -54,7 +56,7 @@ pub fn overview(points: &[Point3<f64>], eye: &Point3<f64>) -> Option<View> {
     render(points, camera_from_frame, tangent.clamp(TANGENTS[0], TANGENTS[1]))
 }
 
-/// Renders the points that a camera sees whose square image has this tangent of half of its angle of view.
+/// Renders the points that a camera with a square image sees. `tangent` is that of half its angle of view.
 fn render(points: &[Point3<f64>], camera_from_task: Isometry3<f64>, tangent: f64) -> Option<View> {
     let projected = points.iter().filter_map(|point| {
         let p = camera_from_task * point;
@@ -94,7 +96,7 @@ fn render(points: &[Point3<f64>], camera_from_task: Isometry3<f64>, tangent: f64
     Some(View { image, camera_from_task, labels: None })
 }
 
-/// The value that this share of the values do not exceed; 0 if there are none.
+/// The quantile `share` of the values; 0 if there are none.
 fn quantile(values: impl Iterator<Item = f64>, share: f64) -> f64 {
     let mut values: Vec<f64> = values.collect();
     let index = (share * values.len() as f64) as usize;

@@ -16,8 +16,8 @@ use self::grid::{Grid, NOISE, STEP};
 pub(crate) struct Segmentation {
     /// Objects that a hand may lift; the label of the first is 1.
     pub objects: Vec<Object>,
-    /// Label of each sampled pixel, row by row: 0 is no object, and labels after those of the objects are other things: what
-    /// the image cuts off, walls and rims of bins, and what hangs over the edge of the table.
+    /// Label of each sampled pixel, row by row: 0 is no object, and labels after those of the objects are other things:
+    /// what the image cuts off, walls and rims of bins, and what hangs over the edge of the table.
     labels: Vec<u16>,
     /// Distance between sampled pixels.
     step: usize,
@@ -31,8 +31,8 @@ pub(crate) struct Object {
     pub points: Vec<([f64; 2], f64)>,
 }
 
-/// A thing with a smaller visible area, m², that is beside other things in the image is a fragment of them: depth cameras have
-/// holes at edges.
+/// A thing with a smaller visible area, m², that is beside other things in the image is a fragment of them: depth
+/// cameras have holes at edges.
 const FRAGMENT: f64 = 6e-4;
 
 /// Things longer than this, metres, may be a bin with objects that touch its walls.
@@ -42,8 +42,8 @@ const LONGEST: f64 = 0.5;
 const OVERHANG: f64 = 0.03;
 
 impl Segmentation {
-    /// Divides what stands on the table in an image. `camera_from_table` is the pose of a frame whose plane z = 0 is the
-    /// table.
+    /// Divides what stands on the table in an image. `camera_from_table` is the pose of a frame whose plane z = 0 is
+    /// the table.
     pub fn new(image: &DepthImage, camera_from_table: &Isometry3<f64>) -> Self {
         let grid = Grid::new(image, camera_from_table);
         let stands = |index: &usize| grid.is_above_table(*index) && grid.is_over_table(*index, OVERHANG);

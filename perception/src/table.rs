@@ -16,14 +16,14 @@ pub struct Table {
 const COLUMNS: usize = 20;
 
 /// Distance between the points that propose a plane, columns: long enough for an accurate slope, and short enough that
-/// they often are on one surface.
+/// they are often on one surface.
 const BASELINE: usize = 3;
 
 /// Largest distance of a point from its plane, metres.
 const TOLERANCE: f64 = 0.005;
 
-/// Share of the points of the largest plane with which a level plane at the expected height is preferred. The top of a
-/// large object may be larger than what is seen of the table.
+/// A level plane at the expected height is preferred if it has at least this share of the points of the largest plane.
+/// The top of a large object may be larger than what is seen of the table.
 const PREFERRED: f64 = 0.5;
 
 impl Table {
@@ -104,7 +104,8 @@ impl Surface {
         self.near(plane).count()
     }
 
-    /// The least-squares plane of the points near a plane, repeated; `None` if they are fewer than three or on a line.
+    /// The least-squares plane of the points near a plane, fitted repeatedly; `None` if they are fewer than three or on
+    /// a line, or the fitted plane is steeper than 45°.
     fn refined(&self, plane: Plane) -> Option<Plane> {
         const REPEATS: usize = 3;
         (0..REPEATS).try_fold(plane, |plane, _| {

@@ -10,9 +10,9 @@ use crate::segmentation::Segmentation;
 /// A table in a depth image, and a workspace on it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tabletop {
-    /// `T_camera_task`: the workspace, a cube of [`WORKSPACE_SIZE`], holds most of what stands on the table near the middle
-    /// of the image. Its z axis is the normal of the table, its x axis points to the right in the image, and the table is
-    /// at the height that [`find`](Self::find) was given.
+    /// `T_camera_task`: the workspace, a cube of [`WORKSPACE_SIZE`], holds most of what stands on the table near the
+    /// middle of the image. Its z axis is the normal of the table, its x axis points to the right in the image, and the
+    /// table is at the height that [`find`](Self::find) was given.
     pub camera_from_task: Isometry3<f64>,
     /// Distance of the camera from the plane of the table, metres.
     pub distance: f64,
@@ -68,19 +68,19 @@ const PROPOSALS: f64 = 400.0;
 /// find small planes, long ones are accurate.
 const BASELINES: [f64; 2] = [0.03, 0.08];
 
-/// Standard deviation of the weight of pixels around the middle, as a fraction of half of the diagonal.
+/// Standard deviation of the weight of pixels around the middle, as a fraction of half the diagonal.
 const MIDDLE: f64 = 0.45;
 
 /// Largest angle between the table's normal and the vertical, radians.
 const LEVEL: f64 = 12.0 * std::f64::consts::PI / 180.0;
 
-/// Error of the angle between a plane and the vertical, radians. Of large planes, the most level ones are preferred by more
-/// than this.
+/// Error of the angle between a plane and the vertical, radians. Of the large planes, only those that are within this
+/// of the most level one are considered.
 const LEVEL_ERROR: f64 = 3.0 * std::f64::consts::PI / 180.0;
 
-/// A plane below the largest one is the table, if it is parallel, not farther than this, metres, and at least this
-/// large in comparison: the top of a large object covers the middle of the image. What is farther below is the floor
-/// around a bin or a table.
+/// A plane below the largest one is the table, if it is parallel, in this range of distances below it, metres, and at
+/// least this large in comparison: the top of a large object covers the middle of the image. What is farther below is
+/// the floor around a bin or a table.
 const BELOW: std::ops::Range<f64> = 0.02..0.2;
 const LARGE: f64 = 0.35;
 
@@ -102,9 +102,9 @@ struct Plane {
 }
 
 impl Tabletop {
-    /// Finds the largest plane near the middle of the image. `gravity` is the direction of gravity in the camera frame; an
-    /// accelerometer at rest measures the opposite. With it only level planes are considered, else a wall that fills the
-    /// image is taken for a table. `height` is the height of the table in the workspace, metres.
+    /// Finds the largest plane near the middle of the image. `gravity` is the direction of gravity in the camera frame;
+    /// an accelerometer at rest measures the opposite. With it, only level planes are considered; without it, a wall
+    /// that fills the image is taken for a table. `height` is the height of the table in the workspace, metres.
     ///
     /// # Errors
     /// [`NoTabletop`] if there is no plane large enough.
@@ -231,8 +231,8 @@ impl Plane {
         sum / count
     }
 
-    /// The plane of least squares of the points on this one, repeated. The tolerance shrinks, so that the lower edges of
-    /// objects and walls do not tilt it.
+    /// The least-squares plane of the points on this one, fitted repeatedly. The tolerance shrinks, so that the lower
+    /// edges of objects and walls do not tilt it.
     fn refined(self, samples: &[Sample]) -> Self {
         const TOLERANCES: [f64; 5] = [1.0, 0.8, 0.6, 0.5, 0.5];
         TOLERANCES.into_iter().fold(self, |plane, tolerance| {
@@ -247,8 +247,8 @@ impl Plane {
         })
     }
 
-    /// `T_camera_table` of a frame on the plane: its z axis is the normal, and its x axis points to the right in the image;
-    /// for a camera that is rotated to the side, to its bottom.
+    /// `T_camera_table` of a frame on the plane: its z axis is the normal, and its x axis points to the right in the
+    /// image; for a camera that is rotated to the side, to the bottom of the image.
     fn frame(&self) -> Isometry3<f64> {
         let z = self.normal.into_inner();
         let x = [Vector3::x(), Vector3::y()].map(|axis| axis - z * axis.dot(&z));
@@ -257,7 +257,7 @@ impl Plane {
         Isometry3::from_parts(Translation3::from(z * self.offset), UnitQuaternion::from_rotation_matrix(&rotation))
     }
 
-    /// Where the optical axis meets the plane, in its frame; the foot of the camera if they are almost parallel.
+    /// Where the optical axis meets the plane, in its frame; the point below the camera if they are almost parallel.
     fn middle(&self, camera_from_table: &Isometry3<f64>) -> [f64; 2] {
         let z = self.normal.z;
         let seen = (z < -0.1).then(|| camera_from_table.inverse() * Point3::new(0.0, 0.0, self.offset / z));

@@ -51,8 +51,9 @@ impl Start {
 }
 
 impl Track {
-    /// A field with the views of a request: those of `track` and these, or only these in a new field if `start` is given.
-    /// All of them are integrated, or none: after an error `track` is as before. Stops when `is_wanted` returns false.
+    /// A field with the views of `track` and those of a request, or a new field with only the latter if `start` is
+    /// given. All of them are integrated, or none: after an error `track` is as before. Stops when `is_wanted` returns
+    /// false.
     ///
     /// # Errors
     /// [`RequestError`] names the invalid field, or says that the result is no longer wanted.

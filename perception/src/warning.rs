@@ -99,7 +99,7 @@ pub enum Warning {
         /// Index of the view.
         view: usize,
     },
-    /// The scale of the depths of a view was corrected without a request for it.
+    /// The scale of the depths of a view was corrected although the request did not ask for it.
     #[error(
         "the depths of views[{view}] were multiplied by {factor:.4}, because its table is at z = {height:.3} m, expected at \
          {expected:.3} m; if a pose is wrong instead, grasps are beside the objects: check the camera pose, workspace.pose \
@@ -115,7 +115,7 @@ pub enum Warning {
         /// Its expected height, metres.
         expected: f64,
     },
-    /// There are more objects on the table than cubes may cover.
+    /// There are more objects on the table than the cubes may cover.
     #[error(
         "{left_out} of the {objects} objects on the table are not in the workspace, which has {cubes} cubes; for a \
          larger one set workspace.extent"
@@ -140,7 +140,7 @@ pub const TRAINED_ANGLE: [f64; 2] = [20.0, 75.0];
 pub const TARGET_HEIGHT: f64 = 0.08;
 
 impl Warning {
-    /// Distances beyond the range of the training that are accepted, metres and degrees.
+    /// How far beyond the range of the training a camera is accepted, metres and degrees.
     const DISTANCE_MARGIN: f64 = 0.05;
     const ANGLE_MARGIN: f64 = 5.0;
     /// Largest contradicted share of a view.
@@ -150,13 +150,13 @@ impl Warning {
     /// Smallest observed area of a table, m². It is larger than the tops of most objects, and smaller than what is seen
     /// of the table in the benchmark's scenes.
     const SMALLEST_TABLE: f64 = 0.02;
-    /// Largest tilt of a table, radians: 3°. Cameras that are calibrated well have errors of 1°.
+    /// Largest tilt of a table, radians: 3°. Well-calibrated cameras have errors of 1°.
     const TILT: f64 = 3.0 * std::f64::consts::PI / 180.0;
     /// Largest distance of a table from the expected height, metres.
     const HEIGHT: f64 = 0.01;
 
-    /// Checks the position of a camera against the training data. `middle` is that of the bottom of the workspace. Both in
-    /// the task frame, metres.
+    /// Checks the position of a camera against the training data. `middle` is that of the bottom of the workspace. Both
+    /// in the task frame, metres.
     #[must_use]
     pub fn of_camera(view: usize, eye: &Point3<f64>, middle: [f64; 2]) -> Option<Warning> {
         let from_middle = eye.coords - Vector3::new(middle[0], middle[1], TARGET_HEIGHT);
@@ -179,7 +179,7 @@ impl Warning {
         (shift.abs() > Self::HEIGHT).then_some(Self::DepthsCorrected { view, factor, height, expected })
     }
 
-    /// Compares a view with those that are fused already.
+    /// Compares a view with those that were fused before it.
     #[must_use]
     pub fn of_view(
         view: usize,
@@ -191,7 +191,8 @@ impl Warning {
         (share > Self::CONTRADICTED).then_some(Self::ViewsDisagree { view, share })
     }
 
-    /// Checks how much of a volume was measured, the middle of a field with `padding` voxels on each side.
+    /// Checks how much of a volume was measured. The volume is the middle of a field with `padding` voxels on each
+    /// side.
     #[must_use]
     pub fn of_coverage(fused: &Fusion, padding: usize) -> Option<Warning> {
         let share = fused.measured(padding);

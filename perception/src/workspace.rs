@@ -16,8 +16,8 @@ pub struct Workspace {
     pub size: Option<f64>,
     /// Whether to find the table, which determines the pose.
     pub find_table: bool,
-    /// Whether to find the objects on that table, and the largest number of cubes for them: grasps are on these objects only,
-    /// and without an extent the workspace covers all of them.
+    /// Whether to find the objects on that table, and the largest number of cubes for them: grasps are on these objects
+    /// only, and without an extent the workspace covers all of them.
     pub find_objects: Option<usize>,
     /// Direction of gravity in the caller's frame.
     pub gravity: Option<Unit<Vector3<f64>>>,
@@ -45,7 +45,7 @@ pub struct FoundTable {
 pub(crate) struct Standing {
     /// The objects.
     pub objects: Vec<Object>,
-    /// Their labels in the first frame, if it got them.
+    /// Their labels in the first frame, if the segmentation labelled it.
     pub labels: Option<BTreeSet<u16>>,
 }
 
@@ -60,12 +60,12 @@ pub(crate) struct Cover {
     pub left_out: usize,
 }
 
-/// Most cubes of a workspace that covers the objects on a table.
+/// Maximum number of cubes of a workspace that covers the objects on a table.
 const MAX_FOUND_CUBES: usize = 12;
 
 impl Workspace {
-    /// Finds the table in the first of the frames, if `find_table` is set, and sets the pose of the workspace. The table is
-    /// at `height` in it, and a workspace without an extent is a cube with this `edge`, metres.
+    /// Finds the table in the first of the frames, if `find_table` is set, and sets the pose of the workspace. The
+    /// table is at `height` in it, and a workspace without an extent is a cube with this `edge`, metres.
     ///
     /// # Errors
     /// [`RequestError`] if the pose of a camera does not allow it, or the first frame shows no table.
@@ -99,7 +99,7 @@ impl Workspace {
                 let is_only = frames.len() == 1;
                 frames.first_mut().map(|frame| {
                     let (table, segmentation) = self.find_in_frame(frame, is_only, height, edge)?;
-                    // An object of several views would have a label in each.
+                    // With several views an object would have a different label in each.
                     let labels = (self.find_objects.is_some() && is_only && frame.labels.is_none()).then(|| {
                         frame.labels = Some(segmentation.labels(&frame.image));
                         segmentation.labels_of_objects()
@@ -122,8 +122,8 @@ impl Workspace {
         found.transpose().map_err(|error: RequestError| error.inside("views[0]"))
     }
 
-    /// Finds the table in a frame and sets the pose of the workspace. If it is the only frame and has no pose, its camera
-    /// is at the origin of the caller's frame.
+    /// Finds the table in a frame and sets the pose of the workspace. If it is the only frame and has no pose, its
+    /// camera is at the origin of the caller's frame.
     ///
     /// # Errors
     /// [`RequestError`] names the field of the view.
@@ -191,7 +191,7 @@ impl Workspace {
         let gravity = self.gravity.map(|gravity| frame_from_camera.rotation.inverse() * gravity);
         let (tabletop, segmentation) = Tabletop::find_with_objects(image, gravity, height)?;
         self.frame_from_task = frame_from_camera * tabletop.camera_from_task;
-        // The workspace has its middle over that of the cube which was found.
+        // The workspace is centred on the cube that was found.
         let extent = self.extent.unwrap_or([edge; 2]);
         let corner = extent.map(|length| (WORKSPACE_SIZE - length) / 2.0);
         let objects = segmentation.objects.len();
@@ -200,15 +200,15 @@ impl Workspace {
         Ok((table, segmentation))
     }
 
-    /// Moves the corner of the workspace by `corner` along the table. Returns the motion of points in its frame.
+    /// Moves the corner of the workspace by `corner` along the table. Returns the shift of points in its frame.
     fn moved(&mut self, table: &mut FoundTable, corner: [f64; 2]) -> [f64; 2] {
         self.frame_from_task *= Translation3::new(corner[0], corner[1], 0.0);
         table.frame_from_task = self.frame_from_task;
         corner.map(|c| -c)
     }
 
-    /// Places cubes with this `edge` over all objects on the table, and the workspace around them. `None` if that was not
-    /// requested, there are no objects, or a cube has no room between its margins.
+    /// Places cubes with this `edge` over all objects on the table, and the workspace around them. `None` if that was
+    /// not requested, there are no objects, or a cube has no room between its margins.
     pub(crate) fn cover(
         &mut self,
         table: &mut FoundTable,
@@ -225,7 +225,7 @@ impl Workspace {
         if let [corner] = corners[..]
             && corner.iter().all(|c| c.abs() < 1e-9)
         {
-            // The cube of the workspace, without another rounding.
+            // The workspace is this cube already. Moving it would only add rounding errors.
             return Some(Cover { corners: vec![[0.0; 2]], extent: table.extent, left_out });
         }
         let lowest = [0, 1].map(|axis| corners.iter().map(|corner| corner[axis]).fold(f64::INFINITY, f64::min));

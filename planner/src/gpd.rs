@@ -31,7 +31,8 @@ impl Gpd {
         Ok(Self::new(Classifier::load(path, &Image::SHAPE, options)?))
     }
 
-    /// The default parameters: the threshold 0.5 keeps candidates that succeed more likely than not, as in GPD's code.
+    /// The default parameters: the threshold 0.5 keeps candidates that are more likely to succeed than to fail, as in
+    /// GPD's code.
     #[must_use]
     pub fn decode_params() -> DecodeParams {
         DecodeParams { threshold: 0.5, ..DecodeParams::default() }

@@ -48,7 +48,7 @@ impl HandFit {
         Params { hand, aperture, bite, ..of_gpd }
     }
 
-    /// Fits the hand to the points of the scene, at as many of them as GPD.
+    /// Fits the hand to the points of the scene, at as many of them as in GPD.
     pub(crate) fn new(scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Self, PlanError> {
         Self::sampled(Params::above(0.0).samples, scene, params, is_wanted)
     }

@@ -48,7 +48,6 @@ impl ModelFiles {
         }
         let networks = networks.into_iter().map(ModelSpec::Network);
         let classifiers = classifiers.entries.into_iter().map(ModelSpec::Gpd);
-        // SHAF needs no file.
         let specs = networks.chain(evaluated).chain(classifiers).chain([ModelSpec::Shaf]).collect();
         Ok(Self { specs, rejected })
     }

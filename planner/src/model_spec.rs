@@ -54,7 +54,7 @@ impl ModelSpec {
         self.entry().map_or("shaf", |entry| &entry.metadata.name)
     }
 
-    /// The name of the planner that is called `name`, or was called so before it was renamed; `name` if there is none.
+    /// The present name of the planner whose name is `name`, or was before it was renamed; `name` if there is none.
     #[must_use]
     pub fn current_name<'a>(specs: impl Iterator<Item = &'a Self> + Clone, name: &'a str) -> &'a str {
         let was_called =
@@ -141,7 +141,7 @@ impl ModelSpec {
     /// [`LoadError`] if the file is invalid or cannot run with `options`.
     pub fn load(&self, options: &Options, count: usize) -> Result<(Vec<Loaded>, Backend), LoadError> {
         let single = |planner: Box<dyn Planner + Send>| Loaded::Single(planner);
-        // 8 bits are for the networks that were exported for them.
+        // Only networks are exported for 8 bits.
         let precision = options.precision.filter(|&precision| precision != Precision::Int8);
         let of_classifiers = Options { precision, ..*options };
         Ok(match self {

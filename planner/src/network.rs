@@ -65,8 +65,8 @@ impl Inference<'_> {
         self.evaluation
     }
 
-    /// The grasps in `scene`, whose volume is the one at `index` of the batch. The evaluator stops when `is_wanted` returns
-    /// false.
+    /// The grasps in `scene`, whose volume is the one at `index` of the batch. The evaluator stops when `is_wanted`
+    /// returns false.
     ///
     /// # Errors
     /// [`PlanError`] if the maps are invalid, the evaluator fails, or planning is cancelled.

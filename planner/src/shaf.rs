@@ -1,4 +1,4 @@
-//! SHAF, the highest-point heuristic that GIGA's paper compares with, in two forms.
+//! SHAF, the highest-point heuristic that GIGA's paper uses as a baseline, in two forms.
 
 use grasp::gpd::ranked;
 use grasp::{DecodeParams, Decoded, Grasp};
@@ -39,8 +39,8 @@ impl Planner for HighestProposal {
     }
 }
 
-/// Sorts by the height of the grasp's position in the task frame, whose pose in the frame of the grasps is the inverse of
-/// `task_from_frame`. The sort is stable, so at equal height the better grasp comes first.
+/// Sorts by the height of the grasp's position in the task frame. `task_from_frame` maps points of the frame of the
+/// grasps into it. The sort is stable, so at equal height the better grasp comes first.
 fn highest_first(grasps: &mut [Grasp], task_from_frame: &Isometry3<f64>) {
     let height = |grasp: &Grasp| (task_from_frame * grasp.pose).translation.z;
     grasps.sort_by(|a, b| height(b).total_cmp(&height(a)));
@@ -60,7 +60,7 @@ mod tests {
         let mut grasps = [at(0.1, 0.99), at(0.2, 0.6), at(0.15, 0.9), at(0.2, 0.55)];
         highest_first(&mut grasps, &Isometry3::identity());
         assert_eq!(grasps.map(|grasp| grasp.quality), [0.6, 0.55, 0.9, 0.99]);
-        // In the frame of a camera that looks down, low is high.
+        // In the frame of a camera that looks down, the highest grasp has the smallest z.
         let upside_down = Isometry3::from_parts(Default::default(), UnitQuaternion::from_euler_angles(PI, 0.0, 0.0));
         highest_first(&mut grasps, &upside_down);
         assert_eq!(grasps.map(|grasp| grasp.quality), [0.99, 0.9, 0.6, 0.55]);

@@ -1,7 +1,7 @@
 //! Decodes requests only if their memory is bounded by their size.
 //!
-//! An empty message in a repeated field takes 2 bytes of a request, but up to several hundred bytes in memory. So before
-//! a request is decoded, its fields are counted.
+//! An empty message in a repeated field takes 2 bytes of a request, but up to several hundred bytes in memory. So
+//! before a request is decoded, its fields are counted.
 
 use std::fmt::{self, Display, Formatter};
 use std::marker::PhantomData;
@@ -159,8 +159,8 @@ fn check(name: &str, bytes: &[u8]) -> Result<(), Reason> {
     Count { allowed: ALLOWANCE + bytes.len(), used: 0 }.message(message, bytes, 0)
 }
 
-/// The codec of all methods: prost's, with a bound on the memory of requests. A request of n bytes needs at most
-/// n + 1 MiB for the elements of its repeated fields; vectors that grow may take up to twice of it.
+/// The codec of all methods: prost's, with a bound on the memory of requests. A request of n bytes needs at most n + 1
+/// MiB for the elements of its repeated fields; vectors that grow may take up to twice as much.
 #[derive(Clone, Copy, Debug)]
 pub struct BoundedCodec<T, U>(PhantomData<(T, U)>);
 

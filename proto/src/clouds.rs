@@ -6,8 +6,8 @@ use crate::pose::{self, PoseFields};
 use crate::views::check_number;
 use crate::{labels, pb};
 
-/// Median distance of the points of a cloud from its camera beyond which they are probably not in metres: far beyond the
-/// range of depth cameras.
+/// Median distance of the points of a cloud from its camera beyond which they are probably not in metres: far beyond
+/// the range of depth cameras.
 const FARTHEST: f64 = 20.0;
 
 const FRAME_FROM_CLOUD: PoseFields =

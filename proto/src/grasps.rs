@@ -7,7 +7,7 @@ const POSE: PoseFields = PoseFields { position: "grasps.pose.position", orientat
 
 const CANDIDATE: PoseFields = PoseFields { position: "pose.position", orientation: "pose.orientation" };
 
-/// Most candidates in a request.
+/// Maximum number of candidates in a request.
 const MAX_CANDIDATES: usize = 1024;
 
 /// Converts the candidates of a request from the convention of its options.

@@ -2,7 +2,7 @@ use std::io::Cursor;
 
 use png::{BitDepth, ColorType, Decoder, Limits};
 
-/// Most pixels of an image that is sent as PNG. A small file can contain a large image.
+/// Maximum number of pixels of an image that is sent as PNG. A small file can contain a large image.
 const MAX_PIXELS: usize = 1 << 24;
 
 /// The 16-bit grey values of a PNG file of `width` × `height` pixels, row by row; the error says what is wrong.
@@ -44,8 +44,8 @@ fn decoded(file: &[u8], width: usize, height: usize, depths: &[BitDepth]) -> Res
     })
 }
 
-/// A PNG file of 16-bit grey values, row by row, compressed quickly. Values after the last whole row are left out; without
-/// a whole row the file is empty, which the server refuses.
+/// A PNG file of 16-bit grey values, row by row, compressed quickly. Values after the last whole row are left out;
+/// without a whole row the file is empty, which the server refuses.
 #[must_use]
 pub fn grey_png(values: &[u16], width: u32) -> Vec<u8> {
     let mut file = Vec::new();

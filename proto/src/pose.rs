@@ -10,7 +10,7 @@ const UNIT_TOLERANCE: f64 = 1e-3;
 /// Converts and validates a pose message. Errors name it `field`.
 ///
 /// # Errors
-/// [`RequestError`] if a part is absent or not finite, or the orientation has no unit length.
+/// [`RequestError`] if a part is absent or not finite, or the orientation is not of unit length.
 pub fn pose(pose: &pb::Pose, field: &'static str) -> Result<Isometry3<f64>, RequestError> {
     const FIELDS: PoseFields = PoseFields { position: "position", orientation: "orientation" };
     decode(pose, &FIELDS).map_err(|error| error.inside(field))

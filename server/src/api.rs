@@ -1,4 +1,5 @@
-//! The protocols: `grasp.v1` and the Open Inference Protocol over gRPC, and the latter over HTTP.
+//! The protocols: `grasp.v1` and the Open Inference Protocol over gRPC; the latter and grasps in depth images also over
+//! HTTP.
 
 mod blocking;
 pub(crate) mod call;

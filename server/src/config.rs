@@ -43,9 +43,9 @@ pub(crate) struct Config {
     /// Time after which a gRPC connection accepts no further calls; None without a limit.
     pub max_connection_age: Option<Duration>,
     pub limits: Limits,
-    /// Messages that are being received, together, bytes.
+    /// Maximum size of all messages that are being received together, bytes.
     pub max_receiving_bytes: usize,
-    /// Concurrent TrackGrasps streams, each with one volume.
+    /// Maximum number of volumes that open TrackGrasps streams keep.
     pub max_tracked: usize,
     /// Time without a request after which a TrackGrasps stream ends.
     pub track_timeout: Duration,
@@ -64,8 +64,8 @@ pub(crate) struct Config {
 const RECENT: usize = 20;
 
 impl Config {
-    /// Environment variables that are named like flags and are not. Those that Kubernetes sets for a service named
-    /// `graspd` are left out.
+    /// Environment variables that are named like those of flags but belong to none. Those that Kubernetes sets for a
+    /// service named `graspd` are left out.
     pub fn unknown_variables() -> Vec<String> {
         let known: Vec<_> =
             Flags::command().get_arguments().filter_map(|flag| flag.get_env()).map(OsStr::to_owned).collect();

@@ -138,7 +138,7 @@ fn serve_until_stopped(
     served
 }
 
-/// Warns about settings that work, but not as their user may think.
+/// Warns about settings that work, but not as the operator may expect.
 fn warn_about(config: &Config, metrics: &Metrics) {
     for name in Config::unknown_variables() {
         warn!(name, "unknown environment variable; see `graspd --help` for the known ones");
@@ -184,7 +184,7 @@ impl Listeners {
     }
 }
 
-/// What the process has from its start to its end.
+/// What the process holds from its start to its end.
 struct Process<'a> {
     config: &'a Config,
     /// Maximum number of connections of a listener.
@@ -205,7 +205,7 @@ struct Serving {
 }
 
 impl Process<'_> {
-    /// Serves until a signal, and drains.
+    /// Serves until a signal arrives, then drains.
     async fn run(self, mut signals: Signals, recorder: Recorder) -> anyhow::Result<()> {
         let reload = hangup().context("cannot install a signal handler")?;
         let listeners = Listeners::bind(self.config).await?;
@@ -302,7 +302,7 @@ impl Process<'_> {
         Ok(Serving { grpc: tokio::spawn(grpc), http, rest })
     }
 
-    /// Watches the sessions. The receiver has whether each model has a healthy one.
+    /// Watches the sessions. The receiver holds whether each model has a healthy one.
     fn watch(&self) -> (JoinHandle<()>, watch::Receiver<bool>) {
         let (sender, healthy) = watch::channel(true);
         let models = Arc::clone(&self.models);
@@ -322,7 +322,7 @@ impl Process<'_> {
             if let Some(rest) = rest {
                 let _ = rest.await;
             }
-            // ONNX Runtime may crash if the process exits while a model is loaded. The models after it are not loaded.
+            // ONNX Runtime may crash if the process exits while a model is loaded. No further models are loaded.
             let _ = tokio::task::spawn_blocking(move || loads.wait()).await;
             ended
         };

@@ -7,17 +7,17 @@ use std::time::Duration;
 use grasp::{Code, RequestError};
 use grasp_engine::Caller;
 
-/// Most open streams. Each holds at most an HTTP/2 window of 1 MiB that is not read yet.
+/// Maximum number of open streams. Each holds at most an HTTP/2 window of 1 MiB that is not read yet.
 const LIMIT: usize = 1024;
 
-/// Retry hint when all streams are in use: streams live long.
+/// Retry hint when all streams are in use: streams are long-lived.
 const IN_USE: Duration = Duration::from_secs(1);
 
 /// The open streams of each caller.
 #[derive(Clone, Default)]
 pub(crate) struct OpenStreams(Arc<Mutex<HashMap<Caller, usize>>>);
 
-/// An open stream. Dropping it makes its place free.
+/// An open stream. Dropping it frees its place.
 pub(crate) struct OpenStream {
     all: OpenStreams,
     caller: Caller,

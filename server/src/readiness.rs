@@ -13,11 +13,12 @@ use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse};
 /// Lifecycle state of the process, read by health checks, `/readyz` and the services.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum State {
-    /// The models are loaded and warmed up.
+    /// The models are being loaded and warmed up.
     Starting,
     /// Every session has completed an inference.
     Ready,
-    /// All sessions of a model hang in an inference, or fail each one; the other models are served. It ends only with a restart.
+    /// All sessions of a model hang in an inference, or fail each one; the other models are served. Ends when a session
+    /// recovers, otherwise only with a restart.
     Unhealthy,
     /// Shutting down: accepted requests are finished, new connections and messages are not accepted.
     Draining,

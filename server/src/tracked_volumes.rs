@@ -7,7 +7,7 @@ use grasp::{Code, RequestError};
 use prometheus::IntGauge;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
-/// Retry hint when all volumes are in use: streams live long.
+/// Retry hint when all volumes are in use: streams are long-lived.
 const IN_USE: Duration = Duration::from_secs(1);
 
 /// The volumes of all streams.

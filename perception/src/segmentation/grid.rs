@@ -17,7 +17,7 @@ const HIGHEST: f64 = 0.45;
 /// Noise of a depth at 1 m, metres; it grows with the square of the depth.
 pub(super) const NOISE: f64 = 0.004;
 
-/// Neighbouring pixels are of one surface if their depths differ by less than this many pixels' widths, and [`STEP`]
+/// Neighbouring pixels are on one surface if their depths differ by less than this many pixel widths plus [`STEP`]
 /// metres: on a surface at 80° to the image the depth changes by six widths.
 const SLOPE: f64 = 6.0;
 pub(super) const STEP: f64 = 0.002;
@@ -33,21 +33,21 @@ const TABLE_PART: f64 = 0.05;
 /// Things this near to other things in the image, metres, are beside them.
 const BESIDE_OTHERS: f64 = 0.02;
 
-/// Number of neighbouring pixels below the table with which a thing is not on the table.
+/// A thing with this many neighbouring pixels below the table is not on the table.
 const HANGING: usize = 10;
 
-/// Number of pixels at which a thing goes on beside the table, divided by the root of its number of pixels, with which it is
-/// part of something that does not stand on the table.
+/// Largest number of pixels at which a thing continues beside the table, divided by the square root of its number of
+/// pixels. With more it is part of something that does not stand on the table.
 const EDGE: f64 = 1.5;
 
 /// Largest share of a thing that is not over the visible part of the table.
 const BESIDE: f64 = 0.7;
 
-/// Width of the border of the image whose things are cut off, as a fraction of the image. Depths that are registered to a
-/// colour image often end before its border.
+/// Width of the border of the image, as a fraction of the image: things that reach into it count as cut off. Depths
+/// that are registered to a colour image often end before its border.
 const BORDER: f64 = 0.0125;
 
-/// Standard deviation of the weight of pixels around the middle, as a fraction of half of the diagonal.
+/// Standard deviation of the weight of pixels around the middle, as a fraction of half the diagonal.
 const MIDDLE: f64 = 0.45;
 
 /// Sampled pixels of an image.
@@ -120,7 +120,7 @@ impl Grid {
         [right, below, left, above].into_iter().chain(diagonal).flatten().filter(move |index| *index < count)
     }
 
-    /// Whether two neighbouring pixels show one surface.
+    /// Whether two neighbouring pixels show the same surface.
     fn are_connected(&self, a: usize, b: usize) -> bool {
         let (Some(a), Some(b)) = (&self.points[a], &self.points[b]) else { return false };
         (a.z - b.z).abs() < SLOPE * self.pixel * a.z.min(b.z) + STEP
@@ -209,7 +209,7 @@ impl Grid {
         let below = pixels.iter().flat_map(|&index| {
             self.neighbours(index, true).filter(move |&other| self.are_connected(index, other)).filter(is_below)
         });
-        // A rim goes on beside the table.
+        // A rim continues beside the table.
         let goes_on = |&index: &usize| {
             self.neighbours(index, true).any(|other| {
                 self.is_above_table(other) && !self.is_over_table(other, OVERHANG) && self.are_connected(index, other)

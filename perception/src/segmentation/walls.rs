@@ -13,10 +13,10 @@ const WALL_AREA: f64 = 0.006;
 /// Distance of points from the plane of their wall, metres.
 pub(super) const WALL_TOLERANCE: f64 = 0.01;
 
-/// Most walls and rims that are taken off one thing.
+/// Maximum number of walls and rims that are taken off one thing.
 const WALLS: usize = 6;
 
-/// Pixels that propose a wall, about.
+/// About this many pixels propose a wall.
 const PROPOSALS: usize = 150;
 
 impl Grid {
@@ -57,7 +57,7 @@ impl Grid {
             };
             let inliers = || sampled.iter().filter(is_on);
             let area = share * inliers().map(|&index| self.area_of(index)).sum::<f64>();
-            // Walls and rims are around what is visible of the table.
+            // Walls and rims are around the visible part of the table.
             let beside = inliers().filter(|index| !self.is_over_table(**index, -WALL_TOLERANCE)).count();
             let area = if 2 * beside > inliers().count() { area } else { 0.0 };
             let [low, high] = bounds(inliers().map(|&index| self.on_table[index].coords));

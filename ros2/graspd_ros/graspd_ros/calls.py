@@ -17,19 +17,19 @@ from graspd_ros.refusal import Refusal
 from graspd_ros.results import Results
 
 POLL = 0.02
-"""Between two looks for a cancellation, seconds."""
+"""Pause between two checks for a cancellation, seconds."""
 
 
 @dataclass
 class Counts:
-    """Since the start of the node."""
+    """Numbers of calls since the start of the node."""
 
     running: int = 0
     succeeded: int = 0
     cancelled: int = 0
     failed: int = 0
     error: str = ""
-    """Of the last call."""
+    """Error of the last call."""
 
 
 class Calls:

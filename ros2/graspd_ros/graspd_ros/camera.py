@@ -14,7 +14,7 @@ LABELS = {"8UC1": "u1", "mono8": "u1", "16UC1": "u2", "mono16": "u2", "32SC1": "
 
 
 def depth(image: Image, topic: str) -> NDArray:
-    """Whole numbers are millimetres, floats metres."""
+    """The depths of an image: integers are millimetres, floats metres."""
     needed = "16UC1 (millimetres) or 32FC1 (metres)"
     return pixels(image, DEPTHS, topic, f"{needed}: remap depth/image to the depth image, not to a colour or compressed one")
 

@@ -21,7 +21,7 @@ PLACE = {"frame_id", "pose"}
 
 
 class Query:
-    """A request with the values of the parameters for what it does not set."""
+    """A request. What it does not set has the values of the parameters."""
 
     def __init__(self, frame_id: str, workspace: Workspace, options: Options, values: dict[str, Any]) -> None:
         self.values = values
@@ -66,7 +66,7 @@ class Detector:
         return seen.cloud_view(frame_from_cloud, cloud_from_camera[:3, 3])
 
     async def workspace(self, query: Query, seen: Seen) -> graspd.Workspace:
-        """In the frame of the grasps. Without a place graspd finds the table."""
+        """The workspace in the frame of the grasps. Without a frame and a pose of its own, graspd finds the table."""
         frame = query.frame_id or seen.frame_id
         fields = {name: value for name, value in query.workspace.items() if name not in PLACE}
         if not query.workspace.keys() & PLACE:
@@ -74,7 +74,7 @@ class Detector:
         own_frame, timeout = query.workspace.get("frame_id", frame), query.values["transform_timeout"]
         pose = query.workspace.get("pose", graspd.Pose())
         corner = await self._transforms.lookup(frame, own_frame, seen.stamp, timeout) @ pose.matrix()
-        fields.pop("gravity", None)  # only of use for finding the table
+        fields.pop("gravity", None)  # used only to find the table
         return graspd.Workspace(corner, frame_id=frame, **fields)
 
     async def answer(self, call: Any) -> Any:

@@ -43,7 +43,7 @@ class Diagnostics:
         except graspd.Error as error:
             return self._status("server", DiagnosticStatus.ERROR, f"not available: {error.message}")
         level = DiagnosticStatus.OK if is_ready else DiagnosticStatus.WARN
-        return self._status("server", level, "ready" if is_ready else "starting or shutting down")
+        return self._status("server", level, "ready" if is_ready else "not ready: see its log")
 
     def _image_status(self, rate: float) -> DiagnosticStatus:
         level = DiagnosticStatus.OK if rate else DiagnosticStatus.WARN

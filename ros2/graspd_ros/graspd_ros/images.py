@@ -21,7 +21,7 @@ from graspd_ros.refusal import Refusal
 from graspd_ros.transforms import nanoseconds
 
 KEPT = 30
-"""Images that wait for their labels, and the reverse."""
+"""Maximum number of images that wait for their labels, and of labels that wait for their images."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Topics:
 
 
 class Images:
-    """Subscribes. Its other methods are called in `loop`."""
+    """Subscribes to the topics of the camera. Its other methods are called in `loop`."""
 
     def __init__(
         self, node: Node, group: CallbackGroup, loop: asyncio.AbstractEventLoop, kind: str, labels: bool
@@ -88,7 +88,7 @@ class Images:
         self._loop = loop
         self._group = group
         self.count = 0
-        """Of images or clouds that arrived."""
+        """Number of images or clouds that arrived."""
         self._latest: Seen | None = None
         self._info: CameraInfo | None = None
         # By stamp, until their counterparts arrive.
@@ -148,7 +148,7 @@ class Images:
         self._keep(self._labels, labels)
 
     def _add_info(self, info: CameraInfo) -> None:
-        # Also later ones: the focal length of some cameras changes.
+        # Later messages replace it: the focal length of some cameras changes.
         self._info = info
         for stamp in list(self._messages)[-1:]:
             self._pair(stamp)

@@ -38,7 +38,7 @@ def grasps(
 
 
 def motion(header: Header, start: Pose, end: Pose) -> GripperTranslation:
-    """MoveIt may shorten it to one half."""
+    """MoveIt may shorten the motion to half its length."""
     step = position(end) - position(start)
     distance = float(np.linalg.norm(step))
     x, y, z = (step / distance).tolist() if distance else (0.0, 0.0, 1.0)

@@ -39,7 +39,7 @@ SPARE_THREADS = 4
 RESULTS_KEPT = 60
 """How long the results of goals can be requested, seconds."""
 GRACE = 0.2
-"""For the transport of the last results, which ROS does not confirm, seconds."""
+"""Time for ROS to deliver the last results, which it does not confirm, seconds."""
 
 
 class GraspNode:

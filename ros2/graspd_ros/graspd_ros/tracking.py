@@ -18,7 +18,7 @@ from graspd_ros.refusal import Refusal
 from graspd_ros.results import Results
 
 PAUSE = 1.0
-"""After a failure, seconds; also the period in which `track` is read while it is not set."""
+"""Pause after a failure, seconds; also the interval at which `track` is read while it is not set."""
 
 
 class Tracker:
@@ -49,7 +49,7 @@ class Tracker:
             await asyncio.sleep(PAUSE)
 
     async def _track(self) -> None:
-        """Until `track` is no longer set, or a call fails. Images that arrive while the server computes are left out."""
+        """Tracks until `track` is unset or a call fails. Images that arrive while the server computes are skipped."""
         query = self._query()
         seen = await self._images.next(query.values["image_timeout"])
         workspace = await self._detector.workspace(query, seen)

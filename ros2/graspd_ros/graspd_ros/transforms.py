@@ -22,7 +22,7 @@ from graspd_ros.refusal import Refusal
 Matrix = NDArray[np.float64]
 Stamped = tuple[int, Transform]
 PAUSE = 0.01
-"""Between two lookups of a transform that has not arrived, seconds."""
+"""Pause between two lookups of a transform that has not arrived, seconds."""
 HISTORY = 10 * 10**9
 """Nanoseconds, as in tf2."""
 
@@ -109,7 +109,7 @@ class TfTopics:
         if frame not in known:
             raise NotKnown(f"{frame!r} is not in TF, which has {', '.join(sorted(known)) or 'no frames'}")
         chain = [frame]
-        while chain[-1] in self._parents and len(chain) <= len(known):  # not for ever if the frames form a circle
+        while chain[-1] in self._parents and len(chain) <= len(known):  # ends also if the frames form a cycle
             chain.append(self._parents[chain[-1]])
         return chain
 
@@ -153,7 +153,7 @@ def stamp_of(entry: Stamped) -> int:
 
 
 def between(before: Stamped, after: Stamped, stamp: int) -> Matrix:
-    """Interpolates linearly; that of the quaternions, normalised, is exact enough between two messages."""
+    """Interpolates linearly. For the quaternions, normalised, this is accurate enough between two messages."""
     share = (stamp - before[0]) / max(after[0] - before[0], 1)
     (start, turned), (end, turned_to) = (parts(entry[1]) for entry in (before, after))
     quaternion = turned + share * (turned_to * (1 if turned @ turned_to >= 0 else -1) - turned)

@@ -5,8 +5,8 @@ use grasp::{Code, RequestError};
 use tokio::task::spawn_blocking;
 
 /// Runs `work` on a thread for blocking tasks, to keep the async runtime's threads free. It is passed a function that
-/// returns whether its result is still wanted: the call was not cancelled, and the deadline has not passed. `permit` is held
-/// until the work is done, also if the call is cancelled before.
+/// returns whether its result is still wanted: the call was not cancelled, and the deadline has not passed. `permit` is
+/// held until the work is done, even if the call is cancelled before.
 pub(crate) async fn blocking<T: Send + 'static>(
     permit: impl Send + 'static,
     deadline: Option<Instant>,

@@ -113,9 +113,9 @@ impl Calls {
         unreadable_message(status, &self.metrics)
     }
 
-    /// Runs a request from start to end. `work` returns the response, and what is shown of it if a model has computed it.
-    /// If the returned future is dropped before, the request counts as cancelled by the client, or as expired if its
-    /// deadline has passed.
+    /// Runs a request from start to end. `work` returns the response and, if a model has computed it, what the page
+    /// shows of it. If the returned future is dropped before it ends, the request counts as cancelled by the client, or
+    /// as expired if its deadline has passed.
     pub async fn run<T>(
         &self,
         id: String,
@@ -147,8 +147,8 @@ impl Calls {
         status(&call.fail(error), &id)
     }
 
-    /// Opens a call. The second value is an error if the id is invalid, the server is still starting, or the token of the
-    /// call's stream is no longer accepted.
+    /// Opens a call. The second value is an error if the id is invalid, the server is still starting, or the token of
+    /// the call's stream is no longer accepted.
     fn open(&self, mut id: String, context: CallContext) -> (Call, Result<(), RequestError>) {
         let CallContext { id_field, caller, deadline, parent } = context;
         let mut checked = check_id(id_field, &id);
@@ -162,7 +162,7 @@ impl Calls {
             let message = "the token of the stream is no longer accepted; open a new stream with a valid one";
             checked = Err(RequestError::new(Code::Unauthenticated, message));
         }
-        // Its fields mark the lines of the log at every level.
+        // At the level error, so that its fields are in the log lines of every level.
         let span = error_span!(
             REQUEST,
             otel.kind = "server",
@@ -208,7 +208,7 @@ pub(crate) struct Call {
 }
 
 impl Call {
-    /// Who sent the request, and when it has to be done.
+    /// Who sent the request, and when it must be answered.
     pub fn metadata(&self, priority: Priority) -> RequestMetadata {
         RequestMetadata { caller: self.caller, priority, deadline: self.deadline }
     }

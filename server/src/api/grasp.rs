@@ -26,8 +26,8 @@ use replies::SceneRequest;
 
 pub(crate) use replies::outputs;
 
-/// Largest volume that is converted on the async runtime's thread, bytes. That takes tens of microseconds, as long as
-/// handing it to another thread.
+/// Largest volume that is converted on the async runtime's thread, bytes. The conversion takes tens of microseconds, as
+/// long as passing it to another thread.
 const INLINE_BYTES: usize = 1 << 20;
 
 /// `grasp.v1.GraspService`.
@@ -38,9 +38,9 @@ pub(crate) struct GraspApi {
     pub tracked_volumes: Arc<TrackedVolumes>,
     pub recorder: Recorder,
     pub streams: OpenStreams,
-    /// Time in which a client reads a reply of a stream.
+    /// Time in which a client must read a reply of a stream.
     pub stall: Duration,
-    /// Requests of one stream that are in work at the same time.
+    /// Requests of one stream that are in progress at the same time.
     pub read_ahead: usize,
     /// Permits of the requests that are converted and fused.
     pub conversions: FairSemaphore,
@@ -60,7 +60,7 @@ impl Views {
         })
     }
 
-    /// Checks that there are views, not too many.
+    /// Checks that there are views, but not too many.
     fn check(&self) -> Result<(), RequestError> {
         check_views(match self {
             Self::Depth(views) => views.len(),
@@ -122,7 +122,8 @@ impl GraspApi {
         Ok(SceneRequest { model, params: params.into(), scenes, origin, waited })
     }
 
-    /// Decodes views, and fuses them for a model. With `find_objects`, the objects on a table that is found are found, too.
+    /// Decodes views, and fuses them for a model. If the table is to be found, `find_objects` says whether to find the
+    /// objects on it, too.
     async fn of_views(
         &self,
         views: Views,
@@ -230,7 +231,7 @@ impl GraspApi {
     }
 }
 
-/// The checked workspace of a message, and its frame and time.
+/// The checked workspace of a message, and its frame and time stamp.
 fn workspace_of(message: Option<pb::Workspace>) -> Result<(Workspace, FrameStamp), RequestError> {
     let mut message = message.unwrap_or_default();
     let frame_id = std::mem::take(&mut message.frame_id);

@@ -46,7 +46,7 @@ pub(crate) struct InferenceApi {
     control: ModelControl,
     /// Permits of the requests that are converted.
     conversions: FairSemaphore,
-    /// Limits the memory of maps, which are a hundred times as large as the grasps in them.
+    /// Limits the memory of maps, which are a hundred times as large as the grasps decoded from them.
     response_buffer: ResponseBuffer,
 }
 
@@ -59,7 +59,8 @@ impl InferenceApi {
         *self.calls.state().borrow() == State::Ready
     }
 
-    /// The network with this name, which is in the field `field`, and version. Planners without a network are not found.
+    /// The network with this name and version; `field` of the request has the name. Planners without a network are not
+    /// found.
     fn network(&self, field: &'static str, name: &str, version: &str) -> Result<Arc<Model>, RequestError> {
         self.calls.check_started()?;
         self.models.network(field, name, version)
@@ -101,7 +102,7 @@ impl InferenceApi {
         }
         timings.queue += waited;
         timings.total = call.elapsed();
-        // Copies megabytes.
+        // Copies megabytes, which would block a thread of the async runtime.
         let copied = spawn_blocking(move || response(request, &model, &maps, &timings)).await;
         let failed = |panic| RequestError::new(Code::Internal, format!("copying the maps panicked: {panic}"));
         Ok((copied.map_err(failed)?, Outcome::Inferred(timings), permit))
@@ -148,7 +149,7 @@ fn statistics(model: &Model) -> oip::ModelStatistics {
             queue: duration(succeeded, queue),
             compute_input: duration(succeeded, preprocessing),
             compute_infer: duration(succeeded, inference),
-            // As compute_output of Triton: all work on the outputs of the network.
+            // Like Triton's compute_output: all work on the outputs of the network.
             compute_output: duration(succeeded, output),
         }),
     }
@@ -202,7 +203,7 @@ fn one_repository(name: &str) -> Result<(), RequestError> {
     Err(RequestError::invalid("repository_name", format_args!("`{}`", on_a_line(name)), "must be empty"))
 }
 
-/// The response: the maps of all volumes, concatenated to one tensor per requested output.
+/// The response: the maps of all volumes, concatenated into one tensor per requested output.
 fn response(
     request: oip::ModelInferRequest,
     model: &Model,

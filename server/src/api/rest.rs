@@ -1,5 +1,5 @@
-//! HTTP/1.1 for clients without gRPC: grasps in depth images as JSON, and the Open Inference Protocol, which are the requests
-//! of `api::inference` with tensors as JSON or binary (Triton's extension).
+//! HTTP/1.1 for clients without gRPC: grasps in depth images as JSON, and the Open Inference Protocol: the requests of
+//! `api::inference` with tensors as JSON or binary (Triton's extension).
 
 mod body;
 mod detect;
@@ -27,7 +27,7 @@ use tokio::sync::{Semaphore, watch};
 use tokio::time::timeout_at;
 use tonic::metadata::MetadataMap;
 use tonic::{Code, Status};
-use tonic_types::StatusExt;
+use tonic_types::{ErrorDetails, StatusExt};
 
 use crate::api::grasp::GraspApi;
 use crate::api::inference::InferenceApi;
@@ -41,8 +41,11 @@ use crate::transport::tokens::Tokens;
 use body::{discard, read};
 use tensors::{HEADER_LENGTH, InferRequest, Parameters, response};
 
-/// Time after which an infer request expires, unless its header `grpc-timeout` has another.
+/// Time after which a request for inference or grasps expires, unless its header `grpc-timeout` has another.
 const TIMEOUT: Duration = Duration::from_secs(60);
+
+/// Retry hint if too many requests wait for their conversion, which takes milliseconds.
+const CONVERSIONS_WAIT: Duration = Duration::from_secs(1);
 
 /// State shared by the handlers.
 #[derive(Clone)]
@@ -53,8 +56,8 @@ pub(crate) struct Rest {
     pub tokens: Option<Arc<Tokens>>,
     pub limits: Limits,
     pub metrics: Arc<Metrics>,
-    /// One permit per CPU. A request holds one while its tensors are converted, because JSON needs much more memory than
-    /// its text.
+    /// One permit per CPU. A request holds one while its tensors are converted, because parsed JSON needs much more
+    /// memory than its text.
     pub conversions: Arc<Semaphore>,
     /// One permit for each request that may wait for a conversion.
     pub waiting: Arc<Semaphore>,
@@ -332,15 +335,19 @@ impl Rest {
         keep_permit(response, self.limits).map(Body::new)
     }
 
-    /// Runs a conversion on a thread for blocking tasks: megabytes of JSON would block those of the async runtime. A bounded
-    /// number of requests wait for it, at most until their deadline.
+    /// Runs a conversion on a thread for blocking tasks: megabytes of JSON would block those of the async runtime. A
+    /// bounded number of requests wait for it, at most until their deadline.
     async fn convert<T: Send + 'static>(
         &self,
         deadline: Deadline,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, Status> {
         let waiting = Arc::clone(&self.waiting).try_acquire_owned();
-        let waiting = waiting.map_err(|_| Status::resource_exhausted("too many requests wait for their conversion"))?;
+        let waiting = waiting.map_err(|_| {
+            let message = "too many requests wait for their conversion; retry later";
+            let details = ErrorDetails::with_retry_info(Some(CONVERSIONS_WAIT));
+            Status::with_error_details(Code::ResourceExhausted, message, details)
+        })?;
         let permit = timeout_at(deadline.0.into(), Arc::clone(&self.conversions).acquire_owned()).await;
         let permit = permit.map_err(|_| Status::deadline_exceeded("the deadline passed before the conversion"))?;
         drop(waiting);

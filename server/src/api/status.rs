@@ -15,8 +15,8 @@ pub(crate) fn code(error: &RequestError) -> Code {
 }
 
 /// The gRPC status, with details for clients: `google.rpc.BadRequest` names the field, `google.rpc.RetryInfo` and the
-/// trailer for gRPC's built-in retries contain the retry hint, and `google.rpc.RequestInfo` the request id that is in the
-/// server's log.
+/// trailer for gRPC's built-in retries contain the retry hint, and `google.rpc.RequestInfo` the request id that is in
+/// the server's log.
 pub(crate) fn status(error: &RequestError, request_id: &str) -> Status {
     let mut details = ErrorDetails::new();
     details.set_request_info(request_id, "");

@@ -95,8 +95,8 @@ pub(super) struct Flags {
     #[arg(long, env = "GRASPD_MAX_BATCH", value_name = "N", default_value = "1", value_parser = count())]
     pub max_batch: u16,
 
-    /// Maximum time that a volume waits for a batch to fill, milliseconds; at most half of the time until its deadline. 0
-    /// disables waiting.
+    /// Maximum time that a volume waits for a batch to fill, milliseconds; at most half of the time until its deadline.
+    /// 0 disables waiting.
     #[arg(
         long,
         env = "GRASPD_BATCH_DELAY",
@@ -132,8 +132,8 @@ pub(super) struct Flags {
     #[arg(long, env = "GRASPD_ALLOW_MODEL_CONTROL")]
     pub allow_model_control: bool,
 
-    /// Address of the Open Inference Protocol's REST listener, for inference clients without gRPC, with the limits, the
-    /// tokens and the TLS files of the gRPC listener. If not set, there is none.
+    /// Address of the REST listener, for clients without gRPC: grasps in depth images as JSON, and the Open Inference
+    /// Protocol, with the limits, the tokens and the TLS files of the gRPC listener. If not set, there is none.
     #[arg(long, env = "GRASPD_REST", value_name = "ADDR")]
     pub rest: Option<SocketAddr>,
 
@@ -181,8 +181,8 @@ pub(super) struct Flags {
     #[arg(long, env = "GRASPD_MAX_CONNECTIONS", value_name = "N", default_value = "16384")]
     pub max_connections: NonZeroUsize,
 
-    /// Time after which a gRPC connection accepts no further calls and is closed when the open ones end, seconds. Clients
-    /// connect again, so that they find the replicas that were added since. 0 disables the limit.
+    /// Time after which a gRPC connection accepts no further calls and is closed when the open ones end, seconds.
+    /// Clients connect again, so that they find the replicas that were added since. 0 disables the limit.
     #[arg(
         long,
         env = "GRASPD_MAX_CONNECTION_AGE",
@@ -192,8 +192,8 @@ pub(super) struct Flags {
     )]
     pub max_connection_age: Duration,
 
-    /// Maximum number of volumes that open TrackGrasps streams keep: each has one, or one for each cube of its workspace.
-    /// Further ones are refused.
+    /// Maximum number of volumes that open TrackGrasps streams keep: each has one, or one for each cube of its
+    /// workspace. Further ones are refused.
     #[arg(long, env = "GRASPD_MAX_TRACKED", value_name = "N", default_value = "256", value_parser = count())]
     pub max_tracked: u16,
 

@@ -15,8 +15,8 @@ const LINES: u64 = 50;
 /// Interval at which suppressed lines are reported.
 const REPORT: Duration = Duration::from_secs(10);
 
-/// A log filter that suppresses further lines of a place in the code within a second. Lines at the levels `debug` and
-/// `trace` are written only on request, and not limited, except those of the HTTP/2 library.
+/// A log filter that suppresses lines of a place in the code beyond [`LINES`] per second. Lines at the levels `debug`
+/// and `trace` are written only on request, and are not limited, except those of the HTTP/2 library.
 #[derive(Clone)]
 pub(super) struct LogRate {
     places: Arc<Mutex<HashMap<Identifier, Place>>>,
@@ -57,7 +57,7 @@ impl LogRate {
         is_admitted
     }
 
-    /// Reports the suppressed lines, for ever.
+    /// Reports the suppressed lines; never returns.
     pub async fn report(self) {
         let mut interval = tokio::time::interval(REPORT);
         loop {

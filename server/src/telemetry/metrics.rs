@@ -73,7 +73,7 @@ struct QueueMetrics {
     waiting: IntGauge,
     /// Volumes per batch.
     batch: Histogram,
-    /// The queue was full; the reply would have been too late; another request took their place.
+    /// The queue was full; the reply would have been too late; another request took its place.
     refused: [IntCounter; 3],
     /// Accepted scenes, by [`Priority`].
     queued: [IntCounter; 2],
@@ -277,7 +277,7 @@ impl Metrics {
         self.warnings.with_label_values(&[model, warning_name(code)]).inc();
     }
 
-    /// Removes the series of the models that are no longer served for a while.
+    /// Removes the series of the models that have not been served for [`RETENTION`].
     fn remove_retired(&self, now: Instant) {
         let expired: Vec<String> = self
             .retired()
@@ -328,7 +328,7 @@ impl Metrics {
         self.recordings.clone()
     }
 
-    /// The gauge of open TrackGrasps streams.
+    /// The gauge of the volumes that open TrackGrasps streams keep.
     pub fn tracked(&self) -> IntGauge {
         self.tracked.clone()
     }

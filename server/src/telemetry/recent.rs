@@ -76,7 +76,7 @@ impl Outcome {
 }
 
 impl Shown {
-    /// Most voxels of the stored volumes: 1 MB per request. Further cubes have no surface on the page.
+    /// Maximum number of voxels of the stored volumes: 1 MB per request. Further cubes have no surface on the page.
     const MAX_VOXELS: usize = 1 << 18;
 
     pub fn new(

@@ -21,8 +21,8 @@ use tracing::warn;
 
 use crate::api::status::message;
 
-/// Recordings that wait to be written, and their bytes. Further ones are dropped and counted, so that a slow disk delays
-/// no reply and fills no memory.
+/// Maximum number of recordings that wait to be written, and of their bytes. Further ones are dropped and counted, so
+/// that a slow disk neither delays replies nor fills the memory.
 const WAITING: usize = 64;
 const WAITING_BYTES: usize = 64 << 20;
 
@@ -91,7 +91,7 @@ impl Recorder {
 }
 
 impl<T> Recording<T> {
-    /// Is not recorded.
+    /// A request that is not recorded.
     pub fn none() -> Self {
         Self(None)
     }
@@ -169,7 +169,7 @@ impl Files {
         let path = self.folder.join(format!("{now:019}-{:06}.{EXTENSION}", self.next));
         self.next += 1;
         let partial = path.with_extension(PARTIAL);
-        // The scenes of a robot are not for every user of the machine.
+        // Other users of the machine must not read the scenes of a robot.
         let mut file = fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(&partial)?;
         if let Err(error) = file.write_all(&bytes).and_then(|()| fs::rename(&partial, &path)) {
             let _ = fs::remove_file(&partial);
@@ -188,7 +188,7 @@ impl Files {
             // Subtracted although the removal may fail: then the next one is removed instead.
             self.bytes -= bytes;
             match fs::remove_file(oldest) {
-                // It was removed before.
+                // It was already removed.
                 Err(error) if error.kind() == io::ErrorKind::NotFound => {}
                 removed => removed?,
             }

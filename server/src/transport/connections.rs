@@ -145,7 +145,7 @@ impl Connection {
         Self { stream, preface: Some((PREFACE, Box::pin(sleep(timeout)))), _permit: permit, peer }
     }
 
-    /// The bytes, when the handshake is done.
+    /// The bytes, once the handshake is done.
     fn poll_bytes(&mut self, context: &mut Context<'_>) -> Poll<io::Result<Pin<&mut dyn Bytes>>> {
         if let Stage::Handshake(handshake) = &mut self.stream {
             let done = Pin::new(handshake.as_mut()).poll(context);
@@ -228,7 +228,7 @@ impl AsyncWrite for Connection {
     fn is_write_vectored(&self) -> bool {
         match &self.stream {
             Stage::Plain(stream) => stream.is_write_vectored(),
-            // As TlsStream, which encrypts the slices one after the other.
+            // Like `TlsStream`, which encrypts the slices one after the other.
             Stage::Handshake(_) | Stage::Tls(_) | Stage::Failed => true,
         }
     }

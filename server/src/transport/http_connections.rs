@@ -84,7 +84,7 @@ pub(crate) async fn serve(listener: TcpListener, config: HttpConfig, app: Router
     tasks.wait().await;
 }
 
-/// A place for a connection. At the limit, the oldest connection without a request ends for it.
+/// A place for a connection. At the limit, the oldest connection without a request is closed to make room.
 async fn place(open: &mut Vec<Open>, limit: &ConnectionLimit) -> Option<ConnectionPermit> {
     if let Some(permit) = limit.acquire() {
         return Some(permit);
@@ -106,7 +106,7 @@ async fn serve_connection(
 ) {
     let address = stream.peer_addr().ok();
     let peer = Peer { address, share: budget.of_peer(address.map(|address| address.ip().to_canonical())) };
-    // Without it, a response of several packets waits for the client's acknowledgement of the first.
+    // Without TCP_NODELAY, a response of several packets waits for the client's acknowledgement of the first.
     let _ = stream.set_nodelay(true);
     let mut stream = TimeoutStream::new(stream);
     stream.set_write_timeout(Some(WRITE_TIMEOUT));

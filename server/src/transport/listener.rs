@@ -26,9 +26,9 @@ use crate::transport::tokens::Tokens;
 use crate::transport::{connections, deadline, request_body, tokens};
 
 /// HTTP/2's default of 64 KiB is a quarter of a 40³ volume: the client would wait for a window update four times per
-/// request. Only what the server does not read stays in a window: requests without a stream are read at once, within the
-/// [`ReceiveBudget`]; streams are not read while their replies are unread, so their number and that time are limited
-/// ([`OpenStreams`](crate::open_streams::OpenStreams)).
+/// request. Only what the server does not read stays in a window: requests without a stream are read at once, within
+/// the [`ReceiveBudget`]; streams are not read while their replies are unread, so their number and that time are
+/// limited ([`OpenStreams`](crate::open_streams::OpenStreams)).
 const STREAM_WINDOW: u32 = 1 << 20;
 /// Several volumes in flight on one connection.
 const CONNECTION_WINDOW: u32 = 4 << 20;

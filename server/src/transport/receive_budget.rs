@@ -23,8 +23,9 @@ pub(crate) struct ReceiveBudget {
     peers: Mutex<HashMap<Option<IpAddr>, Weak<AtomicUsize>>>,
 }
 
-/// The part of the budget that a peer may use with all of its connections: at most as much as the other peers leave free,
-/// so half of the capacity if it is the only one. Thus clients that never complete their messages leave memory for others.
+/// The part of the budget that a peer may use with all of its connections: at most half of what the other peers leave,
+/// so half of the capacity if it is the only one. Thus clients that never complete their messages leave memory for
+/// others.
 #[derive(Clone)]
 pub(crate) struct PeerShare {
     budget: Arc<ReceiveBudget>,

@@ -24,7 +24,7 @@ const PREFIX: usize = 5;
 /// Suffixes of the methods with a client stream.
 const STREAMS: [&str; 3] = ["Stream", "TrackGrasps", REFLECTION];
 
-/// The method of the reflection service. Its implementation does not know that the server drains.
+/// The method of the reflection service. Its implementation does not end when the server drains.
 const REFLECTION: &str = "ServerReflectionInfo";
 
 /// Minimum rate of a message, bytes per second. It refuses clients that send single bytes and so never stall.
@@ -113,7 +113,7 @@ impl RequestBody {
         let is_stream = STREAMS.iter().any(|stream| path.ends_with(stream));
         Self {
             body,
-            // Not for streams, whose responses are useful although the stream has not ended.
+            // Not for streams, whose responses are useful before the stream has ended.
             deadline: deadline.filter(|_| !is_stream),
             limits,
             metrics,
@@ -177,9 +177,9 @@ impl RequestBody {
     }
 }
 
-/// The status of a request that was cancelled or whose connection was lost. A client that cancels resets the stream, which hyper reports as the end of the
-/// body, and a lost connection as its error. tonic takes both, and the code CANCELLED, for the end of the request, and
-/// would report a malformed message.
+/// The status of a request that was cancelled or whose connection was lost. hyper reports the reset of a stream by a
+/// client that cancels as the end of the body, and a lost connection as an error of the body. tonic takes both, and the
+/// code CANCELLED, for the end of the request, and would report a malformed message.
 fn gone() -> Status {
     Status::aborted("the client has cancelled the request or is gone")
 }

@@ -1,4 +1,5 @@
-//! Limits on the memory of large responses that clients have not read yet, and on the time in which they must read them.
+//! Limits on the memory of large responses that clients have not read yet, and on the time in which they must read
+//! them.
 
 use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
@@ -74,7 +75,7 @@ struct Unread {
 impl PermitBody {
     fn new(body: Body, permit: ResponsePermit, limits: Limits) -> Self {
         let now = Instant::now();
-        // Only REST knows the length: JSON is longer than its maps.
+        // Only REST responses have a known length: JSON is longer than its maps.
         let length = http_body::Body::size_hint(&body).exact().and_then(|length| usize::try_from(length).ok());
         let end = now + limits.longest(length.unwrap_or(permit.bytes));
         let unread = Unread { body, rest: Bytes::new(), last: now, _permit: permit };

@@ -18,7 +18,7 @@ const SOON: Duration = Duration::from_secs(14 * 24 * 3600);
 /// A checked configuration of TLS.
 #[derive(Clone)]
 pub(crate) struct Tls {
-    /// Of the gRPC listener, which speaks HTTP/2.
+    /// Of the gRPC listener, which uses HTTP/2.
     pub grpc: TlsAcceptor,
     /// The same for HTTP/1.1.
     pub http: TlsAcceptor,

@@ -7,6 +7,7 @@ use grasp_data::{Provenance, Setup, packed};
 use grasp_models::{Network, Options};
 use grasp_planner::{Evaluator, NetworkPlanner, Planner};
 use grasp_sim::ordered;
+use grasp_sim::planner::PlannerSpec;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::data::DataArgs;
@@ -18,13 +19,13 @@ pub struct Proposals {
     #[command(flatten)]
     data: DataArgs,
 
-    /// The network that proposes grasps.
-    #[arg(long)]
+    /// The network that proposes grasps: a file, or the name of one that comes with graspd.
+    #[arg(long, value_name = "FILE|NAME", value_parser = network)]
     network: PathBuf,
 
     /// Try the grasps as this evaluator scores and moves them, so that the next evaluator is trained on the errors of
-    /// this one.
-    #[arg(long)]
+    /// this one: a file, or the name of a model with an evaluator that comes with graspd.
+    #[arg(long, value_name = "FILE|NAME", value_parser = evaluator)]
     evaluator: Option<PathBuf>,
 
     /// Number of scenes.
@@ -68,6 +69,24 @@ impl Proposals {
         )?;
         progress.finish();
         Ok(())
+    }
+}
+
+/// The file of a network.
+fn network(text: &str) -> Result<PathBuf, String> {
+    match text.parse()? {
+        PlannerSpec::Network(file) => Ok(file),
+        _ => Err("is not a network alone".to_owned()),
+    }
+}
+
+/// The file of an evaluator.
+fn evaluator(text: &str) -> Result<PathBuf, String> {
+    match text.parse()? {
+        PlannerSpec::Evaluated { evaluator: file, .. } => Ok(file),
+        // Of files only the ending is known.
+        PlannerSpec::Network(file) if file.as_path() == Path::new(text) => Ok(file),
+        _ => Err("has no evaluator".to_owned()),
     }
 }
 

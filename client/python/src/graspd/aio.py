@@ -150,7 +150,8 @@ class Client(Connection[grpc.aio.Channel]):
         return await self._call(methods.LIST_MODELS, pb.ListModelsRequest())
 
     async def health(self) -> bool:
-        """Whether the server is ready; False while it is warming up or shutting down."""
+        """Whether the server is ready; False while it is warming up or shutting down, or
+        all sessions of a model hang or fail."""
         return await self._call(methods.CHECK, HealthCheckRequest())
 
     async def wait_ready(self, timeout: float) -> None:

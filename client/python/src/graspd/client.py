@@ -149,7 +149,8 @@ class Client(Connection[grpc.Channel]):
         return self._call(methods.LIST_MODELS, pb.ListModelsRequest())
 
     def health(self) -> bool:
-        """Whether the server is ready; False while it is warming up or shutting down."""
+        """Whether the server is ready; False while it is warming up or shutting down, or
+        all sessions of a model hang or fail."""
         return self._call(methods.CHECK, HealthCheckRequest())
 
     def wait_ready(self, timeout: float) -> None:

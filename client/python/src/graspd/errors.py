@@ -53,7 +53,7 @@ class Aborted(Error):
 
 
 class Unavailable(Error):
-    """The server is unreachable, warming up or shutting down."""
+    """The server is unreachable, warming up or shutting down, or all sessions of the model hang."""
 
 
 class Unauthenticated(Error):

@@ -1,4 +1,5 @@
-//! Files of intrinsics, of ROS, OpenCV, Open3D, librealsense, kalibr, BOP and others, and numbers on the command line.
+//! Intrinsics from files of ROS, OpenCV, Open3D, librealsense, kalibr, BOP and others, or from numbers on the command
+//! line.
 
 use std::path::{Path, PathBuf};
 
@@ -201,8 +202,8 @@ fn metres(depth_scale: f64) -> f64 {
     }
 }
 
-/// The camera of the images that ROS sends if it crops them (`roi`) and then combines pixels (`binning`): CameraInfo has the
-/// intrinsics of the whole sensor.
+/// The camera of the images that ROS sends if it crops them (`roi`) and then combines pixels (`binning`): CameraInfo
+/// has the intrinsics of the whole sensor.
 fn windowed(camera: Camera, map: &Map<String, Value>) -> Camera {
     let roi = map.get("roi").and_then(Value::as_object);
     let of_roi = |key: &str| roi.and_then(|roi| roi.get(key)?.as_f64()).unwrap_or(0.0);

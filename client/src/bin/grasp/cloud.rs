@@ -32,8 +32,8 @@ impl From<Vec<[f32; 3]>> for Points {
     }
 }
 
-/// Reads points, x y z in units of `scale` metres, from a .npy, .npz, .pcd, .ply or .xyz file. Without a scale, integers
-/// are in millimetres and floats in metres.
+/// Reads points, x y z in units of `scale` metres, from a .npy, .npz, .pcd, .ply or .xyz file. Without a scale,
+/// integers are in millimetres and floats in metres.
 pub(crate) fn read(path: &Path, scale: Option<f64>) -> anyhow::Result<Vec<[f32; 3]>> {
     let Points { xyz, are_integers } = unscaled(path)?;
     let scale = scale.unwrap_or(if are_integers { MILLIMETRE } else { 1.0 });
@@ -211,7 +211,8 @@ impl PropertyAccess for Vertex {
     }
 }
 
-/// An ASCII file whose nan, a point that was not measured, is a number beyond the range of a float: ply_rs refuses nan.
+/// The file with each nan of an ASCII file, a point that was not measured, replaced by a number beyond the range of a
+/// float: ply_rs refuses nan.
 fn with_numbers_for_nan(file: Vec<u8>) -> Vec<u8> {
     let Some(text) = std::str::from_utf8(&file).ok().filter(|text| text.contains("\nformat ascii")) else {
         return file;

@@ -13,8 +13,8 @@ use crate::scene::Scene;
 use crate::show;
 use crate::view::ViewArgs;
 
-/// A depth image of household-like objects on a table, with the noise of a stereo camera: `grasp-sim label --scene packed
-/// --objects test --sensor stereo --views random:1 --seed 5`, in millimetres.
+/// A depth image of household-like objects on a table, with the noise of a stereo camera:
+/// `grasp-sim label --scene packed --objects test --sensor stereo --views random:1 --seed 5`, in millimetres.
 const IMAGE: &[u8] = include_bytes!("demo.png");
 
 /// The intrinsic matrix of its camera.
@@ -28,7 +28,7 @@ pub(crate) struct Demo {
 }
 
 impl Demo {
-    /// Asks the server at `address`, or one that it starts for this call if none runs there.
+    /// Calls the server at `address`, or starts one for this call if none runs there.
     pub async fn run(self, address: String, access: Access, json: bool) -> anyhow::Result<()> {
         let (depth, width, height) = image::decode_png(Cursor::new(IMAGE))?;
         let extrinsics = Extrinsics::FrameFromCamera(Isometry3::identity());
@@ -52,7 +52,7 @@ impl Demo {
         eprintln!("grasp: the picture is {}", picture.display());
         drop(client);
         if let Some(server) = server {
-            // Elsewhere, so that this thread can close the connection, for which the server waits.
+            // On another thread, so that this one can close the connection, for which the server waits.
             tokio::task::spawn_blocking(move || server.stop()).await??;
         }
         Ok(())

@@ -55,7 +55,8 @@ pub(crate) struct DetectArgs {
     #[arg(long, value_name = "X,Y,Z,X,Y,Z", allow_hyphen_values = true)]
     region: Option<Numbers<6>>,
 
-    /// Pose of the frame of --region in the frame of the grasps, for a box of any direction. Formats as for --workspace.
+    /// Pose of the frame of --region in the frame of the grasps, for a box of any orientation. Formats as for
+    /// --workspace.
     #[arg(long, value_name = "FILE|NUMBERS", requires = "region", allow_hyphen_values = true)]
     region_pose: Option<Poses>,
 
@@ -75,8 +76,8 @@ pub(crate) struct DetectArgs {
     #[arg(long, value_name = "X,Y,Z,X,Y,Z", allow_hyphen_values = true, requires = "gripper")]
     palm: Option<Numbers<6>>,
 
-    /// Check of the open hand for collisions with the observed surface and the table. Default: filter for depth images and
-    /// point clouds, off for a volume.
+    /// Check of the open hand for collisions with the observed surface and the table. Default: filter for depth images
+    /// and point clouds, off for a volume.
     #[arg(long, value_enum)]
     collision: Option<Collision>,
 
@@ -84,8 +85,8 @@ pub(crate) struct DetectArgs {
     #[arg(long, value_name = "METRES")]
     clearance: Option<f64>,
 
-    /// In the collision check, also treat as an obstacle what lies behind a surface in a view and was measured
-    /// by none.
+    /// In the collision check, also treat as an obstacle what lies behind a surface in a view and was measured by no
+    /// view.
     #[arg(long)]
     hidden: bool,
 

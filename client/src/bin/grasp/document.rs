@@ -12,7 +12,7 @@ pub(crate) fn document(path: &Path) -> anyhow::Result<Value> {
     parse(std::str::from_utf8(&bytes).ok().context("neither text nor a .npy or .npz file")?)
 }
 
-/// Parses a document. Of several YAML documents, as `rostopic echo` prints them, it is the first.
+/// Parses a document. Of several YAML documents, as `rostopic echo` prints them, it parses the first.
 pub(crate) fn parse(text: &str) -> anyhow::Result<Value> {
     if let Some(rows) = rows(text) {
         return Ok(rows);

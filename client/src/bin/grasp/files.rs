@@ -58,7 +58,7 @@ impl Format {
     }
 }
 
-/// Adds the path to the error of `read`, and says what it means that the file ends too early.
+/// Adds the path to the error of `read`, and explains an unexpected end of the file.
 pub(crate) fn in_file<T>(path: &Path, read: impl FnOnce(&Path) -> anyhow::Result<T>) -> anyhow::Result<T> {
     let is_cut_short = |error: &anyhow::Error| {
         let of_reading = error.downcast_ref::<io::Error>().map(io::Error::kind);

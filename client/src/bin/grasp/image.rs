@@ -127,7 +127,7 @@ fn exr(path: &Path) -> anyhow::Result<(Depth, u32, u32)> {
     let image = reader.all_attributes().non_parallel().from_file(path).context("not a valid EXR file")?;
     let channels = || image.layer_data.iter().flat_map(|layer| layer.channel_data.list.iter().map(move |c| (layer, c)));
     let found = channels().find(|(_, channel)| is_depth(&channel.name.to_string()));
-    // A depth image of one channel needs no name, nor one whose channels are equal.
+    // A depth image with one channel, or with equal channels, needs no channel name.
     let values = |channel: &exr::prelude::AnyChannel<exr::prelude::FlatSamples>| -> Vec<f32> {
         channel.sample_data.values_as_f32().collect()
     };

@@ -25,7 +25,7 @@ impl Labels {
     }
 }
 
-/// Reads the labels of objects from a PNG with 8- or 16-bit grey values, or a .npy file with integers, truth values, or
+/// Reads the labels of objects from a PNG with 8- or 16-bit grey values, or a .npy file with integers, booleans, or
 /// floats that are whole numbers.
 pub(crate) fn read(path: &Path) -> anyhow::Result<Labels> {
     files::in_file(path, |path| match Format::from_path(path)? {

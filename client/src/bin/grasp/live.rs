@@ -1,4 +1,4 @@
-//! Live view: a server to which Foxglove connects, of the protocol `foxglove.sdk.v1` over WebSocket.
+//! Live view: a server to which Foxglove connects, with the protocol `foxglove.sdk.v1` over WebSocket.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -16,7 +16,8 @@ use crate::messages::Message;
 /// Where the server listens by default: the address that Foxglove proposes for a connection.
 pub(crate) const DEFAULT_ADDRESS: &str = "127.0.0.1:8765";
 
-/// Largest number of messages queued for a viewer. Beyond it the oldest are dropped; newer ones of the same topics follow.
+/// Largest number of messages queued for a viewer. Beyond it the oldest are dropped; newer ones of the same topics
+/// follow.
 const BACKLOG: usize = 32;
 
 /// Id of the status message with the error of the newest detection.

@@ -181,8 +181,8 @@ struct Score {
     #[command(flatten)]
     detect: DetectArgs,
 
-    /// T_frame_grasp of each grasp, in the convention of --origin and --closing. Formats as for --camera-from-task, and the
-    /// output of `grasp detect --json`. JSON objects may have a `width`, metres, which is checked too.
+    /// T_frame_grasp of each grasp, in the convention of --origin and --closing. Formats as for --camera-from-task, and
+    /// the output of `grasp detect --json`. JSON objects may have a `width`, metres, which is checked too.
     #[arg(long, value_name = "FILE|NUMBERS", allow_hyphen_values = true)]
     grasps: Poses,
 }
@@ -295,7 +295,7 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             show::print(&if json { show::scores_json(&scores) } else { show::scores(&scores) })?;
         }
         Command::View(View { scene: args, detect, view }) => {
-            // The drawing needs the finger base frame, so that --origin and --closing do not apply.
+            // The drawing needs the finger base frame, so --origin and --closing do not apply.
             let (scene, detect) = (args.read()?, DetectOptions { convention: None, ..detect.read()? });
             view.check(&scene)?;
             let detection = scene.detect(&connect().await?, options(&args, detect.clone())).await?;
@@ -358,7 +358,7 @@ fn interrupted() -> Arc<AtomicBool> {
     let flag = Arc::new(AtomicBool::new(false));
     let set = Arc::clone(&flag);
     tokio::spawn(async move {
-        // An error means that Ctrl-C cannot be received, and keeps its effect.
+        // An error means that Ctrl-C cannot be received; it then ends the process as usual.
         if tokio::signal::ctrl_c().await.is_ok() {
             set.store(true, Ordering::Relaxed);
         }

@@ -43,7 +43,7 @@ pub(crate) struct Message {
 
 /// One message for each topic, in the frame of the grasps:
 ///
-/// - `/cloud`: what the cameras measured, also outside the workspace; of a volume there is none,
+/// - `/cloud`: what the cameras measured, also outside the workspace; absent for a volume,
 /// - `/surface`: the fused surface in the workspace,
 /// - `/workspace`: the edges of the workspace, the height of the table on its sides, and the axes of the task frame,
 /// - `/grasps`: the hands as lines, with their quality and width,

@@ -58,7 +58,8 @@ impl Poses {
         }
     }
 
-    /// All poses as grasps, each with its `width` if the file has one. The file may be the output of `grasp detect --json`.
+    /// All poses as grasps, each with its `width` if the file has one. The file may be the output of
+    /// `grasp detect --json`.
     pub fn candidates(&self) -> anyhow::Result<Vec<Candidate>> {
         match self {
             Self::Numbers(pose) => Ok(vec![Candidate::from(*pose)]),
@@ -139,8 +140,8 @@ fn candidates(path: &Path) -> anyhow::Result<Vec<Candidate>> {
     }
 }
 
-/// The pose of an object: position and orientation under the names of this program, of ROS or of easy_handeye, or a named
-/// matrix, alone or in another object.
+/// The pose of an object: position and orientation under the names of this program, of ROS or of easy_handeye, or a
+/// named matrix, alone or in another object.
 fn pose(value: &Value) -> anyhow::Result<Isometry3<f64>> {
     if let Some(found) = find(value) {
         return found;

@@ -163,7 +163,7 @@ impl Replay {
                 (Outcome::Changed(format!("was refused ({}), is answered now", before.message)), None)
             }
             (_, Err(now)) => (Outcome::Changed(format!("was answered, is refused now: {now}")), None),
-            _ => bail!("the answer is not one to its request"),
+            _ => bail!("the answer does not belong to its request"),
         })
     }
 

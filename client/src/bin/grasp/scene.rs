@@ -24,8 +24,8 @@ pub(crate) struct SceneArgs {
     /// Volume, depth images or point clouds. A volume is a .npy file, or a .npz file with one array or an array `grid`:
     /// N×N×N values in [0, 1] (u8: 0 to 255), indexed x, y, z, 0.5 on the surface, 0 if unobserved. With --intrinsics
     /// the files are depth images: PNG, TIFF or .npy with 16 bits per pixel (see --depth-scale), or TIFF, EXR or .npy
-    /// with floats in metres; 0 and NaN mean no reading. With --camera-position they are point clouds: PCD, PLY, .npy, or
-    /// .npz with one array or an array `points`, N×3 or H×W×3, metres.
+    /// with floats in metres; 0 and NaN mean no reading. With --camera-position they are point clouds: PCD, PLY, .npy,
+    /// or .npz with one array or an array `points`, N×3 or H×W×3, metres.
     #[arg(required = true)]
     files: Vec<PathBuf>,
 
@@ -33,13 +33,13 @@ pub(crate) struct SceneArgs {
     #[arg(long, value_name = "METRES", conflicts_with_all = ["intrinsics", "camera_position"])]
     voxel_size: Option<f64>,
 
-    /// Intrinsics of the cameras: JSON, YAML or text of ROS (CameraInfo), OpenCV, Open3D, librealsense, kalibr or BOP, a
-    /// matrix in a .npy or .npz, or the numbers FX,FY,CX,CY. Images of a lens with distortion are rectified.
+    /// Intrinsics of the cameras: JSON, YAML or text of ROS (CameraInfo), OpenCV, Open3D, librealsense, kalibr or BOP,
+    /// a matrix in a .npy or .npz, or the numbers FX,FY,CX,CY. Images of a lens with distortion are rectified.
     #[arg(long, value_name = "FILE|NUMBERS", conflicts_with = "camera_position")]
     intrinsics: Option<String>,
 
-    /// Unit of the depths, metres: 0.0001 for tenths of a millimetre. Default: that of the file of the intrinsics, or else
-    /// 0.001 for integers and 1 for floats.
+    /// Unit of the depths, metres: 0.0001 for tenths of a millimetre. Default: that of the file of the intrinsics, or
+    /// else 0.001 for integers and 1 for floats.
     #[arg(long, value_name = "METRES", value_parser = image::parse_scale, requires = "intrinsics")]
     depth_scale: Option<f64>,
 
@@ -63,8 +63,8 @@ pub(crate) struct SceneArgs {
     #[arg(long, value_name = "FILE|NUMBERS", requires = "intrinsics", allow_hyphen_values = true)]
     frame_from_camera: Option<Poses>,
 
-    /// Find the table in the first depth image or point cloud, and place the workspace over the objects on it: all of them,
-    /// if there is no --extent.
+    /// Find the table in the first depth image or point cloud, and place the workspace over the objects on it: all of
+    /// them, if there is no --extent.
     #[arg(long, conflicts_with_all = ["workspace", "camera_from_task", "voxel_size"])]
     find_table: bool,
 
@@ -99,8 +99,8 @@ pub(crate) struct SceneArgs {
     #[arg(long, value_name = "FILE|NUMBERS", allow_hyphen_values = true)]
     workspace: Option<Poses>,
 
-    /// Multiply the depths of each image or point cloud by one factor, so that the table is at its height; `=false`: of none.
-    /// Default: of depth images whose table is level and at most 3 cm from its height.
+    /// Multiply the depths of each image or point cloud by one factor, so that the table is at its height; `=false`:
+    /// never. Default: only of depth images whose table is level and at most 3 cm from its height.
     #[arg(
         long,
         value_name = "BOOL",
@@ -278,8 +278,8 @@ impl Scene {
         Ok((workspace.pose, Vector3::new(x, y, WORKSPACE_SIZE)))
     }
 
-    /// About `most` of the points that the cameras measured, in the frame of the grasps, with depths corrected as in the
-    /// server; `None` for a volume.
+    /// About `most` of the points that the cameras measured, in the frame of the grasps, with depths corrected as in
+    /// the server; `None` for a volume.
     pub fn points(&self, detection: &Detection, most: usize) -> anyhow::Result<Option<Vec<Point3<f64>>>> {
         let mut points = Vec::new();
         match self {
@@ -343,7 +343,7 @@ impl Scene {
     }
 }
 
-/// The workspace, with the pose and the extent that the server found if it searched the table.
+/// The workspace, with the pose and the extent that the server found if it searched for the table.
 fn found(workspace: &Workspace, detection: &Detection) -> anyhow::Result<Workspace> {
     let table = detection.table.as_ref();
     let found = table.and_then(|table| table.workspace.as_ref());
@@ -402,7 +402,7 @@ mod tests {
         surface.iter().map(|point| point.position.z).sum::<f64>() / surface.len() as f64
     }
 
-    /// What a camera measures that looks straight down at the middle of the workspace.
+    /// What a camera that looks straight down at the middle of the workspace measures.
     fn image() -> DepthView {
         let [eye, table] = HEIGHTS;
         let turned = Vector3::new(std::f64::consts::PI, 0.0, 0.0);

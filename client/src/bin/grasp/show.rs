@@ -56,7 +56,7 @@ pub(crate) fn detection(detection: &Detection) -> String {
     text
 }
 
-/// The lines on the table that was found and on the correction of the depths, if there are any.
+/// The lines about the table that was found and about the correction of the depths, if there are any.
 fn found(table: Option<&FoundTable>, depth_factors: &[f64]) -> String {
     let mut text = String::new();
     if let Some(table) = table {
@@ -283,7 +283,8 @@ pub(crate) fn models_json(models: &[Model]) -> String {
 }
 
 pub(crate) fn health(serving: bool) -> String {
-    if serving { "serving" } else { "not serving: warming up or shutting down" }.to_owned()
+    if serving { "serving" } else { "not serving: warming up, shutting down, or all sessions of a model hang or fail" }
+        .to_owned()
 }
 
 pub(crate) fn health_json(serving: bool) -> String {

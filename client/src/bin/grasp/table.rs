@@ -32,7 +32,8 @@ pub(crate) struct Table {
     #[arg(long, value_name = "X,Y,Z", conflicts_with = "intrinsics", allow_hyphen_values = true)]
     camera_position: Option<Numbers<3>>,
 
-    /// Unit of the depths, metres. Default: that of the file of the intrinsics, or else 0.001 for integers and 1 for floats.
+    /// Unit of the depths, metres. Default: that of the file of the intrinsics, or else 0.001 for integers and 1 for
+    /// floats.
     #[arg(long, value_name = "METRES", value_parser = image::parse_scale)]
     depth_scale: Option<f64>,
 
@@ -40,8 +41,8 @@ pub(crate) struct Table {
     #[arg(long, value_name = "METRES", value_parser = image::parse_scale, requires = "camera_position")]
     cloud_scale: Option<f64>,
 
-    /// Direction of gravity in the camera frame (z forward, x right, y down), or in the frame of the points: the reversed
-    /// reading of an accelerometer at rest. Without it a wall that fills the image is taken for a table.
+    /// Direction of gravity in the camera frame (z forward, x right, y down), or in the frame of the points: the
+    /// reversed reading of an accelerometer at rest. Without it a wall that fills the image is taken for a table.
     #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true)]
     gravity: Option<Numbers<3>>,
 
@@ -85,8 +86,8 @@ impl Table {
         Ok(())
     }
 
-    /// The table in the file, and the image in which it was searched. The caller's frame is that of the camera, or of the
-    /// points.
+    /// The table in the file, and the image in which it was searched for. The caller's frame is that of the camera, or
+    /// of the points.
     fn find(&self, workspace: &mut Workspace) -> anyhow::Result<(FoundTable, View)> {
         let (height, edge) = (self.table_height, WORKSPACE_SIZE);
         if let Some(Numbers(eye)) = self.camera_position {

@@ -29,8 +29,8 @@ pub(crate) struct Watch {
     #[arg(long, value_name = "N")]
     count: Option<u64>,
 
-    /// Also show each detection in Foxglove: the points, the surface, the workspace and the grasps. Foxglove connects to
-    /// this address (Open connection, Foxglove WebSocket, ws://localhost:8765). Default: 127.0.0.1:8765.
+    /// Also show each detection in Foxglove: the points, the surface, the workspace and the grasps. Foxglove connects
+    /// to this address (Open connection, Foxglove WebSocket, ws://localhost:8765). Default: 127.0.0.1:8765.
     #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = DEFAULT_ADDRESS)]
     live: Option<Address>,
 }

@@ -23,14 +23,14 @@ pub(crate) struct SceneRequest {
     pub waited: Duration,
 }
 
-/// What the response of a request has besides its results.
+/// What the response to a request contains besides the results.
 struct Context {
     params: Arc<DetectParams>,
     /// Without the scenes.
     seen: Scenes,
     origin: FrameStamp,
     waited: Duration,
-    /// Time until the scenes were queued, without the fusion and the waiting for it.
+    /// Time until the scenes were queued, without the fusion and the wait for it.
     preprocessing: Duration,
 }
 
@@ -72,7 +72,8 @@ impl SceneRequest {
 }
 
 impl Context {
-    /// The warnings of the request, and the one about the table in its volumes. A table that was found is where it was found.
+    /// The warnings of the request, and the one about the table in its volumes. A table that was found determined the
+    /// pose of the workspace, so there is no warning about it.
     fn warnings(&self, call: &Call, table: Option<Warning>) -> Vec<pb::GeometryWarning> {
         let table = table.filter(|_| self.seen.table.is_none());
         call.warn(&self.seen.warnings.iter().copied().chain(table).collect::<Vec<_>>())
@@ -209,7 +210,7 @@ async fn merged(
 }
 
 /// Waits for the results of all cubes. The timings of the sessions are those from the first cube to the last: the cubes
-/// are computed in parallel, and one after another.
+/// are computed in parallel or one after another.
 async fn all<T>(replies: Vec<Reply<T>>, deadline: Option<Instant>) -> Result<(Vec<T>, StageTimings), RequestError> {
     let mut values = Vec::with_capacity(replies.len());
     // When the first cube was taken from the queue, and the last one had passed each stage.
@@ -233,7 +234,7 @@ async fn all<T>(replies: Vec<Reply<T>>, deadline: Option<Instant>) -> Result<(Ve
     Ok((values, stages))
 }
 
-/// Waits for all results of a request. The first error ends the waiting, and the other scenes leave the queue.
+/// Waits for all results of a request. The first error ends the wait, and the other scenes leave the queue.
 pub(crate) async fn outputs<T>(
     replies: Vec<Reply<T>>,
     deadline: Option<Instant>,

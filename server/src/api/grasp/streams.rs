@@ -29,15 +29,15 @@ use crate::tracked_volumes::TrackPermit;
 /// The responses of a stream.
 type Responses = Response<BoxStream<pb::DetectGraspsStreamResponse>>;
 
-/// How long a stream that has been ended still reads what its client sends. A client that is sending may take the reset of
-/// its stream for a broken connection, and not see the status.
+/// How long the server still reads what the client of an ended stream sends. A client that is sending may take the
+/// reset of its stream for a broken connection, and not see the status.
 const LINGER: Duration = Duration::from_secs(2);
 
 /// The field of a `TrackGrasps` stream, and its frame and time.
 type Tracked = (Arc<Track>, FrameStamp);
 
 impl GraspApi {
-    /// Answers each request of a stream, in their order.
+    /// Answers the requests of a stream in order.
     pub(super) fn answer_each(
         &self,
         request: Request<Streaming<pb::DetectGraspsRequest>>,
@@ -71,8 +71,8 @@ impl GraspApi {
                 };
                 match message {
                     Ok(Some(request)) => {
-                        // A task, because a stream is not polled while its client reads no replies. If the client closes
-                        // the stream, the request counts as cancelled.
+                        // A task, because a stream is not polled while its client reads no replies. If the client
+                        // closes the stream, the request counts as cancelled.
                         let answer = tokio::spawn(api.clone().answer(request, context.clone()));
                         slot.send(Ok(AbortOnDropHandle::new(answer)));
                     }
@@ -131,7 +131,7 @@ impl GraspApi {
         tokio::spawn(async move {
             let ended = api.track_all(&mut requests, &replies, permit, context).await;
             if let Some(status) = ended {
-                // Waits for a client that reads no replies, at most for a while.
+                // Waits for a client that reads no replies, for a limited time.
                 let _ = timeout(LINGER, replies.send(Err(status))).await;
                 drop(replies);
                 linger(requests).await;
@@ -140,8 +140,8 @@ impl GraspApi {
         Ok(Response::new(Box::pin(ReceiverStream::new(sent))))
     }
 
-    /// Returns the status that ends the stream; None if the client has ended it. `permit` is released when the stream ends,
-    /// with the volumes.
+    /// Returns the status that ends the stream; None if the client has ended it. `permit` is released when the stream
+    /// ends, with the volumes.
     async fn track_all(
         &self,
         requests: &mut Streaming<pb::TrackGraspsRequest>,
@@ -182,8 +182,8 @@ impl GraspApi {
         }
     }
 
-    /// Adds the views of a request to the stream's volume, and detects grasps in it. A request that is refused later leaves
-    /// `views_added` true.
+    /// Adds the views of a request to the stream's volume, and detects grasps in it. A request that is refused after
+    /// that leaves `views_added` true.
     async fn add_views(
         &self,
         request: pb::TrackGraspsRequest,
@@ -244,7 +244,7 @@ fn shutting_down() -> RequestError {
     RequestError::new(Code::Unavailable, "the server is shutting down; retry on another replica")
 }
 
-/// Reads and drops what the client of an ended stream still sends, at most for a while.
+/// Reads and drops what the client of an ended stream still sends, for a limited time.
 async fn linger<T>(mut requests: Streaming<T>) {
     let _ = timeout(LINGER, async { while let Ok(Some(_)) = requests.message().await {} }).await;
 }

@@ -8,8 +8,8 @@ use grasp_proto::oip::model_infer_request::InferInputTensor;
 /// The only datatype of tensors.
 pub(super) const FP32: &str = "FP32";
 
-/// With this parameter Triton's clients request an empty message after the last response of a stream. `ModelInfer` is not
-/// a stream, so that it has no effect.
+/// With this parameter Triton's clients request an empty message after the last response of a stream. `ModelInfer` is
+/// not a stream, so it has no effect.
 const EMPTY_FINAL_RESPONSE: &str = "triton_enable_empty_final_response";
 
 /// Refuses parameters: ignoring, for example, a time limit would surprise the client.

@@ -34,8 +34,9 @@ pub(super) async fn read(mut body: Body, parts: &Parts, limits: Limits) -> Resul
     message
 }
 
-/// Reads the rest of a body whose request is refused: a client that is still sending would not read the response, and see
-/// only a broken connection. A client that asks first (`Expect: 100-continue`) sends nothing when it is refused.
+/// Reads the rest of a body whose request is refused: a client that is still sending would not read the response, and
+/// would see only a broken connection. A client that asks first (`Expect: 100-continue`) sends nothing when it is
+/// refused.
 pub(super) async fn discard(mut body: Body, parts: &Parts, limits: Limits) {
     if parts.headers.contains_key(EXPECT) {
         return;

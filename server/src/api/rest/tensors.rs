@@ -1,6 +1,6 @@
 //! The JSON messages of an inference, and the tensors in them or behind them.
 //!
-//! The sizes of lists are limited while they are read, because an empty element takes more memory than text.
+//! The sizes of lists are limited while they are read, because an empty element takes more memory than its text.
 
 use std::collections::HashMap;
 use std::fmt;
