@@ -1,8 +1,11 @@
-use nalgebra::{Isometry3, Point3, Vector3};
+use std::borrow::Borrow;
+
+use nalgebra::{Isometry3, Point3};
 use thiserror::Error;
 
+use crate::measurement::{Measurement, Sample};
 use crate::surface::Field;
-use crate::{DepthImage, Volume, VolumeError};
+use crate::{DepthImage, Details, Volume, VolumeError};
 
 /// Largest valid depth, metres, as in VGN's perception code.
 pub const DEPTH_MAX: f32 = 2.0;
@@ -13,14 +16,8 @@ pub const TRUNCATION_VOXELS: f64 = 4.0;
 /// Voxels whose |truncated distance| reaches this are read out as 0, like unobserved voxels (constant from Open3D).
 pub(crate) const NEAR_SURFACE: f32 = 0.98;
 
-/// Voxels projected per step.
-const LANES: usize = 8;
-
 /// Fuses depth images into a truncated signed distance field over a cube. Every view has the same weight, unless the
 /// field [forgets](Self::forgetting).
-///
-/// Follows Open3D's `UniformTSDFVolume`, which produced the data of VGN and GIGA: a voxel is sampled at its centre, its
-/// pixel is `floor(u + 0.5)`, and the distance is measured along the ray of that pixel.
 #[derive(Clone, Debug)]
 pub struct Fusion {
     resolution: usize,
@@ -131,71 +128,21 @@ impl Fusion {
     ///
     /// Returns the number of measured voxels. If it is 0, [`no_measurement`](Self::no_measurement) gives the reason.
     pub fn integrate(&mut self, image: &DepthImage, camera_from_task: &Isometry3<f64>) -> usize {
-        let decay = self.decay;
+        let (n, decay) = (self.resolution, self.decay);
+        let measurement = Measurement::new(image, camera_from_task, self.voxel_size, self.truncation);
         let mut measured = 0;
-        let camera = image.intrinsics();
-        let (fx, fy) = (camera.fx as f32, camera.fy as f32);
-        // Adding half a pixel turns truncation into rounding.
-        let (cx, cy) = (camera.cx as f32 + 0.5, camera.cy as f32 + 0.5);
-        let (width, height) = (camera.width, camera.height);
-        let (u_end, v_end) = (width as f32 - 1e-4, height as f32 - 1e-4);
-        let (inv_fx, inv_fy) = (1.0 / fx, 1.0 / fy);
-        let (principal_u, principal_v) = (camera.cx as f32, camera.cy as f32);
-        let depth = image.depth();
-        let inv_truncation = 1.0 / self.truncation;
-
-        let step = (camera_from_task.rotation * Vector3::new(0.0, 0.0, self.voxel_size)).cast::<f32>();
-        let n = self.resolution;
         for (row, voxels) in self.voxels.chunks_exact_mut(n).enumerate() {
-            let (x, y) = (row / n, row % n);
-            let centre = Point3::new(x as f64 + 0.5, y as f64 + 0.5, 0.5) * self.voxel_size;
-            let start = (camera_from_task * centre).cast::<f32>();
-            for (chunk, voxels) in voxels.chunks_mut(LANES).enumerate() {
-                // One chunk per iteration: the compiler turns these loops into vector instructions.
-                let (mut us, mut vs, mut zs) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
-                for lane in 0..LANES {
-                    let point = start + step * (chunk * LANES + lane) as f32;
-                    let inv_z = 1.0 / point.z;
-                    us[lane] = point.x * fx * inv_z + cx;
-                    vs[lane] = point.y * fy * inv_z + cy;
-                    zs[lane] = point.z;
-                }
-                for (lane, voxel) in voxels.iter_mut().enumerate() {
-                    let (u, v, z) = (us[lane], vs[lane], zs[lane]);
-                    if !(z > 0.0 && u >= 1e-4 && u < u_end && v >= 1e-4 && v < v_end) {
-                        continue;
-                    }
-                    // No overflow: the bounds check above passed.
-                    let (u, v) = (u as u32, v as u32);
-                    let d = depth[v as usize * width + u as usize];
-                    // Written so that NaN fails.
-                    if !(d > 0.0 && d <= DEPTH_MAX) {
-                        continue;
-                    }
-                    // A ray is never shorter than its depth, so most voxels need no square root.
-                    let behind = d - z;
-                    if behind <= -self.truncation {
-                        voxel.hide();
-                        continue;
-                    }
-                    let sample = if behind >= self.truncation {
-                        1.0
-                    } else {
-                        let (ray_x, ray_y) = ((u as f32 - principal_u) * inv_fx, (v as f32 - principal_v) * inv_fy);
-                        let distance = behind * (ray_x * ray_x + ray_y * ray_y + 1.0).sqrt();
-                        if distance <= -self.truncation {
-                            voxel.hide();
-                            continue;
-                        }
-                        (distance * inv_truncation).min(1.0)
-                    };
+            measurement.column([row / n, row % n, 0], n, |z, sample| match sample {
+                Sample::Hidden => voxels[z].hide(),
+                Sample::Distance(distance) => {
+                    let voxel = &mut voxels[z];
                     let weight = voxel.weight.max(0.0);
-                    let weight = decay.map_or(weight, |decay| decay * weight * voxel.support(sample));
-                    voxel.distance = (voxel.distance * weight + sample) / (weight + 1.0);
+                    let weight = decay.map_or(weight, |decay| decay * weight * voxel.support(distance));
+                    voxel.distance = (voxel.distance * weight + distance) / (weight + 1.0);
                     voxel.weight = weight + 1.0;
                     measured += 1;
                 }
-            }
+            });
         }
         measured
     }
@@ -298,6 +245,92 @@ impl Fusion {
         Ok(Volume::new(self.resolution, self.voxel_size, pose, self.values())?.with_hidden(hidden))
     }
 
+    /// The fused field as a validated volume at `pose` (`T_frame_task`), with the details that `views`, which were
+    /// integrated, show: images, and their `T_camera_task`.
+    ///
+    /// # Errors
+    /// [`VolumeError::Empty`] if no surface was observed.
+    pub fn detailed_volume<'a>(
+        &self,
+        pose: Isometry3<f64>,
+        views: &[(impl Borrow<DepthImage<'a>>, Isometry3<f64>)],
+    ) -> Result<Volume, VolumeError> {
+        let volume = self.volume(pose)?;
+        let details = Details::new(2 * self.resolution, self.voxel_size / 2.0, pose, self.details(views))?;
+        Ok(volume.with_details(details))
+    }
+
+    /// The bytes of [`Details`]. Where the voxels and those around them are all free, or all hidden, so are the smaller ones
+    /// in them.
+    fn details<'a>(&self, views: &[(impl Borrow<DepthImage<'a>>, Isometry3<f64>)]) -> Vec<u8> {
+        let (n, fine) = (self.resolution, 2 * self.resolution);
+        let views: Vec<_> = views
+            .iter()
+            .map(|(image, pose)| Measurement::new(image.borrow(), pose, self.voxel_size / 2.0, self.truncation))
+            .collect();
+        let uniform = self.uniform();
+        let mut bytes = vec![0; fine.pow(3)];
+        let mut sums = vec![(0.0, 0.0); fine];
+        for (row, bytes) in bytes.chunks_exact_mut(fine).enumerate() {
+            let (x, y) = (row / fine, row % fine);
+            let uniform = &uniform[(x / 2 * n + y / 2) * n..][..n];
+            let mut z = 0;
+            for run in uniform.chunk_by(|a, b| a == b) {
+                let end = z + 2 * run.len();
+                match run[0] {
+                    Some(byte) => bytes[z..end].fill(byte),
+                    None => {
+                        let sums = &mut sums[..end - z];
+                        sums.fill((0.0, 0.0));
+                        for view in &views {
+                            view.column([x, y, z], end - z, |index, sample| {
+                                if let Sample::Distance(distance) = sample {
+                                    sums[index].0 += distance;
+                                    sums[index].1 += 1.0;
+                                }
+                            });
+                        }
+                        let voxel = |&(sum, weight): &(f32, f32)| Voxel { distance: sum / weight, weight };
+                        bytes[z..end].iter_mut().zip(sums.iter()).for_each(|(byte, sum)| *byte = voxel(sum).detail());
+                    }
+                }
+                z = end;
+            }
+        }
+        bytes
+    }
+
+    /// For each voxel the byte of [`Details`] that it and all those around it have, if they are all free, or all hidden or
+    /// not measured.
+    fn uniform(&self) -> Vec<Option<u8>> {
+        // A bit for each kind of voxel in the neighbourhood.
+        const FREE: u8 = 1;
+        const HIDDEN: u8 = 2;
+        const NEAR: u8 = 4;
+        let kind = |voxel: &Voxel| match voxel.detail() {
+            Details::FREE => FREE,
+            0 => HIDDEN,
+            _ => NEAR,
+        };
+        let mut kinds: Vec<u8> = self.voxels.iter().map(kind).collect();
+        // Along z, y and x: with those of the layers before and behind.
+        for layer in [1, self.resolution, self.resolution.pow(2)] {
+            let own = kinds.clone();
+            let block = layer * self.resolution;
+            for (kinds, own) in kinds.chunks_exact_mut(block).zip(own.chunks_exact(block)) {
+                let add = |kinds: &mut [u8], own: &[u8]| kinds.iter_mut().zip(own).for_each(|(a, b)| *a |= b);
+                add(&mut kinds[layer..], own);
+                add(kinds, &own[layer..]);
+            }
+        }
+        let uniform = |kinds| match kinds {
+            FREE => Some(Details::FREE),
+            HIDDEN => Some(0),
+            _ => None,
+        };
+        kinds.into_iter().map(uniform).collect()
+    }
+
     /// Voxels along an edge.
     #[must_use]
     pub fn resolution(&self) -> usize {
@@ -343,6 +376,15 @@ impl Voxel {
         let is_free = |distance: f32| distance >= NEAR_SURFACE;
         let contradicts = is_free(sample) != is_free(self.distance) || (sample - self.distance).abs() > CONTRADICTION;
         if contradicts { 0.5 } else { 1.0 }
+    }
+
+    /// The byte of the voxel in [`Details`].
+    fn detail(self) -> u8 {
+        match self {
+            _ if self.is_near_surface() => Details::near(self.distance),
+            Self { distance, weight } if weight > 0.0 && distance > 0.0 => Details::FREE,
+            _ => 0,
+        }
     }
 
     fn is_near_surface(self) -> bool {
@@ -427,6 +469,53 @@ mod tests {
         let hidden = |x: usize, z: usize| volume.hidden().unwrap()[(x * 40 + 20) * 40 + z];
         assert_eq!([5, 19, 22, 25, 38].map(|z| hidden(10, z)), [false, false, false, true, true]);
         assert!(!hidden(30, 38), "nothing is known where there is no measurement");
+    }
+
+    #[test]
+    fn details_have_half_the_voxels_and_know_free_space() {
+        let camera = Intrinsics::BENCHMARK;
+        let depth = vec![0.65; camera.width * camera.height];
+        let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
+        let image = DepthImage::new(camera, &depth).unwrap();
+        fusion.integrate(&image, &facing());
+        let volume = fusion.detailed_volume(Isometry3::identity(), &[(image, facing())]).unwrap();
+        let details = volume.details().unwrap();
+        assert_eq!((details.resolution(), details.voxel_size()), (80, 0.00375));
+        let at = |z: usize| details.bytes()[(40 * 80 + 40) * 80 + z];
+        // The wall is at z = 0.15. The truncation distance is that of the volume, 30 mm: a voxel is 16 bytes.
+        let near = |distance: f64| (127.5 + distance * 127.5 / 8.0).round() as i32;
+        for (z, distance) in [(39, 0.5), (40, -0.5), (37, 2.5), (43, -3.5)] {
+            assert!((i32::from(at(z)) - near(distance)).abs() <= 1, "{z}: {}", at(z));
+        }
+        assert_eq!((at(10), at(70)), (Details::FREE, 0), "free in front, hidden behind");
+        // The middle of a larger volume has its details.
+        let middle = volume.clone().middle(4).unwrap();
+        assert_eq!(middle.details(), volume.details());
+        assert_eq!(middle.alone().details(), None);
+    }
+
+    #[test]
+    fn details_are_those_of_all_voxels() {
+        let camera = Intrinsics::BENCHMARK;
+        // A step of 0.1 m between two walls, and a part without measurements.
+        let depth: Vec<f32> = (0..camera.width * camera.height)
+            .map(|pixel| [0.58, 0.68, 0.0][(pixel % camera.width / 110).saturating_sub(2).min(2)])
+            .collect();
+        let image = DepthImage::new(camera, &depth).unwrap();
+        let poses = [facing(), Isometry3::translation(-0.1, -0.17, 0.52)];
+        let views = poses.map(|pose| (&image, pose));
+        let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
+        let mut all = Fusion { truncation: fusion.truncation, ..Fusion::new(2 * RESOLUTION, WORKSPACE_SIZE) };
+        for pose in &poses {
+            fusion.integrate(&image, pose);
+            all.integrate(&image, pose);
+        }
+        let volume = fusion.detailed_volume(Isometry3::identity(), &views).unwrap();
+        let bytes = volume.details().unwrap().bytes();
+        let differ = bytes.iter().zip(&all.voxels).filter(|(byte, voxel)| byte.abs_diff(voxel.detail()) > 1).count();
+        assert!(differ < bytes.len() / 2000, "{differ} of {}", bytes.len());
+        let near = bytes.iter().filter(|&&byte| byte != 0 && byte != Details::FREE).count();
+        assert!(near > 50_000, "{near}");
     }
 
     #[test]

@@ -3,7 +3,7 @@ use std::sync::Arc;
 use nalgebra::Isometry3;
 use thiserror::Error;
 
-use crate::{ObjectMap, Region, RequestError};
+use crate::{Details, ObjectMap, Region, RequestError};
 
 /// A validated truncated signed distance field over a cube: the input of a network.
 ///
@@ -18,15 +18,9 @@ pub struct Volume {
     values: Vec<f32>,
     hidden: Option<Vec<bool>>,
     objects: Option<Arc<ObjectMap>>,
-    surroundings: Option<Arc<Surroundings>>,
-}
-
-/// A larger volume with the same voxels, of which a volume is the middle.
-#[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Surroundings {
-    pub volume: Volume,
-    /// Voxels on each side of the middle.
-    pub padding: usize,
+    /// The larger volume with the same voxels of which this one is the middle.
+    surroundings: Option<Arc<Volume>>,
+    details: Option<Arc<Details>>,
 }
 
 /// Why an array is not a valid [`Volume`].
@@ -119,12 +113,32 @@ impl Volume {
         if values.iter().fold(true, |zero, &v| zero & (v == 0.0)) {
             return Err(VolumeError::Empty);
         }
-        Ok(Self { resolution, voxel_size, pose, values, hidden: None, objects: None, surroundings: None })
+        Ok(Self {
+            resolution,
+            voxel_size,
+            pose,
+            values,
+            hidden: None,
+            objects: None,
+            surroundings: None,
+            details: None,
+        })
     }
 
     /// The volume with its hidden voxels: those that lie behind a surface in a view and were measured by none.
     pub(crate) fn with_hidden(self, hidden: Vec<bool>) -> Self {
         Self { hidden: Some(hidden), ..self }
+    }
+
+    /// The volume with its details.
+    pub(crate) fn with_details(self, details: Details) -> Self {
+        Self { details: Some(Arc::new(details)), ..self }
+    }
+
+    /// What the views showed in and around the volume, in voxels of half the size. `None` if only the volume is known.
+    #[must_use]
+    pub fn details(&self) -> Option<&Details> {
+        self.observed().details.as_deref()
     }
 
     /// The volume with the objects in it.
@@ -143,7 +157,7 @@ impl Volume {
         let values = middle(&self.values, self.resolution, padding);
         let hidden = self.hidden.as_ref().map(|hidden| middle(hidden, self.resolution, padding));
         let inner = Self::new(resolution, self.voxel_size, pose, values).ok()?;
-        Some(Self { hidden, surroundings: Some(Arc::new(Surroundings { volume: self, padding })), ..inner })
+        Some(Self { hidden, surroundings: Some(Arc::new(self)), ..inner })
     }
 
     /// The volume without what was observed around it, and without objects.
@@ -155,12 +169,7 @@ impl Volume {
     /// All that was observed: the volume itself, or the larger one of which it is the middle.
     #[must_use]
     pub(crate) fn observed(&self) -> &Self {
-        self.surroundings.as_ref().map_or(self, |surroundings| &surroundings.volume)
-    }
-
-    /// Voxels on each side of this volume in the one that was [`observed`](Self::observed).
-    pub(crate) fn padding(&self) -> usize {
-        self.surroundings.as_ref().map_or(0, |surroundings| surroundings.padding)
+        self.surroundings.as_deref().unwrap_or(self)
     }
 
     /// Voxels along an edge.

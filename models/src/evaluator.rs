@@ -17,17 +17,14 @@ const DENSE: usize = 192;
 const CLASSES: usize = 3;
 
 /// Creates an evaluator with random weights: two 2D convolutions over the plane of the approach and the closing axis,
-/// each followed by max pooling by 2; a dense layer; the logits of the classes. The samples along x are channels,
-/// because the hand is narrow along x.
+/// each followed by max pooling by 2; a dense layer; the logits of the classes. The slices are channels, because the
+/// hand is narrow along x.
 #[must_use]
 pub fn evaluator(seed: u64) -> ModelProto {
     let mut builder = Builder::new("evaluator", seed);
     let b = &mut builder;
     let mut x = b.input(INPUT, &Patch::SHAPE);
-    let [channels, slices, rows, columns] = Patch::SHAPE;
-    let mut inputs = channels * slices;
-    let shape = b.integers(&[-1, inputs as i64, rows as i64, columns as i64]);
-    x = b.node("Reshape", &[&x, &shape], vec![]);
+    let [mut inputs, rows, columns] = Patch::SHAPE;
     for (layer, outputs) in CHANNELS.into_iter().enumerate() {
         let conv = Conv { inputs, outputs, kernel: 3, stride: 1, bias: true };
         x = b.conv_2d(&format!("conv.{layer}"), &x, conv, 1);

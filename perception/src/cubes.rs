@@ -1,9 +1,10 @@
+use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::fmt::Display;
 use std::sync::Arc;
 use std::time::Instant;
 
-use grasp::{DetectParams, Fusion, Region, RequestError, SurfacePoint, TABLE_HEIGHT};
+use grasp::{DepthImage, DetectParams, Fusion, Region, RequestError, SurfacePoint, TABLE_HEIGHT};
 use nalgebra::{Isometry3, Point3};
 
 use crate::grid::FusionGrid;
@@ -64,7 +65,7 @@ struct Cube {
     inner: Option<[[f64; 2]; 2]>,
 }
 
-/// Most cubes of a workspace, which bounds the memory of a request to 200 MB: those of 2 × 2 m with the default margin.
+/// Most cubes of a workspace, which bounds the memory of a request to 400 MB: those of 2 × 2 m with the default margin.
 const MAX_CUBES: usize = 100;
 
 /// Smallest height of an object above the table, metres. Lower surfaces are noise, or too low for a hand.
@@ -254,19 +255,27 @@ impl Cubes {
                 }
             });
             let mut sampler = (cube.grid.needs_points() && !self.is_tracked).then(PointSampler::default);
+            let mut views = Vec::new();
             for index in 0..eyes.len() {
                 if !is_wanted() {
                     return Err(RequestError::expired());
                 }
                 let seen = cube.integrate(&mut fusion, observation, index, sampler.as_mut(), &mut disagreements[index]);
                 match (seen, &mut blind[index]) {
-                    (Ok(()), seen) => *seen = Ok(()),
+                    (Ok(view), seen) => {
+                        views.push(view);
+                        *seen = Ok(());
+                    }
                     (Err(error), Err(first)) => *first = first.take().or(Some(error)),
                     (Err(_), Ok(())) => {}
                 }
             }
+            if self.is_tracked {
+                // The views of earlier requests are not known, so there are no details.
+                views.clear();
+            }
             unseen.extend(Warning::of_coverage(&fusion, cube.grid.padding));
-            scenes.extend(cube.grid.volume(&fusion).map(|volume| Scene {
+            scenes.extend(cube.grid.volume(&fusion, &views).map(|volume| Scene {
                 volume,
                 points: sampler.map(PointSampler::into_points),
                 region: cube.region(&self.frame_from_task, margin),
@@ -308,15 +317,16 @@ fn with_objects(mut scenes: Vec<Scene>, table: Option<f64>) -> Vec<Scene> {
 }
 
 impl Cube {
-    /// Integrates view `index`. `disagreement` becomes the warning if it contradicts the views before it.
-    fn integrate(
+    /// Integrates view `index`, and returns its image and the pose of the camera (`T_camera_field`). `disagreement` becomes
+    /// the warning if it contradicts the views before it.
+    fn integrate<'a>(
         &self,
         fusion: &mut Fusion,
-        observation: &Observation,
+        observation: &'a Observation,
         index: usize,
         sampler: Option<&mut PointSampler>,
         disagreement: &mut Option<Warning>,
-    ) -> Result<(), RequestError> {
+    ) -> Result<(Cow<'a, DepthImage<'static>>, Isometry3<f64>), RequestError> {
         let (image, camera_from_cube) = observation.image(index, &self.task_from_cube, self.grid.size)?;
         let camera_from_grid = self.grid.camera_from_grid(&camera_from_cube);
         if disagreement.is_none() {
@@ -331,7 +341,7 @@ impl Cube {
             let inside = |point: &SurfacePoint| point.position.iter().all(|c| (0.0..=self.grid.size).contains(c));
             image.points(&camera_from_cube).filter(inside).for_each(|point| sampler.add(point));
         }
-        Ok(())
+        Ok((image, camera_from_grid))
     }
 
     /// The region of the cube's grasps, if it is not the whole field. The fingertips keep `margin` from the sides.

@@ -1,6 +1,7 @@
+use std::borrow::Cow;
 use std::f64::consts::PI;
 
-use grasp::{Fusion, RESOLUTION, RequestError, Volume, WORKSPACE_SIZE};
+use grasp::{DepthImage, Fusion, RESOLUTION, RequestError, Volume, WORKSPACE_SIZE};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 
 /// The grid that a planner reads.
@@ -11,6 +12,8 @@ pub struct InputGrid {
     /// The grid of the network. Planners without one accept cubes of every size, and need the observed points besides the
     /// volume.
     pub network: Option<NetworkGrid>,
+    /// Whether the planner reads the [details](Volume::details) of volumes.
+    pub reads_details: bool,
 }
 
 /// The grid that a network was trained with.
@@ -57,6 +60,7 @@ pub(crate) struct FusionGrid {
     pub size: f64,
     /// The grid of the planner's network.
     network: Option<NetworkGrid>,
+    reads_details: bool,
     /// `T_frame_cube`.
     frame_from_cube: Isometry3<f64>,
     /// `T_cube_grid`: for a network trained with the camera on one side, the grid is rotated so that the camera is on
@@ -84,7 +88,14 @@ impl FusionGrid {
         let cube_from_grid = azimuth.map_or_else(Isometry3::identity, |azimuth| rotated(azimuth, size, eyes));
         let voxel_size = size / resolution(input.network) as f64;
         let padding = if is_padded { (PADDING / voxel_size).ceil().min(MAX_PADDING) as usize } else { 0 };
-        Self { size, network: input.network, frame_from_cube, cube_from_grid, padding }
+        Self {
+            size,
+            network: input.network,
+            reads_details: input.reads_details,
+            frame_from_cube,
+            cube_from_grid,
+            padding,
+        }
     }
 
     /// Whether a planner can read this grid.
@@ -130,10 +141,13 @@ impl FusionGrid {
         Fusion::of_voxels(resolution(self.network) + 2 * self.padding, self.voxel_size())
     }
 
-    /// The fused volume; `None` if no surface was observed in it.
-    pub fn volume(&self, fusion: &Fusion) -> Option<Volume> {
+    /// The volume fused from `views`, images with their `T_camera_field`; `None` if no surface was observed in it. If the
+    /// planner reads details, it has those of the views.
+    pub fn volume<'a>(&self, fusion: &Fusion, views: &[(Cow<'_, DepthImage<'a>>, Isometry3<f64>)]) -> Option<Volume> {
+        let pose = self.frame_from_cube * self.cube_from_grid * self.grid_from_field();
+        let has_details = self.reads_details && !views.is_empty();
         // The only error of a field is that it is empty.
-        let volume = fusion.volume(self.frame_from_cube * self.cube_from_grid * self.grid_from_field()).ok()?;
+        let volume = if has_details { fusion.detailed_volume(pose, views) } else { fusion.volume(pose) }.ok()?;
         if self.padding == 0 { Some(volume) } else { volume.middle(self.padding) }
     }
 }

@@ -17,9 +17,9 @@ const PROPOSALS: usize = 32;
 /// If no proposal has this quality, the hand is fitted to the surface for more of them.
 const SURE: f32 = 0.9;
 
-/// Number of points at which the hand is fitted, and largest number of the proposals from it.
-const SAMPLES: usize = 150;
-const FITTED: usize = 96;
+/// Number of points at which the hand is fitted, and largest number of the proposals from it: at first, and if none of
+/// the grasps passes the threshold.
+const FITS: [(usize, usize); 2] = [(150, 96), (600, 384)];
 
 /// Quality from which moving a grasp gains nothing.
 const SETTLED: f32 = 0.97;
@@ -66,8 +66,8 @@ impl Evaluator {
         DecodeParams { threshold: PROPOSAL_THRESHOLD, force: None, clearance: None, ..*params }
     }
 
-    /// Scores and moves a network's proposals, and selects the grasps that pass `params`. If no proposal is sure to hold, places
-    /// where the hand fits around the surface are proposals, too. Stops when `is_wanted` returns false.
+    /// Scores and moves a network's proposals, and selects the grasps that pass `params`. If no proposal is sure to hold,
+    /// places where the hand fits around the surface are proposals, too. Stops when `is_wanted` returns false.
     ///
     /// # Errors
     /// [`PlanError`] if the classifier fails or planning is cancelled.
@@ -85,8 +85,11 @@ impl Evaluator {
         let (volume, depth) = (&scene.volume, depth(&params.decode));
         self.evaluate(&mut grasps, volume, depth)?;
         let reaches = |grasp: &Grasp, quality: f32| grasp.quality >= quality && selection.accepts(&grasp.pose);
-        if !grasps.iter().any(|grasp| reaches(grasp, SURE)) {
-            let mut fitted = HandFit::sampled(SAMPLES, scene, params, is_wanted)?.spread(FITTED, volume.pose());
+        for (enough, (points, most)) in [SURE, params.decode.threshold].into_iter().zip(FITS) {
+            if grasps.iter().any(|grasp| reaches(grasp, enough)) {
+                break;
+            }
+            let mut fitted = HandFit::sampled(points, scene, params, is_wanted)?.spread(most, volume.pose());
             self.evaluate(&mut fitted, volume, depth)?;
             grasps.extend(fitted);
         }

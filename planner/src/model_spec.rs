@@ -112,7 +112,8 @@ impl ModelSpec {
             let Metadata { resolution, voxel_size, camera_azimuth, .. } = entry.metadata;
             NetworkGrid { resolution, voxel_size, camera_azimuth }
         });
-        InputGrid { model: self.name().to_owned(), network }
+        let reads_details = matches!(self, Self::Evaluated { .. });
+        InputGrid { model: self.name().to_owned(), network, reads_details }
     }
 
     /// Orders two versions of one model, older first.

@@ -209,19 +209,22 @@ pub fn add_stereo_noise(view: &mut View, rng: &mut impl Rng) {
 #[must_use]
 pub fn fuse(views: &[View], resolution: usize) -> Fusion {
     let mut fusion = Fusion::new(resolution, grasp::WORKSPACE_SIZE);
-    for view in views {
-        let image = DepthImage::new(Intrinsics::BENCHMARK, &view.depth).expect("views are of the benchmark's camera");
-        fusion.integrate(&image, &view.camera_from_task);
+    for (image, camera_from_task) in images(views) {
+        fusion.integrate(&image, &camera_from_task);
     }
     fusion
+}
+
+/// The depth images of views, with their `T_camera_task`.
+pub fn images(views: &[View]) -> impl Iterator<Item = (DepthImage<'_>, Isometry3<f64>)> {
+    views.iter().map(|view| {
+        let image = DepthImage::new(Intrinsics::BENCHMARK, &view.depth).expect("views are of the benchmark's camera");
+        (image, view.camera_from_task)
+    })
 }
 
 /// The point cloud of the views in the task frame: one point for every pixel with a depth.
 #[must_use]
 pub fn points(views: &[View]) -> Vec<SurfacePoint> {
-    let points = views.iter().flat_map(|view| {
-        let image = DepthImage::new(Intrinsics::BENCHMARK, &view.depth).expect("views are of the benchmark's camera");
-        image.points(&view.camera_from_task).collect::<Vec<_>>()
-    });
-    points.collect()
+    images(views).flat_map(|(image, pose)| image.points(&pose).collect::<Vec<_>>()).collect()
 }

@@ -17,7 +17,7 @@ use rand_chacha::ChaCha8Rng;
 
 pub use self::server::{Server, depth_view};
 use crate::TABLE_HEIGHT;
-use crate::camera::{View, fuse, points};
+use crate::camera::{View, fuse, images, points};
 use crate::label::is_graspable;
 
 /// Input of a planner: depth images and the volume fused from them.
@@ -36,7 +36,8 @@ impl Observation {
     pub fn new(views: Vec<View>) -> Option<Self> {
         let start = Instant::now();
         let fusion = fuse(&views, RESOLUTION);
-        let volume = fusion.volume(Isometry3::identity()).ok()?;
+        let images: Vec<_> = images(&views).collect();
+        let volume = fusion.detailed_volume(Isometry3::identity(), &images).ok()?;
         let took = start.elapsed();
         if !fusion.surface().iter().any(is_graspable) {
             return None;

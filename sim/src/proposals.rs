@@ -4,8 +4,8 @@ use std::ops::RangeInclusive;
 use std::sync::{Mutex, PoisonError};
 
 use anyhow::Context;
-use grasp::{DecodeParams, FINGER_DEPTH, RESOLUTION};
-use grasp_data::{Occupancy, Trial};
+use grasp::{DecodeParams, FINGER_DEPTH, WORKSPACE_SIZE};
+use grasp_data::{Occupancy, Trial, value};
 use grasp_perception::Scene;
 use grasp_planner::{PlanParams, Planner};
 use nalgebra::{Isometry3, Translation3, Vector3};
@@ -21,8 +21,8 @@ use crate::trial;
 /// An observed scene with the trials of a planner's grasps.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TriedScene {
-    /// The observed volume, `[x][y][z]`.
-    pub volume: Vec<f32>,
+    /// The values of the observed volume, or of its [details](grasp::Details), `[x][y][z]`.
+    pub values: Vec<f32>,
     /// The trials. A success is a grasp that the hand reached without a contact, and that lifted an object. The share is
     /// 1 if it lifted an object, also after a contact, else 0. The clearance is unknown.
     pub trials: Vec<Trial>,
@@ -32,7 +32,8 @@ pub struct TriedScene {
 
 impl SceneConfig {
     /// Generates and observes scene number `index`, and tries [`points`](Self::points) grasps of a planner, each moved at
-    /// random and executed with a pose error. The planner runs with `params`. `None` if it proposes nothing.
+    /// random and executed with a pose error. The planner runs with `params`. With `with_details` the scene has the
+    /// details of the volume instead of the volume. `None` if nothing is proposed.
     ///
     /// # Errors
     /// If the planner fails.
@@ -41,6 +42,7 @@ impl SceneConfig {
         index: u64,
         planner: &Mutex<Box<dyn Planner + Send>>,
         params: &DecodeParams,
+        with_details: bool,
     ) -> anyhow::Result<Option<TriedScene>> {
         let mut rng = self.rng(index);
         let mut world = self.scene(&mut rng);
@@ -54,17 +56,21 @@ impl SceneConfig {
         let mut planner = planner.lock().unwrap_or_else(PoisonError::into_inner);
         let proposed = planner.plan(&scene, &params, &|| true).context("the planner failed")?.grasps;
         drop(planner);
-        let volume = scene.volume;
+        let (voxel_size, values) = match scene.volume.details().filter(|_| with_details) {
+            Some(details) => (details.voxel_size(), details.bytes().iter().copied().map(value).collect()),
+            None => (scene.volume.voxel_size(), scene.volume.values().to_vec()),
+        };
+        let resolution = (WORKSPACE_SIZE / voxel_size).round() as usize;
         let mut trials = Vec::new();
         for _ in 0..self.points {
             let Some(mut grasp) = proposed.choose(&mut rng).copied() else { return Ok(None) };
             grasp.pose *= displacement(&mut rng);
             let (outcome, short_by) = trial::attempt(&world, &perturbed(&grasp.pose, &mut rng));
             let lifted = outcome.is_success();
-            let trial = Trial::new(&grasp, lifted && short_by == 0.0, volume.voxel_size());
+            let trial = Trial::new(&grasp, lifted && short_by == 0.0, voxel_size);
             trials.push(Trial { share: if lifted { 1.0 } else { 0.0 }, ..trial });
         }
-        Ok(Some(TriedScene { volume: volume.values().to_vec(), trials, occupancy: world.occupancy(RESOLUTION) }))
+        Ok(Some(TriedScene { values, trials, occupancy: world.occupancy(resolution) }))
     }
 }
 

@@ -78,6 +78,9 @@ pub struct Provenance {
     /// The evaluator that scored and moved the network's grasps before they were tried.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub evaluator: Option<String>,
+    /// Whether the data have details instead of volumes.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub details: bool,
     /// Version of the simulator. Labels can differ between versions.
     pub version: String,
 }

@@ -27,6 +27,7 @@ fn setup() -> Setup {
         observation_seed: None,
         network: None,
         evaluator: None,
+        details: false,
         version: "0".into(),
     })
 }

@@ -56,7 +56,7 @@ impl Examples for CandidateDataset {
         self.scenes[index].to_string()
     }
 
-    fn images(&self, indices: &[i64]) -> Tensor {
+    fn images(&self, indices: &[i64], _mirrored: [bool; 2]) -> Tensor {
         self.images.index_select(0, &Tensor::from_slice(indices)).to_kind(Kind::Float) / 255.0
     }
 }

@@ -29,8 +29,9 @@ pub trait Examples {
     /// with one name are not distinguished: with the same seed they are the same scene.
     fn scene(&self, index: usize) -> String;
 
-    /// The images of examples, f32 `[n, shape…]` in [0, 1].
-    fn images(&self, indices: &[i64]) -> Tensor;
+    /// The images of examples, f32 `[n, shape…]` in [0, 1]: mirrored along x and the closing axis as `mirrored` says, if
+    /// a mirrored grasp has the same class.
+    fn images(&self, indices: &[i64], mirrored: [bool; 2]) -> Tensor;
 
     /// Number of successes.
     fn successes(&self) -> usize {
@@ -81,8 +82,6 @@ pub struct ClassifierSettings {
     /// Whether failures and successes have the same total weight. Without it the predicted probability is that of the
     /// data.
     pub balance: bool,
-    /// Whether each step reverses the x and y axes of the patches at random: the hand is symmetric in both.
-    pub mirror: bool,
     /// Computes convolutions and matrix products in bf16.
     pub bf16: bool,
 }
@@ -147,9 +146,9 @@ impl<'a> ClassifierTrainer<'a> {
         self.training.shuffle(&mut self.rng);
         let mut sums = MetricSums::default();
         for indices in self.training.chunks(self.settings.batch) {
-            let (images, classes) = self.batch(indices);
-            let axes: Vec<i64> = [-3, -2].into_iter().filter(|_| self.settings.mirror && self.rng.random()).collect();
-            let loss = sums.add(&self.executor, &self.class_weights, &images.flip(axes), &classes)?;
+            let mirrored = [self.rng.random(), self.rng.random()];
+            let (images, classes) = self.batch(indices, mirrored);
+            let loss = sums.add(&self.executor, &self.class_weights, &images, &classes)?;
             loss.backward();
             let learning_rate = self.learning_rate();
             self.adam.step(self.executor.parameters(), learning_rate);
@@ -159,9 +158,9 @@ impl<'a> ClassifierTrainer<'a> {
     }
 
     /// The images and classes, i64 `[n]`, of examples.
-    fn batch(&self, indices: &[i64]) -> (Tensor, Tensor) {
+    fn batch(&self, indices: &[i64], mirrored: [bool; 2]) -> (Tensor, Tensor) {
         let classes: Vec<i64> = indices.iter().map(|&index| self.dataset.class(index as usize) as i64).collect();
-        (self.dataset.images(indices), Tensor::from_slice(&classes))
+        (self.dataset.images(indices, mirrored), Tensor::from_slice(&classes))
     }
 
     /// The learning rate of the next step.
@@ -178,7 +177,7 @@ impl<'a> ClassifierTrainer<'a> {
     pub fn validate(&self) -> Result<Option<ClassifierMetrics>, ExecuteError> {
         let mut sums = MetricSums::default();
         for indices in self.validation.chunks(self.settings.batch) {
-            let (images, classes) = self.batch(indices);
+            let (images, classes) = self.batch(indices, [false; 2]);
             let _ = no_grad(|| sums.add(&self.executor, &self.class_weights, &images, &classes))?;
         }
         Ok((!self.validation.is_empty()).then(|| sums.metrics()))

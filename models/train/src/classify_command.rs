@@ -137,7 +137,6 @@ impl Classify {
             // GPD's classifier ranks candidates. The evaluator predicts a probability, so its classes keep their
             // frequencies.
             balance: self.network == Kind::Gpd,
-            mirror: self.network == Kind::Evaluator,
             bf16: self.bf16,
         };
         let device = self.device.device()?;

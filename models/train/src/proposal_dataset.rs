@@ -1,25 +1,25 @@
 use std::path::PathBuf;
 
-use grasp::{Patch, Volume, WORKSPACE_SIZE};
-use grasp_data::{DataError, Dataset, Setup, value};
+use grasp::{Details, Patch, WORKSPACE_SIZE};
+use grasp_data::{DataError, Dataset, Setup};
 use nalgebra::Isometry3;
 use tch::Tensor;
 
 use crate::Examples;
 
-/// The tried grasps of networks, with the volumes in which they were proposed. The images are patches of the volumes.
+/// The tried grasps of networks, with the details of the volumes in which they were proposed. The images are patches.
 ///
 /// Class 0 is failure; 1 is success after a contact on the approach; 2 is success without a contact.
 pub struct ProposalDataset {
-    volumes: Vec<Volume>,
-    /// Name of the scene of each volume.
+    details: Vec<Details>,
+    /// Name of the scene of each of them.
     scenes: Vec<String>,
     proposals: Vec<Proposal>,
 }
 
 struct Proposal {
-    volume: usize,
-    /// In the frame of the volume, metres.
+    details: usize,
+    /// In the frame of the details, metres.
     pose: Isometry3<f64>,
     class: usize,
 }
@@ -30,7 +30,7 @@ impl ProposalDataset {
     /// # Errors
     /// [`DataError`] names the folder that cannot be used.
     pub fn read(folders: &[PathBuf]) -> Result<Self, DataError> {
-        let mut all = Self { volumes: Vec::new(), scenes: Vec::new(), proposals: Vec::new() };
+        let mut all = Self { details: Vec::new(), scenes: Vec::new(), proposals: Vec::new() };
         for path in folders {
             let dataset = Dataset::open(std::slice::from_ref(path))?;
             if Setup::read(path)?.provenance.is_some_and(|provenance| provenance.network.is_none()) {
@@ -39,8 +39,8 @@ impl ProposalDataset {
             let n = dataset.resolution();
             let voxel_size = WORKSPACE_SIZE / n as f64;
             for scene in 0..dataset.len() {
-                let values = dataset.volume(scene, 0).iter().copied().map(value).collect();
-                let volume = Volume::new(n, voxel_size, Isometry3::identity(), values).map_err(|error| {
+                let bytes = dataset.volume(scene, 0).to_vec();
+                let details = Details::new(n, voxel_size, Isometry3::identity(), bytes).map_err(|error| {
                     let reason = format!("scene {}: {error}", dataset.id(scene));
                     DataError::Scene { path: path.clone(), reason, expected: "an observed volume" }
                 })?;
@@ -51,9 +51,9 @@ impl ProposalDataset {
                         (false, false) => 0,
                     };
                     let pose = trial.grasp(voxel_size).pose;
-                    all.proposals.push(Proposal { volume: all.volumes.len(), pose, class });
+                    all.proposals.push(Proposal { details: all.details.len(), pose, class });
                 }
-                all.volumes.push(volume);
+                all.details.push(details);
                 all.scenes.push(dataset.id(scene).to_owned());
             }
         }
@@ -75,14 +75,14 @@ impl Examples for ProposalDataset {
     }
 
     fn scene(&self, index: usize) -> String {
-        self.scenes[self.proposals[index].volume].clone()
+        self.scenes[self.proposals[index].details].clone()
     }
 
-    fn images(&self, indices: &[i64]) -> Tensor {
+    fn images(&self, indices: &[i64], mirrored: [bool; 2]) -> Tensor {
         let mut patches = vec![0.0; indices.len() * Patch::SIZE];
         for (&index, patch) in indices.iter().zip(patches.chunks_exact_mut(Patch::SIZE)) {
-            let Proposal { volume, pose, .. } = &self.proposals[index as usize];
-            Patch::write(&self.volumes[*volume], pose, patch);
+            let Proposal { details, pose, .. } = &self.proposals[index as usize];
+            Patch::write_mirrored(&self.details[*details], pose, mirrored, patch);
         }
         let shape: Vec<i64> =
             [&[indices.len()], &Patch::SHAPE[..]].concat().into_iter().map(|size| size as i64).collect();

@@ -61,6 +61,7 @@ impl DataArgs {
             observation_seed: None,
             network: None,
             evaluator: None,
+            details: false,
             version: env!("CARGO_PKG_VERSION").to_owned(),
         }
     }

@@ -28,6 +28,11 @@ pub struct Proposals {
     #[arg(long, value_name = "FILE|NAME", value_parser = evaluator)]
     evaluator: Option<PathBuf>,
 
+    /// Write what was observed in voxels of half the size, with free space: the best input for training an evaluator.
+    /// Without it the data have the volumes, for training a network or an evaluator.
+    #[arg(long)]
+    details: bool,
+
     /// Number of scenes.
     #[arg(long)]
     scenes: u64,
@@ -48,6 +53,7 @@ impl Proposals {
         let setup = Setup::benchmark(Provenance {
             network: Some(name(&self.network)),
             evaluator: self.evaluator.as_deref().map(name),
+            details: self.details,
             ..self.data.provenance(&config)
         });
         let mut writer = packed::Writer::open(&self.out, &setup)?;
@@ -58,10 +64,10 @@ impl Proposals {
         progress.reset_eta();
         ordered::for_each(
             next..self.scenes.max(next),
-            |number| config.proposals(number, &planner, &params),
+            |number| config.proposals(number, &planner, &params, self.details),
             |number, scene| {
                 if let Some(scene) = scene? {
-                    writer.append(number, &[scene.volume], &scene.trials, Some(&scene.occupancy))?;
+                    writer.append(number, &[scene.values], &scene.trials, Some(&scene.occupancy))?;
                 }
                 progress.inc(1);
                 anyhow::Ok(())

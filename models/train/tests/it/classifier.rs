@@ -63,7 +63,6 @@ fn a_small_data_set_is_memorized() {
         validation: 0.25,
         seed: 1,
         balance: true,
-        mirror: false,
         bf16: false,
     };
     let mut trainer = ClassifierTrainer::new(gpd(1), &dataset, settings, Device::Cpu).unwrap();
@@ -151,7 +150,7 @@ fn grasp(shift: f64) -> Grasp {
 fn an_evaluator_separates_full_from_empty_volumes() {
     let folder = tempfile::tempdir().unwrap();
     proposals(folder.path());
-    let arguments = "--network evaluator --proposals-of vgn-packed --data proposals --out evaluator.onnx --epochs 6 \
+    let arguments = "--network evaluator --proposals-of vgn-packed --data proposals --out evaluator.onnx --epochs 20 \
                      --batch 16";
     let output = classify(folder.path(), arguments);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));

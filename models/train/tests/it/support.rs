@@ -62,6 +62,7 @@ pub fn provenance() -> Provenance {
         observation_seed: None,
         network: None,
         evaluator: None,
+        details: false,
         version: String::new(),
     }
 }
