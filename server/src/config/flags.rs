@@ -76,7 +76,8 @@ pub(super) struct Flags {
     #[arg(long, env = "GRASPD_NO_CUDA_GRAPHS")]
     pub no_cuda_graphs: bool,
 
-    /// Queue length per model, requests. If the queue is full, requests are refused immediately.
+    /// Queue length per model, requests; one whose workspace has several cubes counts once per cube. If the queue is full,
+    /// requests are refused immediately.
     #[arg(long, env = "GRASPD_QUEUE", value_name = "N", default_value = "32", value_parser = count())]
     pub queue: u16,
 

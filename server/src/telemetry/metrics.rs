@@ -202,7 +202,11 @@ impl Metrics {
                 "Scenes that a queue has accepted, by the priority of the request.",
                 &["model", "priority"],
             ),
-            waiting: gauges("graspd_queue_requests", "Queued requests.", &["model"]),
+            waiting: gauges(
+                "graspd_queue_requests",
+                "Queued requests; a request whose workspace has several cubes counts once per cube.",
+                &["model"],
+            ),
             batches: histograms("graspd_batch_size", "Volumes per batch.", &["model"], &BATCHES),
             models: gauges(
                 "graspd_model_info",
