@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::{Duration, Instant};
 
-use grasp::{DecodeParams, Grasp, RESOLUTION, Volume};
+use grasp::{DecodeParams, Fusion, Grasp, RESOLUTION, Volume, VolumeError};
 use grasp_models::{Network, Options};
 use grasp_perception::Scene;
 use grasp_planner::{Evaluator, Gpd, HighestProposal, NetworkPlanner, PlanParams, Planner, Shaf};
@@ -24,6 +24,7 @@ use crate::label::is_graspable;
 pub struct Observation {
     /// The depth images.
     pub views: Vec<View>,
+    fused: Fusion,
     /// The volume they were fused into, task frame.
     pub volume: Volume,
     /// Duration of the fusion.
@@ -36,13 +37,21 @@ impl Observation {
     pub fn new(views: Vec<View>) -> Option<Self> {
         let start = Instant::now();
         let fusion = fuse(&views, RESOLUTION);
-        let images: Vec<_> = images(&views).collect();
-        let volume = fusion.detailed_volume(Isometry3::identity(), &images).ok()?;
+        let volume = fusion.volume(Isometry3::identity()).ok()?;
         let took = start.elapsed();
         if !fusion.surface().iter().any(is_graspable) {
             return None;
         }
-        Some(Self { views, volume, fusion: took })
+        Some(Self { views, fused: fusion, volume, fusion: took })
+    }
+
+    /// The volume with its details, which an evaluator reads.
+    ///
+    /// # Errors
+    /// [`VolumeError`] if the volume is empty, which [`new`](Self::new) excludes.
+    pub fn detailed_volume(&self) -> Result<Volume, VolumeError> {
+        let images: Vec<_> = images(&self.views).collect();
+        self.fused.detailed_volume(Isometry3::identity(), &images)
     }
 }
 
@@ -60,6 +69,8 @@ pub enum BenchPlanner {
         decode: Box<DecodeParams>,
         /// Whether it reads the point cloud.
         reads_points: bool,
+        /// Whether it reads the details of the volume.
+        reads_details: bool,
     },
 }
 
@@ -73,9 +84,10 @@ impl BenchPlanner {
         match self {
             Self::Random => Ok(random::plan(observation, rng)),
             Self::Server(server) => server.plan(observation),
-            Self::Local { planner, decode, reads_points } => {
+            Self::Local { planner, decode, reads_points, reads_details } => {
                 let points = reads_points.then(|| points(&observation.views));
-                let scene = Scene { points, ..observation.volume.clone().into() };
+                let volume = if *reads_details { observation.detailed_volume()? } else { observation.volume.clone() };
+                let scene = Scene { points, ..volume.into() };
                 let params = PlanParams { decode: **decode, table: Some(TABLE_HEIGHT) };
                 Ok(planner.plan(&scene, &params, &|| true)?.grasps)
             }
@@ -158,6 +170,7 @@ impl PlannerSpec {
             planner,
             decode: Box::new(decode),
             reads_points,
+            reads_details: matches!(self, Self::Evaluated { .. }),
         };
         Ok(match self {
             Self::Random => BenchPlanner::Random,

@@ -47,11 +47,10 @@ impl SceneConfig {
         let mut rng = self.rng(index);
         let mut world = self.scene(&mut rng);
         world.sleep();
-        let Some(Observation { volume, .. }) = Observation::new(observe(&world, &self.views, self.noise, &mut rng))
-        else {
+        let Some(observation) = Observation::new(observe(&world, &self.views, self.noise, &mut rng)) else {
             return Ok(None);
         };
-        let scene = Scene::from(volume);
+        let scene = Scene::from(observation.detailed_volume()?);
         let params = PlanParams { decode: *params, table: Some(TABLE_HEIGHT) };
         let mut planner = planner.lock().unwrap_or_else(PoisonError::into_inner);
         let proposed = planner.plan(&scene, &params, &|| true).context("the planner failed")?.grasps;

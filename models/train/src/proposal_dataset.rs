@@ -8,6 +8,7 @@ use tch::Tensor;
 use crate::Examples;
 
 /// The tried grasps of networks, with the details of the volumes in which they were proposed. The images are patches.
+/// Volumes are read as details in which nothing is free.
 ///
 /// Class 0 is failure; 1 is success after a contact on the approach; 2 is success without a contact.
 pub struct ProposalDataset {
