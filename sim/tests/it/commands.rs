@@ -426,6 +426,16 @@ fn proposals_are_tried_and_an_interrupted_run_continues() {
     assert!(trials.iter().all(|trial| !trial.success || trial.share == 1.0), "a success has lifted an object");
     let lifted = trials.iter().filter(|trial| trial.share == 1.0).count();
     assert!((1..36).contains(&lifted), "{lifted} of 36");
+    desk.run(&format!("{command} --scenes 1 --details --out details"));
+    let details = Dataset::open(&[desk.path("details")]).unwrap();
+    assert_eq!((one.resolution(), details.resolution()), (40, 80));
+    for (coarse, fine) in one.trials(0).iter().zip(details.trials(0)) {
+        assert!(
+            (fine.position - 2.0 * coarse.position.coords).coords.norm() < 1e-4,
+            "the same tries, in smaller voxels"
+        );
+    }
+    assert!(details.volume(0, 0).contains(&grasp::Details::FREE) && !one.volume(0, 0).contains(&grasp::Details::FREE));
     let refused = desk.refused("proposals --scenes 1 --out x");
     assert!(refused.contains("--network"), "{refused}");
     let refused = desk.refused("observe one --views side --out again");
