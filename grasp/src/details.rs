@@ -37,6 +37,11 @@ impl Details {
         ((distance + 1.0) * 127.5 + 0.5) as u8
     }
 
+    /// The distance that the byte of a voxel near a surface stands for, a fraction of the truncation distance.
+    pub(crate) fn distance(byte: u8) -> f32 {
+        f32::from(byte) / 127.5 - 1.0
+    }
+
     /// Voxels along an edge.
     #[must_use]
     pub fn resolution(&self) -> usize {

@@ -3,7 +3,7 @@ use std::collections::HashMap;
 use nalgebra::{Point3, Vector3};
 
 use crate::fusion::NEAR_SURFACE;
-use crate::{Fusion, Volume};
+use crate::{Details, Fusion, Volume};
 
 /// A zero crossing of the fused field, with the outward normal. Cube frame, metres.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -114,6 +114,36 @@ impl Field for Volume {
     fn near_surface(&self, index: usize) -> Option<f32> {
         let is_near = |distance: &f32| (-NEAR_SURFACE..NEAR_SURFACE).contains(distance);
         (self.values()[index] > 0.0).then(|| self.distance(index)).filter(is_near)
+    }
+}
+
+impl Field for Details {
+    fn resolution(&self) -> usize {
+        self.resolution()
+    }
+
+    fn voxel_size(&self) -> f64 {
+        self.voxel_size()
+    }
+
+    fn distance(&self, index: usize) -> f32 {
+        match self.bytes()[index] {
+            0 => 0.0,
+            byte => Self::distance(byte),
+        }
+    }
+
+    fn near_surface(&self, index: usize) -> Option<f32> {
+        let byte = self.bytes()[index];
+        (byte != 0 && byte != Self::FREE).then(|| Self::distance(byte))
+    }
+}
+
+impl Details {
+    /// The zero crossings between neighbouring voxels, with normals.
+    #[must_use]
+    pub fn surface(&self) -> Vec<SurfacePoint> {
+        Field::surface(self)
     }
 }
 

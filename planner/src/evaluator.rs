@@ -89,7 +89,7 @@ impl Evaluator {
             if grasps.iter().any(|grasp| reaches(grasp, enough)) {
                 break;
             }
-            let mut fitted = HandFit::sampled(points, scene, params, is_wanted)?.spread(most, volume.pose());
+            let mut fitted = HandFit::for_evaluator(points, scene, params, is_wanted)?.spread(most, volume.pose());
             self.evaluate(&mut fitted, volume, depth)?;
             grasps.extend(fitted);
         }

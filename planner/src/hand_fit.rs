@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use grasp::gpd::{Candidate, Cloud, Params, by_sample, is_on_an_object};
-use grasp::{DecodeParams, Decoded, Grasp, Hand, Selection, SurfacePoint};
+use grasp::{DecodeParams, Decoded, Grasp, Hand, Selection, SurfacePoint, Volume};
 use grasp_perception::Scene;
 use nalgebra::Isometry3;
 use rand_chacha::ChaCha8Rng;
@@ -14,8 +14,16 @@ use crate::{PlanError, PlanParams};
 /// Smallest distance between the hand and the table, metres: a margin for camera noise.
 const TABLE_CLEARANCE: f64 = 0.002;
 
-/// Graspable objects are wider than this, and narrower than the hand's opening minus this, metres.
+/// GPD: graspable objects are wider than this, and narrower than the hand's opening minus this, metres.
 const APERTURE_MARGIN: f64 = 0.01;
+
+/// The same for an evaluator, which knows better what holds: pens and cutlery are thin, cartons almost as wide as the
+/// hand.
+const APERTURE_MARGIN_OF_EVALUATOR: f64 = 0.004;
+
+/// How far the fingertips initially pass a sample for an evaluator, metres. With GPD's distance they would hit the table
+/// beside a pen or a fork.
+const BITE_OF_EVALUATOR: f64 = 0.003;
 
 /// The candidates in one scene.
 #[derive(Debug)]
@@ -48,14 +56,31 @@ impl HandFit {
         Params { hand, aperture, bite, ..of_gpd }
     }
 
-    /// Fits the hand to the points of the scene, at as many of them as in GPD.
-    pub(crate) fn new(scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Self, PlanError> {
-        Self::sampled(Params::above(0.0).samples, scene, params, is_wanted)
+    /// Parameters for places that an evaluator will score: thin objects count, too. The hand is fitted at `samples`
+    /// points.
+    fn evaluator_params(samples: usize, hand: Hand, table: f64) -> Params {
+        let aperture = APERTURE_MARGIN_OF_EVALUATOR..=(2.0 * hand.half_opening() - APERTURE_MARGIN_OF_EVALUATOR);
+        Params { samples, aperture, bite: BITE_OF_EVALUATOR, ..Self::params(hand, table) }
     }
 
-    /// Fits the hand at `samples` points of the scene.
-    pub(crate) fn sampled(
+    /// Fits the hand to the points of the scene as GPD does.
+    pub(crate) fn new(scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Self, PlanError> {
+        Self::with(Self::params, scene, params, is_wanted)
+    }
+
+    /// Fits the hand at `samples` points of the scene, for an evaluator.
+    pub(crate) fn for_evaluator(
         samples: usize,
+        scene: &Scene,
+        params: &PlanParams,
+        is_wanted: &dyn Fn() -> bool,
+    ) -> Result<Self, PlanError> {
+        Self::with(|hand, table| Self::evaluator_params(samples, hand, table), scene, params, is_wanted)
+    }
+
+    /// Fits the hand to the points of the scene, with parameters for the hand and the height of the table.
+    fn with(
+        fit: impl Fn(Hand, f64) -> Params,
         scene: &Scene,
         params: &PlanParams,
         is_wanted: &dyn Fn() -> bool,
@@ -65,12 +90,12 @@ impl HandFit {
         let table = params.table.unwrap_or(f64::NEG_INFINITY);
         let points = match &scene.points {
             Some(points) => Cow::Borrowed(points),
-            None => Cow::Owned(volume.surface()),
+            None => Cow::Owned(surface(volume)),
         };
         let of_objects = object_points(&points, size, table);
         let other_points = points.len() - of_objects.len();
         let cloud = Cloud::new(of_objects);
-        let fit = Params { samples, ..Self::params(params.decode.hand.unwrap_or(Hand::GPD), table) };
+        let fit = fit(params.decode.hand.unwrap_or(Hand::GPD), table);
         let (mut candidates, mut misfits) = (Vec::new(), 0);
         for of_sample in by_sample(&cloud, &fit, &mut ChaCha8Rng::seed_from_u64(0)) {
             if !is_wanted() {
@@ -98,4 +123,14 @@ impl HandFit {
         decoded.dropped.collision += self.misfits;
         decoded
     }
+}
+
+/// The observed surface in the frame of the volume's corner: that of its details, if it has them, because they show
+/// thinner objects.
+fn surface(volume: &Volume) -> Vec<SurfacePoint> {
+    let Some(details) = volume.details() else { return volume.surface() };
+    let in_volume = volume.pose().inverse() * details.pose();
+    let moved =
+        |SurfacePoint { position, normal }| SurfacePoint { position: in_volume * position, normal: in_volume * normal };
+    details.surface().into_iter().map(moved).collect()
 }

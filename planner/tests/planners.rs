@@ -13,13 +13,17 @@ use grasp_planner::{Evaluator, Gpd, HighestProposal, ModelSpec, NetworkPlanner, 
 use nalgebra::{Isometry3, Point3, Vector3};
 
 const TABLE: f64 = 0.05;
-/// Centre of the base and edge lengths of a high and a low box, metres.
-const BOXES: [([f64; 2], [f64; 3]); 2] = [([0.1, 0.15], [0.04, 0.05, 0.12]), ([0.2, 0.16], [0.045, 0.04, 0.05])];
+/// Centre of the base and edge lengths, metres.
+type Cuboid = ([f64; 2], [f64; 3]);
+/// A high and a low box.
+const BOXES: [Cuboid; 2] = [([0.1, 0.15], [0.04, 0.05, 0.12]), ([0.2, 0.16], [0.045, 0.04, 0.05])];
 /// Distance between surface points, metres.
 const STEP: f64 = 0.002;
+/// A camera in front of the boxes.
+const EYE: Point3<f64> = Point3::new(0.15, -0.35, 0.45);
 
 /// The top and the four sides of a box.
-fn surface(([x, y], [a, b, height]): ([f64; 2], [f64; 3])) -> Vec<SurfacePoint> {
+fn surface(([x, y], [a, b, height]): Cuboid) -> Vec<SurfacePoint> {
     let steps = |length: f64| (0..=(length / STEP) as usize).map(|i| i as f64 * STEP);
     let at = |dx: f64, dy: f64, dz: f64, normal| SurfacePoint {
         position: Point3::new(x - a / 2.0 + dx, y - b / 2.0 + dy, TABLE + dz),
@@ -36,13 +40,19 @@ fn surface(([x, y], [a, b, height]): ([f64; 2], [f64; 3])) -> Vec<SurfacePoint> 
     points
 }
 
-/// The boxes as seen by a camera in front of them, with the volume at the pose `frame`.
-fn scene(frame: Isometry3<f64>) -> Scene {
-    let mut points: Vec<SurfacePoint> = BOXES.into_iter().flat_map(surface).collect();
+/// The surface of boxes and of the table.
+fn on_table(boxes: &[Cuboid]) -> Vec<SurfacePoint> {
+    let mut points: Vec<SurfacePoint> = boxes.iter().copied().flat_map(surface).collect();
     let table = (0..150).flat_map(|i| (0..150).map(move |j| (f64::from(i) * STEP, f64::from(j) * STEP)));
     points.extend(table.map(|(x, y)| SurfacePoint { position: Point3::new(x, y, TABLE), normal: Vector3::z() }));
+    points
+}
+
+/// The boxes as seen by the camera, with the volume at the pose `frame`.
+fn scene(frame: Isometry3<f64>) -> Scene {
+    let points = on_table(&BOXES);
     let positions: Vec<Point3<f64>> = points.iter().map(|point| point.position).collect();
-    let view = seen_from(&positions, &Point3::new(0.15, -0.35, 0.45), WORKSPACE_SIZE).unwrap();
+    let view = seen_from(&positions, &EYE, WORKSPACE_SIZE).unwrap();
     let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
     assert!(fusion.integrate(&view.image, &view.camera_from_task) > 0);
     Scene { points: Some(points), ..fusion.volume(frame).unwrap().into() }
@@ -85,7 +95,7 @@ fn every_planner_grasps_the_boxes_and_is_deterministic() {
         assert!(!decoded.grasps.is_empty(), "{name}");
         for grasp in &decoded.grasps {
             let tip = grasp.pose * Point3::new(0.0, 0.0, grasp::FINGER_DEPTH);
-            let near = |&([x, y], [a, b, height]): &([f64; 2], [f64; 3])| {
+            let near = |&([x, y], [a, b, height]): &Cuboid| {
                 (tip.x - x).abs() < a && (tip.y - y).abs() < b && tip.z < TABLE + height + 0.02
             };
             assert!(BOXES.iter().any(near), "{name}: {tip}");
@@ -171,6 +181,27 @@ fn fingers_shorter_than_the_first_bite_of_gpd_find_grasps() {
 fn without_points_the_surface_of_the_volume_is_used() {
     let scene = Scene { points: None, ..scene(Isometry3::identity()) };
     assert!(!plan(&mut Shaf, &scene, Shaf::decode_params()).grasps.is_empty());
+}
+
+/// A pen, 12 mm wide and high: the network proposes nothing there, and the fingers have 10 mm above the table.
+#[test]
+fn the_evaluator_grasps_thin_things_across() {
+    let pen: Cuboid = ([0.15, 0.15], [0.012, 0.13, 0.012]);
+    let positions: Vec<Point3<f64>> = on_table(&[pen]).iter().map(|point| point.position).collect();
+    let view = seen_from(&positions, &EYE, WORKSPACE_SIZE).unwrap();
+    let mut fusion = Fusion::new(RESOLUTION, WORKSPACE_SIZE);
+    fusion.integrate(&view.image, &view.camera_from_task);
+    let frame = Isometry3::new(Vector3::new(0.3, 0.1, -0.2), Vector3::z() * 0.4);
+    let volume = fusion.detailed_volume(frame, &[(&view.image, view.camera_from_task)]).unwrap();
+    let network = Network::load(&zoo("vgn-packed.onnx"), &Options::default()).unwrap();
+    let decode = Evaluator::decode_params(network.metadata());
+    let evaluator = Evaluator::load(&zoo("evaluators/vgn-refined.onnx"), &Options::default()).unwrap();
+    let mut planner = NetworkPlanner::new(network, Some(evaluator));
+    let best = plan(&mut planner, &volume.into(), decode).grasps[0];
+    let pose = frame.inverse() * best.pose;
+    let tips = pose * Point3::new(0.0, 0.0, grasp::FINGER_DEPTH);
+    assert!((tips.x - 0.15).abs() < 0.03 && (tips.y - 0.15).abs() < 0.065, "the pen is between the fingers: {tips}");
+    assert!((pose * Vector3::y()).x.abs() > 0.7, "the fingers close across the pen");
 }
 
 #[test]

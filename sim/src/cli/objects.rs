@@ -36,6 +36,11 @@ pub struct Objects {
     #[arg(long, default_value_t = COLUMNS * ROWS)]
     count: usize,
 
+    /// Only objects that are at most so high, metres, at least 0.01: with 0.032 pens, cutlery, plates and tools that lie
+    /// flat.
+    #[arg(long, value_name = "METRES", value_parser = height)]
+    max_height: Option<f64>,
+
     /// Draw the first 60 objects into this file, PNG.
     #[arg(long)]
     picture: Option<PathBuf>,
@@ -49,9 +54,12 @@ impl Objects {
     pub fn run(self) -> anyhow::Result<()> {
         let set = self.scene.objects(&self.objects)?;
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let mut objects = set.listed().to_vec();
-        if objects.is_empty() {
-            objects = (0..self.skip + self.count).map(|_| set.draw(&mut rng)).collect();
+        let highest = self.max_height.unwrap_or(f64::INFINITY);
+        let is_low = |object: &Arc<Object>| object.visual.extents().z <= highest;
+        let mut objects: Vec<_> = set.listed().iter().filter(|object| is_low(object)).cloned().collect();
+        if set.listed().is_empty() {
+            let generated = std::iter::repeat_with(|| set.draw(&mut rng));
+            objects = generated.filter(is_low).take(self.skip + self.count).collect();
         }
         let objects = objects.get(self.skip..).unwrap_or_default();
         println!("{} objects", objects.len());
@@ -66,6 +74,12 @@ impl Objects {
         }
         Ok(())
     }
+}
+
+/// A height at which some generated objects are lower.
+fn height(text: &str) -> Result<f64, String> {
+    let height: f64 = text.parse().map_err(|_| "must be a number".to_owned())?;
+    if height >= 0.01 { Ok(height) } else { Err("must be at least 0.01 m".to_owned()) }
 }
 
 fn draw(objects: &[Arc<Object>]) -> Picture {

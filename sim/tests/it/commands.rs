@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use grasp_data::Dataset;
 use grasp_sim::export;
+use grasp_sim::objects::ObjectSet;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -303,6 +304,19 @@ fn a_benchmark_reports_every_attempt() {
     let of_network = rows.lines().find(|line| line.contains("vgn-packed.onnx |")).unwrap();
     let gsr = format!("{:.1} ±", summaries[1]["seeds"]["gsr"]["mean"].as_f64().unwrap() * 100.0);
     assert!(of_network.contains(&gsr), "{of_network}: {gsr}");
+}
+
+#[test]
+fn objects_can_be_low_only() {
+    let desk = Desk::new();
+    assert_eq!(
+        desk.run("objects --objects generated --count 6 --max-height 0.032 --out low").lines().next(),
+        Some("6 objects")
+    );
+    let low = ObjectSet::load(&desk.path("low")).unwrap();
+    assert_eq!(low.listed().len(), 6);
+    assert!(low.listed().iter().all(|object| object.visual.extents().z < 0.0321));
+    assert!(desk.refused("objects --max-height 0").contains("at least 0.01 m"));
 }
 
 #[test]
