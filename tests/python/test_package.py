@@ -20,6 +20,7 @@ import tempfile
 import time
 import types
 import unittest
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from pathlib import Path
@@ -539,8 +540,50 @@ class ErrorsTest(ServerTest):
     def test_the_port_of_an_address_without_one_is_50051(self):
         for address, expected in [
             ("robot", "robot:50051"), ("robot:1", "robot:1"), ("[::1]", "[::1]:50051"), ("unix:/run/graspd.sock", None),
+            ("127.0.0.1:", "127.0.0.1:50051"), ("[::1]:7", None), ("dns:///robot:1", None), ("dns:robot", "dns:robot:50051"),
+            ("ipv4:10.0.0.1:50051,10.0.0.2", "ipv4:10.0.0.1:50051,10.0.0.2:50051"),
         ]:
             self.assertEqual(with_port(address), expected or address)
+        for address, message in [
+            ("127.0.0.1:99999", "the port of the address is 99999"), ("robot:x", "the port of the address is x"),
+            ("ftp://robot:1", "begins with ftp://"),
+        ]:
+            with self.assertRaisesRegex(ValueError, message):
+                graspd.Client(address)
+        for arguments, message in [
+            ({"address": None}, "address is None, must be a text"), ({"address": 23001}, "address is 23001, must be a text"),
+            ({"retry": 3}, "retry is 3, must be a graspd.Retry"), ({"token": 3}, "token is 3, must be a text"),
+        ]:
+            with self.assertRaisesRegex(TypeError, message):
+                graspd.Client(**{"address": "robot"} | arguments)
+        with self.assertRaisesRegex(ValueError, "timeout is inf, must be finite"):
+            graspd.Client("robot", timeout=float("inf"))
+
+    def test_arguments_of_another_type_are_named(self):
+        view = views()[0]
+        cloud = graspd.CloudView(np.ones((5, 3)), (0, 0, 0))
+        for call, message in [
+            (lambda: self.client.detect_from_depth(view, options={"threshold": 1}), "options is .*, must be a graspd.Options"),
+            (lambda: self.client.detect_from_depth(view, np.eye(4)), "workspace is .*, must be a graspd.Workspace"),
+            (lambda: self.client.detect_from_depth("view"), "views is 'view', must be a graspd.DepthView"),
+            (lambda: self.client.detect_from_depth({"depth": 1}), "views is .*, must be a graspd.DepthView"),
+            (lambda: self.client.detect_from_depth(cloud), "views is .*, must be a graspd.DepthView"),
+            (lambda: self.client.detect_from_cloud([view]), "views is .*, must be a graspd.CloudView"),
+            (lambda: self.client.detect_from_depth(view, request_id=3), "request_id is 3, must be a text"),
+            (lambda: graspd.Options(model=3), "Options.model is 3, must be a text"),
+            (lambda: graspd.Options(explain="no"), "Options.explain is 'no', must be True or False"),
+            (lambda: graspd.CollisionCheck(hidden="yes"), "CollisionCheck.hidden is 'yes', must be True or False"),
+        ]:
+            with self.subTest(message), self.assertRaisesRegex(TypeError, message):
+                call()
+        for make, message in [
+            (lambda: graspd.Options(threshold=-0.1), "Options.threshold is -0.1, must not be negative"),
+            (lambda: graspd.CollisionCheck(clearance=-1), "CollisionCheck.clearance is -1, must not be negative"),
+            (lambda: graspd.CloudView(np.ones((5, 3)), None), "camera_position is None, must be x, y, z"),
+            (lambda: graspd.Picture("<svg/>").save("p.png"), "p.png: the picture is SVG"),
+        ]:
+            with self.subTest(message), self.assertRaisesRegex(ValueError, message):
+                make()
 
 
 class StreamTest(ServerTest):
@@ -824,6 +867,9 @@ class AsyncioTest(unittest.IsolatedAsyncioTestCase):
             return asyncio.run(client.health())
 
         self.assertTrue(await asyncio.to_thread(health))
+        await self.client.health()
+        with self.assertRaisesRegex(RuntimeError, "used in another event loop; make a new one"):
+            await asyncio.to_thread(lambda: asyncio.run(self.client.health()))
 
     async def test_errors_are_raised(self):
         with self.assertRaises(graspd.InvalidArgument) as caught:
@@ -962,6 +1008,71 @@ class CameraTest(ServerTest):
             np.testing.assert_array_equal(camera.k, scene.K)
             self.assertEqual(camera.size, (scene.WIDTH, scene.HEIGHT))
 
+    def test_files_of_other_tools_are_read_whole(self):
+        """The names are those of the tests of `grasp`."""
+        fx = {"fx": 540, "fy": 541, "cx": 320, "cy": 240}
+        k, d = [540, 0, 320, 0, 541, 240, 0, 0, 1], [-0.28, 0.09, 0, 0, 0]
+        named = dict(zip(["k1", "k2", "p1", "p2"], d))
+        sizes = [{"w": 848, "h": 480}, {"image_size": [848, 480]}, {"resolution": {"width": 848, "height": 480}}]
+        sizes += [{"width": "848", "height": "480"}, {"image_Width": 848, "image_Height": 480}, {"image": {"width": 848, "height": 480}}]
+        names = "d dist distCoeffs dist_coefs distortion distortion_coeff Distortion_Coefficients coeffs kc".split()
+        lenses = [{name: [d]} for name in names] + [named, {"distortion": named}, {"coeffs": named}, {"d": list(map(str, d))}]
+        units = [{"depth_scale": "0.0005"}, {"depthScale": 0.0005}, {"factor_depth": [[2000]]}, {"DepthMapFactor": 2000}]
+        for part in [*sizes, *lenses, *units]:
+            for document in [fx | part, {"K": k} | part, part | {"intrinsics": fx}]:
+                with self.subTest(document):
+                    camera = graspd.Camera.from_info(document)
+                    np.testing.assert_array_equal(camera.k, np.reshape(k, (3, 3)))
+                    self.assertEqual(camera.size, (848, 480) if part in sizes else None)
+                    self.assertEqual(camera.distortion[:2], (-0.28, 0.09) if part in lenses else ())
+                    self.assertEqual(camera.depth_scale, 0.0005 if part in units else None)
+        fisheye = fx | {"distortion_type": "equidistant", "d": [0.02, -0.01, 0.003, -0.0005]}
+        self.assertEqual(graspd.Camera.from_info(fisheye).distortion_model, "equidistant")
+        depth = graspd.Camera.from_info({"color": fx | {"fx": 250}, "depth": fx})
+        self.assertEqual(depth.k[0, 0], 540)
+        for document, message in [
+            ({"cam0": fx, "cam1": fx | {"fx": 250}}, "several cameras in the file: cam0, cam1"),
+            (fx | {"model": 2, "coeffs": d}, "inverse_brown_conrady"),
+            (fx | {"d": "<sequence>"}, "`d` is '<sequence>', must be the numbers of the distortion"),
+            (fx | {"distortion": {"a": 1}}, "`distortion` is .*, must be the numbers"),
+            (fx | {"depth_scale": 0}, "`depth_scale` is 0, must be above 0"),
+            (fx | {"k1": 1, "k2": 1, "k3": 1, "k4": 1}, "name its `distortion_model`"),
+            ({"focal": 540}, "no intrinsics found; keys in the file: focal$"),
+        ]:
+            with self.subTest(document), self.assertRaisesRegex(ValueError, message):
+                graspd.Camera.from_info(document)
+
+    def test_the_files_of_the_command_line_are_read(self):
+        folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        for name in people_files.intrinsics(folder):
+            with self.subTest(name):
+                np.testing.assert_allclose(graspd.Camera.read(folder / name).k, scene.K)
+        np.savez(folder / "lens.npz", mtx=scene.K, dist=[[0.1, 0, 0, 0, 0]], width=160, height=120, depth_scale=0.0005)
+        camera = graspd.Camera.read(folder / "lens.npz")
+        self.assertEqual((camera.distortion[0], camera.size, camera.depth_scale), (0.1, (160, 120), 0.0005))
+        np.save(folder / "dict.npy", {"K": scene.K}, allow_pickle=True)
+        (folder / "empty.json").write_text("")
+        for name, message in [("dict.npy", "dict.npy: a pickled Python object"), ("empty.json", "empty.json: the file is empty")]:
+            with self.assertRaisesRegex(ValueError, message):
+                graspd.Camera.read(folder / name)
+
+    def test_the_unit_of_a_camera_and_of_integer_points_is_used(self):
+        camera = graspd.Camera(scene.K, depth_scale=0.0005)
+        depth = scene.depth(CAMERAS[0])
+        view = graspd.DepthView(np.rint(depth / 0.0005).astype(np.uint16), camera, camera_from_task=CAMERAS[0])
+        sent = np.frombuffer(wire.depth_message(view).data, "<f4").reshape(depth.shape)
+        np.testing.assert_allclose(sent, depth, atol=3e-4)
+        points = np.array([[100, 200, 300]])
+        for dtype, scale, expected in [("i4", None, 0.1), ("f4", None, 100), ("i4", 1e-4, 0.01), ("f8", 1e-3, 0.1)]:
+            message = wire.cloud_message(graspd.CloudView(points.astype(dtype), (0, 0, 0), scale=scale))
+            self.assertAlmostEqual(np.frombuffer(message.points, "<f4")[0], expected, places=5)
+
+    def test_a_camera_takes_lists_and_arrays(self):
+        camera = graspd.Camera(scene.K, size=[160, 120], distortion=np.zeros((1, 5)))
+        graspd.DepthView(np.ones((120, 160)), camera)
+        with self.assertRaisesRegex(ValueError, "must be finite numbers"):
+            graspd.Camera(scene.K, distortion=[np.nan] * 5)
+
     def test_parts_of_the_sensor_and_rectified_images(self):
         part = {"roi": {"x_offset": 20, "y_offset": 40, "width": 120, "height": 80}, "binning_x": 2, "binning_y": 2}
         camera = graspd.Camera.from_info(self.INFO | part)
@@ -981,7 +1092,9 @@ class CameraTest(ServerTest):
             ({"d": [0.1] * 4, "distortion_model": "double_sphere"}, "'double_sphere' with 4 coefficients"),
             ({"d": [0.1] * 6}, "'plumb_bob' with 6 coefficients"),
             ({"k": [0.0] * 9}, "not calibrated"),
-            ({"k": None}, "must have k"),
+            ({"k": None}, "no intrinsics found; keys in the file: width, height"),
+            ({"d": [float("nan")] * 5}, "must be finite"),
+            ({"width": "wide"}, "`width` is .wide., must be a number of pixels"),
         ]:
             with self.assertRaisesRegex(ValueError, message):
                 graspd.Camera.from_info(self.INFO | wrong)
@@ -1014,6 +1127,19 @@ class PoseTest(unittest.TestCase):
             pose = graspd.Pose.from_matrix(matrix)
             np.testing.assert_allclose(pose.matrix(), matrix, atol=1e-12)
             np.testing.assert_allclose(Rotation.from_quat(pose.quaternion).as_matrix(), rotation, atol=1e-12)
+
+    def test_rotations_with_three_decimals_are_orthonormalised(self):
+        for rotation in Rotation.random(200, rng=1):
+            matrix = np.eye(4)
+            matrix[:3, :3] = rotation.as_matrix().round(3)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                pose = graspd.Pose.from_matrix(matrix)
+            self.assertLess((Rotation.from_quat(pose.quaternion) * rotation.inv()).magnitude(), 2e-3)
+        coarse = np.eye(4)
+        coarse[0, 0] = 1.002
+        with self.assertWarnsRegex(UserWarning, "few decimals"):
+            graspd.Pose.from_matrix(coarse)
 
     def test_invalid_matrices_are_rejected(self):
         pose = Rotation.from_euler("xyz", [0.1, 0.2, 0.3])

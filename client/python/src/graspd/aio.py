@@ -31,6 +31,8 @@ class Client(Connection[grpc.aio.Channel]):
     Arguments, results and errors are those of `graspd.Client`.
     """
 
+    _loop: asyncio.AbstractEventLoop | None = None
+
     async def __aenter__(self) -> Client:
         return self
 
@@ -166,6 +168,13 @@ class Client(Connection[grpc.aio.Channel]):
             except (Unavailable, DeadlineExceeded) as failure:
                 waiting.failed(failure)
             await asyncio.sleep(waiting.pause())
+
+    def _opened(self) -> grpc.aio.Channel:
+        loop = asyncio.get_running_loop()
+        if self._loop not in (None, loop):
+            raise RuntimeError("the client was used in another event loop; make a new one in each asyncio.run")
+        self._loop = loop
+        return super()._opened()
 
     def _open(
         self, target: str, credentials: grpc.ChannelCredentials | None, options: ChannelOptions

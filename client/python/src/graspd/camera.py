@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from os import PathLike
@@ -12,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-PLUMB_BOB = (4, 5, 8, 12)
-"""Numbers of the coefficients of `plumb_bob`, `rational_polynomial` and its form with thin prisms, in OpenCV's order."""
+from graspd.calibration import FISHEYE, POLYNOMIAL, find, whole
+from graspd.document import number, numbers, plain, read
 
-POLYNOMIAL = ("plumb_bob", "rational_polynomial", "thin_prism", "radtan", "brown_conrady", "pinhole")
-FISHEYE = ("equidistant", "fisheye", "kannala_brandt4")
+COUNTS = (4, 5, 8, 12)
+"""Numbers of the coefficients of `plumb_bob`, `rational_polynomial` and its form with thin prisms, in OpenCV's order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,19 +26,33 @@ class Camera:
     k: NDArray[np.floating[Any]]
     """The 3 × 3 intrinsic matrix, pixels, or a 3 × 4 projection matrix without a translation."""
     _: KW_ONLY
-    size: tuple[int, int] | None = None
+    size: tuple[int | None, int | None] | None = None
     """Width and height of the images, pixels; None: any."""
     distortion: Sequence[float] = ()
     """Coefficients in the order of OpenCV and ROS: 4, 5, 8 or 12, or 4 of `equidistant`. Empty or 0: none."""
     distortion_model: str = "plumb_bob"
     """``plumb_bob``, ``rational_polynomial``, or ``equidistant`` for OpenCV's fisheye."""
+    depth_scale: float | None = None
+    """Unit of integer depths, metres; None: 0.001."""
 
     def __post_init__(self) -> None:
         intrinsic_matrix(self.k)
+        # Lists and arrays are accepted.
+        coefficients = numbers(self.distortion)
+        if coefficients is None or not all(map(np.isfinite, coefficients)):
+            raise ValueError(f"distortion is {self.distortion!r}, must be finite numbers")
+        object.__setattr__(self, "distortion", tuple(coefficients))
+        if self.size is not None:
+            if len(self.size) != 2 or not all(edge is None or whole(number(edge)) for edge in self.size):
+                raise ValueError(f"size is {self.size!r}, must be the width and the height in pixels")
+            object.__setattr__(self, "size", tuple(edge if edge is None else int(edge) for edge in self.size))
+        if self.depth_scale is not None and not 0 < self.depth_scale <= 1:
+            raise ValueError(f"depth_scale is {self.depth_scale!r}, must be the unit of integer depths in metres: 0.001")
         if not self._is_distorted():
             return
         count = len(self.distortion)
-        is_known = count in PLUMB_BOB if self.distortion_model in POLYNOMIAL else self.distortion_model in FISHEYE and count == 4
+        model = plain(self.distortion_model)
+        is_known = count in COUNTS if model in POLYNOMIAL else model in FISHEYE and count == 4
         if not is_known:
             raise ValueError(
                 f"distortion {self.distortion_model!r} with {count} coefficients is not supported: rectify the image, and "
@@ -48,9 +61,13 @@ class Camera:
 
     @classmethod
     def from_info(cls, info: Any, *, rectified: bool = False) -> Camera:
-        """From a ``CameraInfo`` of ROS 1 or 2: a message, or a dictionary with its fields. `rectified`: for the images of
+        """From a ``CameraInfo`` of ROS 1 or 2: a message, or a dictionary with its fields or those of a file that `read`
+        reads. `rectified`: for the images of
         ``image_rect`` topics, which have the matrix `p` and no distortion. A part of the sensor (`roi`) and combined pixels
         (`binning`) are taken into account."""
+
+        if isinstance(info, Mapping) and not rectified:
+            return cls._found(info)
 
         def field(*names: str) -> Any:
             of = info.get if isinstance(info, Mapping) else lambda name: getattr(info, name, None)
@@ -82,29 +99,41 @@ class Camera:
 
     @classmethod
     def read(cls, path: str | PathLike[str], *, rectified: bool = False) -> Camera:
-        """From a file with a ``CameraInfo``: JSON, or YAML as ``ros2 topic echo`` and camera_calibration write it. YAML needs
-        the package PyYAML."""
-        text = Path(path).read_text()
-        if Path(path).suffix == ".json":
-            return cls.from_info(json.loads(text), rectified=rectified)
+        """From a file of ROS (``CameraInfo`` as ``ros2 topic echo`` prints it), OpenCV, Open3D, librealsense, kalibr, BOP and
+        others: JSON, YAML (needs the package PyYAML), a matrix as text, .npy or .npz. `rectified`: as for `from_info`."""
+        document = read(Path(path))
         try:
-            import yaml
-        except ImportError as error:
-            raise ImportError(f"{path}: reading YAML needs the package PyYAML") from error
-        return cls.from_info(next(yaml.safe_load_all(text)), rectified=rectified)
+            return cls.from_info(document, rectified=True) if rectified else cls._found(document)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+
+    @classmethod
+    def _found(cls, document: Any) -> Camera:
+        found = find(document)
+        return cls(
+            np.reshape(found.k, (3, 3)),
+            size=found.size,
+            distortion=found.distortion,
+            distortion_model=found.distortion_model,
+            depth_scale=found.depth_scale,
+        )
 
     def check_size(self, width: int, height: int) -> None:
         """Raises `ValueError` if images of this camera have another size."""
-        if self.size is None or self.size == (width, height):
+        own = self.size or (None, None)
+        image = (width, height)
+        differing = [axis for axis in range(2) if own[axis] is not None and own[axis] != image[axis]]
+        if not differing:
             return
-        scale = width / self.size[0]
-        if abs(scale * self.size[1] - height) <= 1:
+        scale = image[differing[0]] / (own[differing[0]] or 1)
+        # Rounded sizes of a scaled image differ by a pixel.
+        if all(edge is None or abs(scale * edge - of_image) <= 1 for edge, of_image in zip(own, image)):
             k = (intrinsic_matrix(self.k) * scale).round(4)
             advice = f"if the image was scaled, fx, fy, cx, cy are {k[0, 0]:g}, {k[1, 1]:g}, {k[0, 2]:g}, {k[1, 2]:g}"
         else:
             advice = "if the image was cropped, subtract the left and upper margin from cx and cy"
         raise ValueError(
-            f"the intrinsics are of images of {self.size[0]} × {self.size[1]} pixels, the image has {width} × {height}; {advice}"
+            f"the intrinsics are of images of {own[0] or '?'} × {own[1] or '?'} pixels, the image has {width} × {height}; {advice}"
         )
 
     def rectified(self, image: NDArray[Any]) -> NDArray[Any]:
@@ -129,7 +158,7 @@ class Camera:
         """Where the lens shows the points that a pinhole camera shows at (x, y), both for a focal length of 1, by the
         formulas of OpenCV (modules calib3d and fisheye)."""
         r2 = x * x + y * y
-        if self.distortion_model in FISHEYE:
+        if plain(self.distortion_model) in FISHEYE:
             r = np.sqrt(r2)
             theta = np.arctan(r)
             powers = np.stack([theta ** (2 * power) for power in range(5)], axis=-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -49,6 +50,10 @@ class Connection(Generic[Channel]):
         TLS. `token` is a bearer token. `timeout` limits each attempt of a call, seconds, and is sent to the server as
         the deadline; it does not apply to streams and tracking.
         """
+        if not isinstance(address, str):
+            raise TypeError(f"address is {address!r}, must be a text such as '127.0.0.1:50051'")
+        if not isinstance(retry, Retry):
+            raise TypeError(f"retry is {retry!r}, must be a graspd.Retry, such as Retry.RECOMMENDED")
         if (tls_cert is None) != (tls_key is None):
             raise ValueError("tls_cert and tls_key must be given together")
         ca, cert, key = (None if file is None else Path(file).read_bytes() for file in (tls_ca, tls_cert, tls_key))
@@ -80,15 +85,33 @@ def positive(name: str, value: float) -> float:
     """Checks a number of seconds."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError(f"{name} is {value!r}, must be a number of seconds")
+    if value == float("inf"):
+        raise ValueError(f"{name} is {value!r}, must be finite")
     if not value > 0:
         raise ValueError(f"{name} is {value!r}, must be greater than 0 seconds")
     return value
 
 
 def with_port(target: str) -> str:
-    """The target with the port of graspd, if it is a host without a port."""
-    is_host = not target.startswith("unix:") and (target.endswith("]") or ":" not in target)
-    return f"{target}:50051" if is_host else target
+    """The target with the port of graspd, if it is a host without a port. Others than 1 to 65535 are refused: gRPC takes them
+    modulo 65536."""
+    if target.startswith("unix:"):
+        return target
+    if "://" in target and not target.startswith("dns://"):
+        scheme = target.split("://")[0]
+        raise ValueError(f"the address begins with {scheme}://, must begin with http://, https:// or unix:")
+    scheme = re.match(r"(dns:/*|ipv[46]:/*)?", target)[0]  # type: ignore[index]
+    return scheme + ",".join(map(host_with_port, target[len(scheme) :].split(",")))
+
+
+def host_with_port(host: str) -> str:
+    has_port = ":" in host.rpartition("]")[2] and host.rpartition("]")[2].count(":") == 1
+    name, _, port = host.rpartition(":") if has_port else (host, "", "")
+    if not port:
+        return f"{name}:50051"
+    if not (port.isdigit() and 0 < int(port) < 65536):
+        raise ValueError(f"the port of the address is {port}, must be from 1 to 65535")
+    return host
 
 
 def replicas(target: str) -> ChannelOptions:
@@ -108,6 +131,8 @@ def without_proxy(target: str) -> ChannelOptions:
 
 
 def bearer(token: str) -> str:
+    if not isinstance(token, str):
+        raise TypeError(f"token is {token!r}, must be a text")
     token = token.strip()
     # Checked here, because gRPC's error message would contain the token.
     if not (token and token.isascii() and token.isprintable()):

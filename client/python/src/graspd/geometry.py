@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -11,6 +12,12 @@ from numpy.typing import NDArray
 
 Vector: TypeAlias = Sequence[float] | NDArray[np.floating[Any]]
 """x, y, z."""
+
+
+CORRECTED = 1e-2
+"""Largest deviation of a rotation from an orthonormal matrix that is corrected: room for three decimals, as in `grasp`."""
+EXACT = 1e-3
+"""Deviations that are not reported."""
 
 
 @dataclass(frozen=True)
@@ -24,15 +31,22 @@ class Pose:
 
     @classmethod
     def from_matrix(cls, matrix: NDArray[np.floating[Any]]) -> Pose:
-        """From the 4 × 4 matrix that maps points (x, y, z, 1). Raises `ValueError` if it is not a rigid transform."""
+        """From the 4 × 4 matrix that maps points (x, y, z, 1). A rotation with few decimals is orthonormalised; raises
+        `ValueError` if it is further from a rigid transform."""
         matrix = np.asarray(matrix, np.float64)
         if matrix.shape != (4, 4):
             raise ValueError(f"a pose must be a 4 × 4 matrix, got shape {matrix.shape}")
         rotation = matrix[:3, :3]
-        # The server's tolerance for the norm of quaternions.
-        is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
-        if not (is_rotation and np.allclose(matrix[3], [0, 0, 0, 1])):
-            raise ValueError(f"a pose must be a rotation and a translation, got\n{matrix}")
+        deviation = float(np.linalg.norm(rotation @ rotation.T - np.eye(3)))
+        # Written so that NaN fails.
+        is_rotation = deviation < CORRECTED and np.linalg.det(rotation) > 0
+        if not (is_rotation and np.isfinite(matrix).all() and np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6)):
+            raise ValueError(
+                f"a pose must be a rotation and a translation (R·Rᵀ deviates from the identity by {deviation:.3f}, at most "
+                f"{CORRECTED} is corrected; the last row must be 0 0 0 1), got\n{matrix}"
+            )
+        if deviation > EXACT:
+            warnings.warn(f"the rotation of a pose has few decimals; it was orthonormalised ({deviation:.4f} off)", stacklevel=2)
         # The quaternion is the eigenvector of the largest eigenvalue of a symmetric matrix, whose lower half this is
         # (Bar-Itzhack 2000). The method is stable at every angle.
         (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any, Literal
 
+import numpy as np
+
 from graspd.geometry import PoseLike, Vector
 
 
@@ -27,6 +29,24 @@ def check_count(name: str, value: Any) -> None:
         raise TypeError(f"{name} is {value!r}, must be an integer")
     if not 0 <= int(value) < 2**32:
         raise ValueError(f"{name} is {value!r}, must be from 0 to {2**32 - 1}")
+
+
+def check_text(name: str, value: Any) -> None:
+    if not isinstance(value, str):
+        raise TypeError(f"{name} is {value!r}, must be a text")
+
+
+def check_truth(name: str, value: Any) -> None:
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"{name} is {value!r}, must be True or False")
+
+
+def check_not_negative(name: str, values: dict[str, Any]) -> None:
+    """Accepts None among them."""
+    check_numbers(name, values)
+    for field, value in values.items():
+        if value is not None and value < 0:
+            raise ValueError(f"{name}.{field} is {value!r}, must not be negative")
 
 
 def check_numbers(name: str, values: dict[str, Any]) -> None:
@@ -89,7 +109,9 @@ class CollisionCheck:
     depth images or point clouds."""
 
     def __post_init__(self) -> None:
-        check_numbers("CollisionCheck", {"table_height": self.table_height, "clearance": self.clearance})
+        check_numbers("CollisionCheck", {"table_height": self.table_height})
+        check_not_negative("CollisionCheck", {"clearance": self.clearance})
+        check_truth("CollisionCheck.hidden", self.hidden)
         if self.mode is not None:
             check_choice("CollisionCheck.mode", self.mode, "off", "flag", "filter")
 
@@ -182,8 +204,12 @@ class Options:
             raise TypeError(f"Options.objects is {self.objects!r}, must be a list of labels")
         for label in self.objects:
             check_count("Options.objects", label)
-        names = ["threshold", "force", "min_height", "pregrasp_distance", "margin"]
-        check_numbers("Options", {name: getattr(self, name) for name in names})
+        check_text("Options.model", self.model)
+        check_text("Options.version", self.version)
+        check_truth("Options.explain", self.explain)
+        check_numbers("Options", {"min_height": self.min_height})
+        names = ["threshold", "force", "pregrasp_distance", "margin"]
+        check_not_negative("Options", {name: getattr(self, name) for name in names})
         check_choice("Options.priority", self.priority, "normal", "batch")
         check_type("Options.collision", self.collision, CollisionCheck, 'CollisionCheck("filter")')
         check_type("Options.convention", self.convention, Convention, 'Convention("tcp")')

@@ -33,12 +33,16 @@ class Picture:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Writes an SVG file, which browsers show."""
+        if Path(path).suffix.lower() not in (".svg", ""):
+            raise ValueError(f"{path}: the picture is SVG; give a name that ends with .svg, and convert it to other formats")
         Path(path).write_text(self.svg)
 
 
 def draw(hands: Iterable[tuple[Pose, float, float]], view: DepthView, frame_from_task: PoseLike | None, depth: float) -> Picture:
     """Draws hands over a depth image, each with its pose, its width and its quality; the last is in front. `depth` is the
     length of the fingers, metres."""
+    if not isinstance(view, DepthView):
+        raise TypeError(f"view is {view!r}, must be the graspd.DepthView in which the grasps were found")
     image = np.ma.filled(view.depth, 0) if np.ma.isMA(view.depth) else np.asarray(view.depth)
     height, width = image.shape[:2]
     image = image.reshape(height, width)

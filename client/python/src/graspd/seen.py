@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from graspd.document import listed
 from graspd.camera import Camera, intrinsic_matrix
 from graspd.geometry import PoseLike, Vector
 
@@ -89,12 +91,16 @@ class CloudView:
     labels: NDArray[np.integer[Any]] | None = None
     """``[…]``: label of the object of each point, whole numbers from 0 to 65535, or truth values; 0 is no object. None:
     unknown."""
-    scale: float = 1.0
-    """Unit of the points, metres: 0.001 for millimetres. `camera_position` is in metres."""
+    scale: float | None = None
+    """Unit of the points, metres: 0.001 for millimetres; None: 0.001 for integers and 1 for floats. `camera_position` is in
+    metres."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.scale, (bool, str)) or not (np.isfinite(self.scale) and self.scale > 0):
+        is_number = isinstance(self.scale, Real) and not isinstance(self.scale, bool)
+        if self.scale is not None and not (is_number and 0 < self.scale < np.inf):
             raise ValueError(f"scale is {self.scale!r}, must be a number above 0: 0.001 for points in millimetres")
+        if np.shape(self.camera_position) != (3,):
+            raise ValueError(f"camera_position is {self.camera_position!r}, must be x, y, z in metres")
         points = coordinates(self.points)
         if self.labels is not None and np.shape(self.labels) != points.shape[:-1]:
             raise ValueError(f"labels must be one for each point, got shape {np.shape(self.labels)}")
@@ -104,15 +110,26 @@ def coordinates(points: Any) -> NDArray[Any]:
     """x, y and z of each point; NaN for masked points."""
     names = getattr(getattr(points, "dtype", None), "names", None)
     if names is not None:
-        if not {"x", "y", "z"} <= set(names):
-            raise ValueError(f"a structured point cloud must have the fields x, y and z, got {', '.join(names)}")
-        points = np.ma.stack([points[axis] for axis in "xyz"], axis=-1)
+        axes = {name.lower(): name for name in names}
+        if not {"x", "y", "z"} <= set(axes):
+            raise ValueError(f"a structured point cloud must have the fields x, y and z, got {listed(names)}")
+        points = np.ma.stack([points[axes[axis]] for axis in "xyz"], axis=-1)
     if np.ma.isMA(points):
-        points = np.ma.filled(points.astype(np.float32), np.nan)
+        is_masked = np.ma.getmaskarray(points).any()
+        points = np.ma.filled(points.astype(np.float32), np.nan) if is_masked else np.asarray(points)
     array: NDArray[Any] = np.asarray(points)
-    if array.shape[-1:] not in [(3,), (4,), (6,), (7,)]:
-        raise ValueError(f"a point cloud must be an array […][3] of x, y, z, got shape {array.shape}")
+    if array.shape[-1:] not in [(count,) for count in range(3, 8)] or not np.issubdtype(array.dtype, np.number):
+        raise ValueError(f"a point cloud must be an array […][3] of x, y, z, got shape {array.shape} of {array.dtype}")
     return array[..., :3]
+
+
+def unit_of(view: CloudView) -> float:
+    """The unit of the points, metres. Integers are in millimetres, as in `grasp`."""
+    if view.scale is not None:
+        return float(view.scale)
+    dtype = getattr(view.points, "dtype", None)
+    kinds = [dtype[name] for name in dtype.names if name.lower() == "x"] if dtype is not None and dtype.names else [dtype]
+    return 1e-3 if kinds[0] is not None and np.issubdtype(kinds[0], np.integer) else 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,10 +17,11 @@ from graspd import errors
 from graspd import grasp_pb2 as pb
 from graspd.camera import Camera, intrinsic_matrix
 from graspd.detection import Detection, Dropped, FoundTable, GeometryWarning, Grasp, Latency, Model, Score, Scores
+from graspd.document import short
 from graspd.geometry import Pose, PoseLike, Vector
 from graspd.options import Box, Candidate, CollisionCheck, Cone, Convention, Gripper, Options, Retreat
 from graspd.png import png_file
-from graspd.seen import CloudView, DepthView, Volume, Workspace, coordinates
+from graspd.seen import CloudView, DepthView, Volume, Workspace, coordinates, unit_of
 
 Observation: TypeAlias = Volume | NDArray[Any] | DepthView | CloudView | Iterable[DepthView | CloudView]
 """A volume, depth images or point clouds."""
@@ -48,9 +49,27 @@ def given(message: Callable[[Value], Message], value: Value | None) -> Message |
     return None if value is None else message(value)
 
 
+def each(views: Any, kind: type[Value]) -> list[Value]:
+    """The views of a request, of one kind."""
+    if isinstance(views, kind):
+        return [views]
+    listed = list(views) if isinstance(views, Iterable) and not isinstance(views, (str, dict, np.ndarray)) else [views]
+    for view in listed:
+        if not isinstance(view, kind):
+            raise TypeError(f"views is {short(views)}, must be a graspd.{kind.__name__} or several")
+    return listed
+
+
+def checked(name: str, value: Value, kind: type[Any]) -> Value:
+    if not isinstance(value, kind):
+        made = "a text" if kind is str else f"a graspd.{kind.__name__}"
+        raise TypeError(f"{name} is {short(value)}, must be {made}")
+    return value
+
+
 def detect_request(volume: Volume | NDArray[Any], options: Options | None, request_id: str) -> pb.DetectGraspsRequest:
     return pb.DetectGraspsRequest(
-        request_id=request_id,
+        request_id=checked("request_id", request_id, str),
         volume=volume_message(volume),
         options=given(options_message, options),
     )
@@ -60,8 +79,8 @@ def depth_request(
     views: DepthView | Iterable[DepthView], workspace: Workspace, options: Options | None, request_id: str
 ) -> pb.DetectGraspsFromDepthRequest:
     return pb.DetectGraspsFromDepthRequest(
-        request_id=request_id,
-        views=map(depth_message, [views] if isinstance(views, DepthView) else views),
+        request_id=checked("request_id", request_id, str),
+        views=map(depth_message, each(views, DepthView)),
         workspace=workspace_message(workspace),
         options=given(options_message, options),
     )
@@ -71,8 +90,8 @@ def cloud_request(
     views: CloudView | Iterable[CloudView], workspace: Workspace, options: Options | None, request_id: str
 ) -> pb.DetectGraspsFromCloudRequest:
     return pb.DetectGraspsFromCloudRequest(
-        request_id=request_id,
-        views=map(cloud_message, [views] if isinstance(views, CloudView) else views),
+        request_id=checked("request_id", request_id, str),
+        views=map(cloud_message, each(views, CloudView)),
         workspace=workspace_message(workspace),
         options=given(options_message, options),
     )
@@ -86,7 +105,7 @@ def score_request(
     request_id: str,
 ) -> pb.ScoreGraspsRequest:
     request = pb.ScoreGraspsRequest(
-        request_id=request_id,
+        request_id=checked("request_id", request_id, str),
         candidates=map(candidate_message, grasps),
         options=given(options_message, options),
     )
@@ -125,9 +144,9 @@ def track_request(
 ) -> pb.TrackGraspsRequest:
     return pb.TrackGraspsRequest(
         half_life=half_life,
-        request_id=request_id,
+        request_id=checked("request_id", request_id, str),
         stamp=given(stamp_message, stamp),
-        views=map(depth_message, [views] if isinstance(views, DepthView) else views),
+        views=map(depth_message, each(views, DepthView)),
         workspace=given(workspace_message, workspace),
         options=given(options_message, options),
     )
@@ -136,8 +155,9 @@ def track_request(
 def table_request(
     view: DepthView | CloudView, workspace: Workspace, table_height: float | None, request_id: str
 ) -> pb.FindTableRequest:
+    checked("workspace", workspace, Workspace)
     return pb.FindTableRequest(
-        request_id=request_id,
+        request_id=checked("request_id", request_id, str),
         view=None if isinstance(view, CloudView) else depth_message(view),
         cloud=cloud_message(view) if isinstance(view, CloudView) else None,
         # The server refuses both with a search.
@@ -194,6 +214,9 @@ def depth_message(view: DepthView) -> pb.DepthView:
         image = view.k.rectified(image)
         if labels is not None:
             labels = view.k.rectified(np.reshape(np.ma.filled(labels, 0), (height, width)))
+    scale = view.k.depth_scale if isinstance(view.k, Camera) else None
+    if scale is not None and scale != 1e-3 and np.issubdtype(image.dtype, np.integer):
+        image = image * scale
     if np.issubdtype(image.dtype, np.integer):
         if image.size and not (0 <= image.min() and image.max() <= 65535):
             raise ValueError(
@@ -224,6 +247,9 @@ def labels_message(labels: Any) -> pb.Labels:
     labels = np.ma.filled(labels, 0) if np.ma.isMA(labels) else np.asarray(labels)
     if not (np.issubdtype(labels.dtype, np.number) or labels.dtype == bool):
         raise ValueError(f"labels must be whole numbers or truth values, got {labels.dtype}")
+    if labels.dtype == np.float16:
+        # 65535 is beyond its range.
+        labels = labels.astype(np.float32)
     if np.issubdtype(labels.dtype, np.inexact) and not (labels == np.rint(labels)).all():
         raise ValueError(f"labels must be whole numbers or truth values, got {labels[labels != np.rint(labels)][0]}")
     if labels.size and not (0 <= labels.min() and labels.max() <= 65535):
@@ -235,8 +261,9 @@ def labels_message(labels: Any) -> pb.Labels:
 
 def cloud_message(view: CloudView) -> pb.CloudView:
     points = coordinates(view.points)
-    if view.scale != 1:
-        points = points * view.scale
+    scale = unit_of(view)
+    if scale != 1:
+        points = points * scale
     return pb.CloudView(
         labels=given(labels_message, view.labels),
         points=points.astype("<f4", copy=False).tobytes(),
@@ -246,6 +273,7 @@ def cloud_message(view: CloudView) -> pb.CloudView:
 
 
 def workspace_message(workspace: Workspace) -> pb.Workspace:
+    checked("workspace", workspace, Workspace)
     return pb.Workspace(
         pose=pose_message(workspace.pose),
         size=workspace.size,
@@ -264,6 +292,7 @@ def extent_message(extent: tuple[float, float]) -> pb.Extent:
 
 
 def options_message(options: Options) -> pb.Options:
+    checked("options", options, Options)
     return pb.Options(
         model=options.model,
         version=options.version,
@@ -382,10 +411,15 @@ def scores(message: pb.ScoreGraspsResponse) -> Scores:
     )
 
 
+def short_float(value: float) -> float:
+    """A number without the digits that are noise of 32-bit floats."""
+    return float(str(np.float32(value)))
+
+
 def score(message: pb.Score) -> Score:
     names = (enum_name(pb.Score.Violation.Name, violation) for violation in message.violations)
     return Score(
-        quality=message.quality,
+        quality=short_float(message.quality),
         violations=tuple(name.removeprefix("VIOLATION_") for name in names),
         object=message.object if message.HasField("object") else None,
         open_width=message.open_width if message.HasField("open_width") else None,
@@ -433,8 +467,8 @@ def warning(message: pb.GeometryWarning) -> GeometryWarning:
 def grasp(message: pb.Grasp) -> Grasp:
     return Grasp(
         pose=pose(message, "pose"),
-        width=message.width,
-        quality=message.quality,
+        width=short_float(message.width),
+        quality=short_float(message.quality),
         pregrasp=pose(message, "pregrasp"),
         retreat=pose(message, "retreat"),
         collides=message.collides if message.HasField("collides") else None,
