@@ -18,6 +18,7 @@ use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
 use crate::access::{Bearer, has_timed_out, is_transient};
+use crate::address;
 use crate::{
     Access, AnyView, Candidate, CloudView, DepthView, Detection, Error, Observation, Options, Retry, Scores, Workspace,
 };
@@ -72,13 +73,9 @@ impl Client {
     pub async fn connect_with(address: impl Into<String>, access: Access) -> Result<Self, Error> {
         let address = address.into();
         let tls = access.tls(&address);
-        let scheme = if tls.is_some() { "https" } else { "http" };
-        // With `http://`, tonic would not use TLS.
-        let name = address.strip_prefix("http://").unwrap_or(&address);
-        let uri = if name.contains("://") || name.starts_with("unix:") {
-            name.to_owned()
-        } else {
-            format!("{scheme}://{name}")
+        let uri = match address::uri(&address, tls.is_some()) {
+            Ok(uri) => uri,
+            Err(reason) => return Err(Error::Connect { address, reason }),
         };
         let connect = async || {
             let mut endpoint = Endpoint::from_shared(uri)?;

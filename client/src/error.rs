@@ -105,13 +105,17 @@ impl Error {
     pub(crate) fn connect(address: String, error: &tonic::transport::Error) -> Self {
         let error = root(error).to_string();
         let known = CONNECTION_ERRORS.iter().find(|(part, _)| error.contains(part));
-        let advice = known.map_or("check the address and that graspd runs there", |(_, advice)| advice);
-        Self::Connect { address, reason: format!("{error}; {advice}") }
+        let reason = match known {
+            Some((_, advice)) => (*advice).to_owned(),
+            None => format!("{error}; check the address and that graspd runs there"),
+        };
+        Self::Connect { address, reason }
     }
 }
 
 /// Parts of the transport's errors, and what to do.
-const CONNECTION_ERRORS: [(&str, &str); 4] = [
+const CONNECTION_ERRORS: [(&str, &str); 5] = [
+    ("CertificateRequired", "it needs a client certificate (tls_cert and tls_key)"),
     ("InvalidContentType", "the server does not use TLS: give an address without https://, and no CA or certificate"),
     (
         "CaUsedAsEndEntity",
@@ -135,10 +139,12 @@ impl From<Status> for Error {
         let request_id = status.get_details_request_info().map(|info| info.request_id);
         Self::Refused {
             code: status.code(),
-            message: if is_not_grpc {
+            message: if is_not_grpc && source(&status).contains("CertificateRequired") {
+                "the server needs a client certificate (tls_cert and tls_key)".to_owned()
+            } else if is_not_grpc {
                 format!(
                     "{}; if no call succeeds, the address may be the port for HTTP, or need https:// and a CA",
-                    std::error::Error::source(&status).map_or_else(String::new, |source| root(source).to_string())
+                    source(&status)
                 )
             } else {
                 status.message().to_owned()
@@ -162,6 +168,10 @@ impl From<pb::Error> for Error {
             views_added: error.views_added,
         }
     }
+}
+
+fn source(status: &Status) -> String {
+    std::error::Error::source(status).map_or_else(String::new, |source| root(source).to_string())
 }
 
 /// The innermost source. The transport's own message is only "transport error".

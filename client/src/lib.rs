@@ -32,6 +32,7 @@
 #![warn(missing_docs)]
 
 mod access;
+mod address;
 mod client;
 mod detection;
 mod error;

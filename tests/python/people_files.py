@@ -111,13 +111,21 @@ def poses(folder):
         "opencv_pose.yaml": opencv("T_base_camera", POSE),
         "xyz_keys.json": json.dumps({"position": xyz, "orientation": xyzw}),
         "named_matrix.json": json.dumps({"T_base_camera": rows}),
+        "upper_keys.json": json.dumps({"position": xyz, "orientation": {k.upper(): v for k, v in xyzw.items()}}),
+        "rotation_matrix.json": json.dumps({"R": POSE[:3, :3].tolist(), "t": [x, y, z]}),
+        "3x4.json": json.dumps(rows[:3]),
+        "tf.yaml": yaml.dump({"transforms": [{"transform": {"translation": xyz, "rotation": xyzw}}]}),
+        "two_decimals.json": json.dumps({"position": [x, y, z], "orientation": np.round([qx, qy, qz, qw], 2).tolist()}),
+        "row.txt": f"{x} {y} {z} {qx} {qy} {qz} {qw}\n",
+        "tum.txt": f"1311867170.4 {x} {y} {z} {qx} {qy} {qz} {qw}\n",
     }
     for name, text in texts.items():
         (folder / name).write_text(text)
     np.savez(folder / "pose.npz", pose=POSE)
+    np.savez(folder / "named.npz", T_base_camera=POSE, error=0.001)
     np.savetxt(folder / "pose.txt", POSE)
     (folder / "three_decimals.json").write_text(json.dumps(np.round(POSE, 3).tolist()))
-    return [*texts, "pose.npz", "pose.txt", "three_decimals.json"]
+    return [*texts, "pose.npz", "named.npz", "pose.txt", "three_decimals.json"]
 
 
 def intrinsics(folder):
@@ -133,14 +141,19 @@ def intrinsics(folder):
         "opencv_k.yaml": opencv("camera_matrix", K),
         "vgn_setup.json": json.dumps(setup),
         "camera_info.yaml": camera_info(),
+        "texts.json": json.dumps({"FX": str(fx), "FY": str(fy), "CX": str(cx), "CY": str(cy)}),
+        "rows_of_intrinsic_matrix.json": json.dumps({"intrinsic_matrix": K.tolist()}),
+        "orb_slam.yaml": f"%YAML:1.0\nCamera.fx: {fx}\nCamera.fy: {fy}\nCamera.cx: {cx}\nCamera.cy: {cy}\n",
+        "two_cameras.json": json.dumps({"color": {"fx": 2 * fx, "fy": fy, "cx": cx, "cy": cy}, "depth": {"K": numbers}}),
         "fx_fy.json": json.dumps({"fx": fx, "fy": fy, "x_offset": cx, "y_offset": cy}),
     }
     for name, text in texts.items():
         (folder / name).write_text(text)
     np.savetxt(folder / "k.txt", K)
     np.savez(folder / "k.npz", K=K)
+    np.savez(folder / "opencv.npz", mtx=K, dist=np.zeros((1, 5)), w=scene.WIDTH, h=scene.HEIGHT, rvecs=np.zeros((2, 3)))
     np.save(folder / "p.npy", np.hstack([K, np.zeros((3, 1))]))
-    return [*texts, "k.txt", "k.npz", "p.npy"]
+    return [*texts, "k.txt", "k.npz", "opencv.npz", "p.npy"]
 
 
 def clouds(folder):
@@ -171,7 +184,19 @@ def clouds(folder):
     np.save(folder / "structured.npy", structured)
     np.savez(folder / "xyz_rgb.npz", xyz=valid, rgb=grey)
     np.savetxt(folder / "points.xyz", valid)
-    names = ["nan.ply", "short_mm.ply", "count0.pcd", "short_mm.pcd", "xyzrgb.npy", "xyz1.npy", "structured.npy"]
+    np.save(folder / "five.npy", np.hstack([valid, grey[:, :2]]))
+    np.save(folder / "i4_mm.npy", millimetres.astype("<i4"))
+    short = np.zeros(len(valid), [("X", "<i2"), ("Y", "<i2"), ("Z", "<i2")])
+    for axis, values in zip("XYZ", millimetres.T):
+        short[axis] = values
+    np.save(folder / "structured_mm.npy", short)
+    upper = header.format("ascii 1.0", len(organised), properties("float").upper().replace("PROPERTY FLOAT", "property float"))
+    (folder / "minus_nan.ply").write_text(upper + rows.replace("nan", "-nan"))
+    (folder / "nan.xyz").write_text(rows.replace("nan", "-nan"))
+    (folder / "header.csv").write_text("index,x,y,z\n" + "".join(f"{i},{x},{y},{z}\n" for i, (x, y, z) in enumerate(valid)))
+    (folder / "count.pts").write_text(f"{len(organised)}\n" + rows)
+    more = ["five.npy", "i4_mm.npy", "structured_mm.npy", "minus_nan.ply", "nan.xyz", "header.csv", "count.pts"]
+    names = [*more, "nan.ply", "short_mm.ply", "count0.pcd", "short_mm.pcd", "xyzrgb.npy", "xyz1.npy", "structured.npy"]
     return [(name, ()) for name in [*names, "xyz_rgb.npz", "points.xyz"]] + [("float_mm.ply", ("--cloud-scale", "0.001"))]
 
 
@@ -183,9 +208,14 @@ def depths(folder):
     exr(folder / "view_layer.exr", {"ViewLayer.Depth.Z": DEPTH, "ViewLayer.Combined.R": DEPTH * 0})
     exr(folder / "rgb_equal.exr", {"R": DEPTH, "G": DEPTH, "B": DEPTH})
     np.save(folder / "channel.npy", DEPTH[..., None])
-    np.save(folder / "i32.npy", MILLIMETRES.astype(np.int32))
-    names = ["depth.png", "view_layer.exr", "rgb_equal.exr", "channel.npy", "i32.npy"]
-    scaled = [("float_mm.tiff", ("--depth-scale", "0.001")), ("tenths.png", ("--depth-scale", "0.0001"))]
+    exr(folder / "rgba.exr", {"R": DEPTH, "G": DEPTH, "B": DEPTH, "A": DEPTH * 0 + 1})
+    for kind in ["f2", "i2", "i4", "u4", "u8"]:
+        np.save(folder / f"{kind}.npy", (DEPTH if kind == "f2" else MILLIMETRES).astype(kind))
+    np.save(folder / "micrometres.npy", MILLIMETRES.astype(np.int32) * 1000)
+    np.savez(folder / "upper.npz", Depth=DEPTH, other=[1, 2])
+    (folder / "upper.npz").rename(folder / "UPPER.NPZ")
+    names = ["rgba.exr", "f2.npy", "i2.npy", "u4.npy", "u8.npy", "UPPER.NPZ", "depth.png", "view_layer.exr", "rgb_equal.exr", "channel.npy", "i4.npy"]
+    scaled = [("micrometres.npy", ("--depth-scale", "0.000001")), ("float_mm.tiff", ("--depth-scale", "0.001")), ("tenths.png", ("--depth-scale", "0.0001"))]
     return [(name, ()) for name in names] + scaled
 
 

@@ -18,6 +18,13 @@ import scene
 from server import Server
 
 WORKSPACE = "--workspace=0,0,0"
+# First bytes of files, by the words that name them.
+NAMED = {
+    "a JPEG file": b"\xff\xd8\xff\xe0\0\x10JFIF", "an HDF5 file": b"\x89HDF\r\n\x1a\n", "a BMP file": b"BM\0\0", "a PGM file": b"P5\n2 2\n",
+    "a PFM file": b"Pf\n2 2\n", "a Radiance HDR file": b"#?RADIANCE\n", "a HEIC": b"\0\0\0\x18ftypheic", "a MATLAB file": b"MATLAB 5.0",
+    "a pickle": b"\x80\x04\x95", "a gzip file": b"\x1f\x8b\x08", "a ZIP file without arrays": b"PK\x05\x06" + bytes(18),
+    "not a file of a known format": b"plain text", "the file is empty": b"",
+}
 
 
 class FilesTest(unittest.TestCase):
@@ -114,6 +121,37 @@ class FilesTest(unittest.TestCase):
         self.assert_refused(result, "320 × 180", "160 × 120")
         self.assertNotIn("if the image was scaled", result.stderr)
 
+    def test_what_is_in_doubt_is_refused(self):
+        (fx, _, cx), (_, fy, cy), _ = files.K.tolist()
+        k, one = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}, files.POSE.tolist()
+        other = np.linalg.inv(files.POSE).tolist()
+        for intrinsics, part in [
+            ({"w": 848, "h": 480, **k}, "of 848 × 480 pixels"),
+            ({"width": 848, "height": 480, "intrinsics": k}, "of 848 × 480 pixels"),
+            ({"cam0": k, "cam1": k | {"fx": 2 * fx}}, "several cameras in the file: cam0, cam1"),
+            ({"model": 2, "coeffs": [0.1, 0, 0, 0, 0], **k}, "inverse_brown_conrady"),
+        ]:
+            with self.subTest(intrinsics):
+                (self.folder / "doubt.json").write_text(json.dumps(intrinsics))
+                self.assert_refused(self.detect("depth.png", k="doubt.json"), part)
+        (self.folder / "poses.json").write_text(json.dumps({"T_base_cam": one, "T_cam_base": other}))
+        self.assert_refused(self.detect("depth.png", pose="poses.json"), "several poses in the file: T_base_cam, T_cam_base")
+        files.exr(self.folder / "two.exr", {"A.Depth.Z": files.DEPTH, "B.Depth.Z": files.DEPTH * 2})
+        self.assert_refused(self.detect("two.exr"), "several channels with depths: A.Depth.Z, B.Depth.Z")
+
+    def test_distortions_are_found_wherever_they_are(self):
+        d, k = files.LENSES["plumb_bob"], files.K.tolist()
+        np.save(self.folder / "seen.npy", files.distorted(d, "plumb_bob"))
+        documents = [{"camera_matrix": k, "distCoeffs": [d]}, {"K": k, "k1": d[0], "k2": d[1], "p1": d[2], "p2": d[3]}]
+        documents += [{"K": k, "distortion": {"k1": d[0], "k2": d[1], "p1": d[2], "p2": d[3]}}]
+        documents += [{"distortion": d, "intrinsics": {"K": k}}, {"K": k, "d": list(map(str, d))}]
+        for document in documents:
+            with self.subTest(document):
+                (self.folder / "named.json").write_text(json.dumps(document))
+                self.assert_right(self.detect("seen.npy", k="named.json"))
+        np.savez(self.folder / "lens.npz", mtx=files.K, dist=[d])
+        self.assert_right(self.detect("seen.npy", k="lens.npz"))
+
     def test_depth_scales_that_are_wrong_are_refused(self):
         for scale, advice in [("10000", "did you mean 0.0001?"), ("0", "--depth-scale"), ("nan", "--depth-scale")]:
             with self.subTest(scale):
@@ -124,7 +162,9 @@ class FilesTest(unittest.TestCase):
         self.assert_refused(self.detect("tenths.png", "--depth-scale", "0.001", k="tenths.json"), "0.001", "0.0001")
 
     def test_masks(self):
-        for name, mask in [("bool", files.ON_BLOCK), ("float", files.ON_BLOCK.astype(np.float32))]:
+        kinds = ["f2", "f4", "i1", "i2", "u4", "u8"]
+        masks = [("bool", files.ON_BLOCK), *((kind, files.ON_BLOCK.astype(kind)) for kind in kinds)]
+        for name, mask in [*masks, ("channel", files.ON_BLOCK[..., None])]:
             with self.subTest(name):
                 np.save(self.folder / "mask.npy", mask)
                 reply = self.assert_right(self.detect("depth.png", "--labels", "mask.npy", "--objects", "1"))
@@ -138,9 +178,12 @@ class FilesTest(unittest.TestCase):
         self.assert_refused(self.detect("cut.npy"), "cut.npy: the file is cut short")
         files.pickled(self.folder / "dict.npy")
         self.assert_refused(self.detect("dict.npy"), "pickled", "save")
-        for name, content in {"a.jpg": b"\xff\xd8\xff\xe0\0\x10JFIF", "a.h5": b"\x89HDF\r\n\x1a\n"}.items():
-            (self.folder / name).write_bytes(content)
-            self.assert_refused(self.detect(name), {"a.jpg": "JPEG", "a.h5": "HDF5"}[name])
+        for name, content in NAMED.items():
+            (self.folder / "file").write_bytes(content)
+            with self.subTest(name):
+                result = self.detect("file")
+                self.assert_refused(result, name)
+                self.assertNotIn("magic", result.stderr)
 
 
 if __name__ == "__main__":

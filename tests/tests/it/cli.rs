@@ -156,6 +156,13 @@ fn invalid_combinations_of_flags_are_refused_before_files_are_read() {
     assert!(refused("a.npy --camera-position 0,0,0 --intrinsics k.npy").contains("cannot be used with"));
     assert!(refused("a.npy --camera-position 0,0,0 --voxel-size 0.01").contains("cannot be used with"));
     assert!(refused("a.npy --camera-position 0,0").contains("must be 3 numbers separated by commas"));
+    // Flags of the other kind of input are not ignored.
+    for flags in ["--cloud-scale 0.001", "--frame-from-cloud pose.npy"] {
+        assert!(refused(&format!("a.npy --intrinsics k.npy {flags}")).contains("cannot be used with"), "{flags}");
+    }
+    for flags in ["--depth-scale 0.001", "--frame-from-camera pose.npy", "--camera-from-task pose.npy", "--png"] {
+        assert!(refused(&format!("a.npy --camera-position 0,0,0 {flags}")).contains("cannot be used with"), "{flags}");
+    }
     assert!(refused("a.npy --frame-from-cloud pose.npy").contains("--camera-position <X,Y,Z>"));
     assert!(refused("a.npy --palm 0,0,0,1,1,1").contains("--gripper <OPENING,DEPTH,WIDTH,BREADTH>"));
     assert!(refused("a.npy --origin parent").contains("--parent-from-grasp <FILE|NUMBERS>"));
@@ -453,7 +460,7 @@ fn depth_images_are_read_in_every_format() {
     let output = run(&server, &["detect", &flags[0], "--intrinsics", &flags[3]]);
     assert!(text(&output.stderr).contains("depth images need --camera-from-task or --frame-from-camera"));
     let output = run(&server, &command(&["detect"], &[&flags[..1], &flags[2..]].concat()));
-    assert!(text(&output.stderr).contains("2 poses in the file for 1 images"), "{}", text(&output.stderr));
+    assert!(text(&output.stderr).contains("2 poses in the file for 1 image;"), "{}", text(&output.stderr));
 }
 
 /// Point clouds of the same cameras: in the frames of the cameras, and in the task frame.
@@ -535,9 +542,9 @@ fn point_clouds_are_read_in_every_format() {
     let error = refused(&["detect", cloud]);
     assert!(error.contains("a volume must be N×N×N; for a point cloud add --camera-position"), "{error}");
     let error = refused(&[&["detect", cloud][..], &origin, &["--frame-from-cloud", poses]].concat());
-    assert!(error.contains("2 poses in the file for 1 point clouds"), "{error}");
+    assert!(error.contains("2 poses in the file for 1 point cloud;"), "{error}");
     let error = refused(&[&["detect", cloud][..], &origin, &origin].concat());
-    assert!(error.contains("is given 2 times for 1 point clouds"), "{error}");
+    assert!(error.contains("is given 2 times for 1 point cloud;"), "{error}");
     let error = refused(&[&["detect", cloud][..], &["--camera-position", "0.1,0.1,0.1"]].concat());
     assert!(error.contains("views[0]") && error.contains("check camera_position"), "{error}");
     let (_folder, volumes) = files();
@@ -592,7 +599,7 @@ fn point_clouds_of_pcl_and_of_meshes_are_read() {
     std::fs::write(path("image"), b"\x89PNG\r\n\x1a\n").unwrap();
     assert!(refused(&[&path("image")]).contains("this is an image; for a depth image give --intrinsics"));
     std::fs::write(path("text"), "hello").unwrap();
-    assert!(refused(&[&path("text")]).contains("neither a .npy file nor an image or a point cloud"));
+    assert!(refused(&[&path("text")]).contains("not a file of a known format"));
 }
 
 #[test]

@@ -5,13 +5,13 @@ use std::io::{self, Read};
 use std::path::Path;
 
 use anyhow::{Context, bail};
-use npyz::{DType, DTypeError, Deserialize, TypeRead};
-use pcd_rs::{DynReader, Field, ValueKind};
+use npyz::{DType, DTypeError, Deserialize, TypeChar, TypeRead};
+use pcd_rs::{DynReader, Field, ValueKind, ViewPoint};
 use ply_rs_bw::parser::Parser;
 use ply_rs_bw::ply::{Property, PropertyAccess, PropertyAccessResult};
 
-use crate::document::{document, flat};
-use crate::files::{self, Format};
+use crate::document::{listed, words};
+use crate::files::{self, Format, Values};
 
 /// Names of the points' array in a .npz file with several arrays.
 const ARRAYS: [&str; 2] = ["points", "xyz"];
@@ -48,38 +48,75 @@ fn unscaled(path: &Path) -> anyhow::Result<Points> {
         Format::Pcd => pcd(path),
         Format::Ply => ply(path),
         Format::Png | Format::Tiff | Format::Exr => bail!("this is an image; for a depth image give --intrinsics"),
-        Format::Other if ["xyz", "txt", "csv"].iter().any(|extension| files::has_extension(path, extension)) => {
-            Ok(text(path)?.into())
+        Format::Other
+            if ["xyz", "txt", "csv", "asc", "pts"].iter().any(|extension| files::has_extension(path, extension)) =>
+        {
+            Ok(text(&fs::read_to_string(path)?)?.into())
         }
-        Format::Other => Ok(arrays(path)?.into()),
+        Format::Other => arrays(path),
     })
 }
 
-/// The first three numbers of each line.
-fn text(path: &Path) -> anyhow::Result<Vec<[f32; 3]>> {
-    let document = document(path)?;
-    let rows = document.as_array().context("a point cloud as text has rows of numbers: x, y, z")?;
-    let point = |row: &serde_json::Value| match flat(row)[..] {
-        [x, y, z, ..] => Ok([x, y, z].map(|c| c as f32)),
-        _ => bail!("a row of fewer than three numbers"),
+/// The coordinates of each line: the first three numbers, or those under x, y and z of a first line with names. A first
+/// line with the number of points, as in .pts files, is left out.
+fn text(text: &str) -> anyhow::Result<Vec<[f32; 3]>> {
+    let lines =
+        text.trim_start_matches('\u{feff}').lines().map(|line| line.split('#').next().unwrap_or_default().trim());
+    let mut lines = lines.enumerate().filter(|(_, line)| !line.is_empty()).peekable();
+    let mut columns = [0, 1, 2];
+    let first: Vec<&str> = lines.peek().map(|(_, line)| words(line).collect()).unwrap_or_default();
+    let is_header = first.iter().any(|word| word.parse::<f32>().is_err());
+    if is_header {
+        let column = |axis: &str| {
+            let is_axis = |word: &&str| word.trim_matches(['"', '/']).eq_ignore_ascii_case(axis);
+            first
+                .iter()
+                .position(is_axis)
+                .with_context(|| format!("the first line has no column `{axis}`: {}", first.join(" ")))
+        };
+        columns = [column("x")?, column("y")?, column("z")?];
+    }
+    if is_header || first.len() == 1 {
+        lines.next();
+    }
+    let point = |(index, line): (usize, &str)| {
+        let row: Vec<&str> = words(line).collect();
+        let coordinate = |column: usize| row.get(column)?.parse::<f32>().ok();
+        let [x, y, z] = columns.map(coordinate);
+        let ((x, y), z) =
+            x.zip(y).zip(z).with_context(|| format!("line {} is `{line}`, must have x, y and z", index + 1))?;
+        Ok([x, y, z])
     };
-    rows.iter().map(point).collect()
+    lines.map(point).collect()
 }
 
-fn arrays(path: &Path) -> anyhow::Result<Vec<[f32; 3]>> {
+fn arrays(path: &Path) -> anyhow::Result<Points> {
     let array = files::array_of(path, &ARRAYS)?;
-    if let DType::Record(_) = array.dtype() {
-        let points =
-            files::values::<Structured>(array).context("a structured array needs the fields x, y and z, floats")?;
-        return Ok(points.into_iter().map(|Structured(point)| point).collect());
+    if let DType::Record(fields) = array.dtype() {
+        let is_integer = |field: &npyz::Field| match &field.dtype {
+            DType::Plain(plain) => {
+                field.name.eq_ignore_ascii_case("x") && !matches!(plain.type_char(), TypeChar::Float)
+            }
+            _ => false,
+        };
+        let are_integers = fields.iter().any(is_integer);
+        let points = files::values::<Structured>(array).context("a structured array needs numbers x, y and z")?;
+        return Ok(Points { xyz: points.into_iter().map(|Structured(point)| point).collect(), are_integers });
     }
     // Organized clouds are H×W×3. Further columns are colours or normals.
     let columns = match *array.shape() {
-        [.., _, columns @ (3 | 4 | 6 | 7)] => columns as usize,
-        _ => bail!("shape {:?}: a point cloud must be N×3 or H×W×3 (x, y, z), or N×4, N×6 or N×7", array.shape()),
+        [.., _, columns @ 3..=7] => columns as usize,
+        _ => bail!(
+            "shape {:?}: a point cloud must be N×3 or H×W×3 (x, y, z), with at most 4 further columns",
+            array.shape()
+        ),
     };
-    let point = |row: &[f64]| [row[0], row[1], row[2]].map(|c| c as f32);
-    Ok(files::floats(array)?.chunks_exact(columns).map(point).collect())
+    let (are_integers, numbers) = match files::numbers(array, "numbers x, y, z")? {
+        Values::Integers(numbers) => (true, numbers.into_iter().map(|number| number as f32).collect::<Vec<_>>()),
+        Values::Floats(numbers) => (false, numbers.into_iter().map(|number| number as f32).collect()),
+    };
+    let xyz = numbers.chunks_exact(columns).map(|row| [row[0], row[1], row[2]]).collect();
+    Ok(Points { xyz, are_integers })
 }
 
 /// A point of a structured array, as ros2_numpy makes it, with fields besides x, y and z.
@@ -95,6 +132,29 @@ struct StructuredReader {
 enum Coordinate {
     F32(<f32 as Deserialize>::TypeReader),
     F64(<f64 as Deserialize>::TypeReader),
+    I16(<i16 as Deserialize>::TypeReader),
+    I32(<i32 as Deserialize>::TypeReader),
+    U16(<u16 as Deserialize>::TypeReader),
+}
+
+impl Coordinate {
+    fn new(dtype: &DType) -> Result<Self, DTypeError> {
+        (f64::reader(dtype).map(Self::F64))
+            .or_else(|_| i16::reader(dtype).map(Self::I16))
+            .or_else(|_| i32::reader(dtype).map(Self::I32))
+            .or_else(|_| u16::reader(dtype).map(Self::U16))
+            .or_else(|_| f32::reader(dtype).map(Self::F32))
+    }
+
+    fn read(&self, bytes: &[u8]) -> io::Result<f32> {
+        Ok(match self {
+            Self::F32(reader) => reader.read_one(bytes)?,
+            Self::F64(reader) => reader.read_one(bytes)? as f32,
+            Self::I16(reader) => reader.read_one(bytes)?.into(),
+            Self::I32(reader) => reader.read_one(bytes)? as f32,
+            Self::U16(reader) => reader.read_one(bytes)?.into(),
+        })
+    }
 }
 
 impl Deserialize for Structured {
@@ -106,9 +166,8 @@ impl Deserialize for Structured {
         let coordinate = |name: &str| {
             let mut offset = 0;
             for field in fields {
-                if field.name == name {
-                    let double = f64::reader(&field.dtype).map(Coordinate::F64);
-                    return Ok((offset, double.or_else(|_| f32::reader(&field.dtype).map(Coordinate::F32))?));
+                if field.name.eq_ignore_ascii_case(name) {
+                    return Ok((offset, Coordinate::new(&field.dtype)?));
                 }
                 offset += size(&field.dtype)?;
             }
@@ -127,10 +186,7 @@ impl TypeRead for StructuredReader {
         bytes.read_exact(&mut record)?;
         let mut point = [0.0; 3];
         for (value, (offset, reader)) in point.iter_mut().zip(&self.coordinates) {
-            *value = match reader {
-                Coordinate::F32(reader) => reader.read_one(&record[*offset..])?,
-                Coordinate::F64(reader) => reader.read_one(&record[*offset..])? as f32,
-            };
+            *value = reader.read(&record[*offset..])?;
         }
         Ok(Structured(point))
     }
@@ -160,53 +216,72 @@ fn pcd(path: &Path) -> anyhow::Result<Points> {
     let reader = DynReader::from_bytes(&file).context("not a valid PCD file")?;
     let names: Vec<_> = reader.meta().field_defs.iter().map(|field| field.name.clone()).collect();
     let column = |name: &str| {
-        let found = names.iter().position(|other| other == name);
-        found.with_context(|| format!("no field `{name}`; fields in the file: {}", names.join(", ")))
+        let found = names.iter().position(|other| other.eq_ignore_ascii_case(name));
+        found.with_context(|| {
+            format!("no field `{name}`; fields in the file: {}", listed(names.iter().map(String::as_str)))
+        })
     };
     let columns = [column("x")?, column("y")?, column("z")?];
     let coordinate = |field: &Field| match field {
         Field::F32(values) => values.first().copied(),
         Field::F64(values) => values.first().map(|&value| value as f32),
+        Field::I8(values) => values.first().map(|&value| f32::from(value)),
         Field::I16(values) => values.first().map(|&value| f32::from(value)),
         Field::I32(values) => values.first().map(|&value| value as f32),
-        _ => None,
+        Field::U8(values) => values.first().map(|&value| f32::from(value)),
+        Field::U16(values) => values.first().map(|&value| f32::from(value)),
+        Field::U32(values) => values.first().map(|&value| value as f32),
+        Field::I64(values) => values.first().map(|&value| value as f32),
+        Field::U64(values) => values.first().map(|&value| value as f32),
     };
     let point = |record: pcd_rs::Result<pcd_rs::DynRecord>| {
         let record = record.context("not a valid PCD file")?;
         let [x, y, z] = columns.map(|column| record.0.get(column).and_then(coordinate));
-        let point = x.zip(y).zip(z).context("x, y and z must be floats, or integers of 16 or 32 bits")?;
-        let ((x, y), z) = point;
+        let ((x, y), z) = x.zip(y).zip(z).context("a point has no x, y or z")?;
         Ok([x, y, z])
     };
     let kind = reader.meta().field_defs.iter().nth(columns[0]).map(|field| field.kind);
-    let are_integers = matches!(kind, Some(ValueKind::I16 | ValueKind::I32));
+    let are_integers = !matches!(kind, Some(ValueKind::F32 | ValueKind::F64));
+    let ViewPoint { tx, ty, tz, qw, qx, qy, qz } = reader.meta().viewpoint;
+    if [tx, ty, tz, qx, qy, qz] != [0.0; 6] {
+        eprintln!(
+            "grasp: {}: the VIEWPOINT {tx} {ty} {tz} {qw} {qx} {qy} {qz} of the file is not applied to its points; if they \
+             are in the frame of the camera, give it as --frame-from-cloud={tx},{ty},{tz},{qx},{qy},{qz},{qw}",
+            path.display()
+        );
+    }
     Ok(Points { xyz: reader.map(point).collect::<anyhow::Result<_>>()?, are_integers })
 }
 
 /// A vertex of a PLY file.
 struct Vertex {
     point: [f32; 3],
+    /// Whether all coordinates are integers.
     is_integer: bool,
 }
 
 impl PropertyAccess for Vertex {
     fn new() -> Self {
-        Self { point: [f32::NAN; 3], is_integer: false }
+        Self { point: [f32::NAN; 3], is_integer: true }
     }
 
     fn set_property(&mut self, key: &str, property: Property) -> PropertyAccessResult {
         let (value, is_integer) = match property {
             Property::Float(value) => (value, false),
             Property::Double(value) => (value as f32, false),
+            Property::Char(value) => (f32::from(value), true),
+            Property::UChar(value) => (f32::from(value), true),
             Property::Short(value) => (f32::from(value), true),
+            Property::UShort(value) => (f32::from(value), true),
             Property::Int(value) => (value as f32, true),
+            Property::UInt(value) => (value as f32, true),
             _ => return PropertyAccessResult::Ignored,
         };
-        let Some(axis) = ["x", "y", "z"].iter().position(|axis| *axis == key) else {
+        let Some(axis) = ["x", "y", "z"].iter().position(|axis| key.eq_ignore_ascii_case(axis)) else {
             return PropertyAccessResult::Ignored;
         };
         self.point[axis] = value;
-        self.is_integer = is_integer;
+        self.is_integer &= is_integer;
         PropertyAccessResult::Set
     }
 }
@@ -218,10 +293,17 @@ fn with_numbers_for_nan(file: Vec<u8>) -> Vec<u8> {
         return file;
     };
     let line = |line: &str| {
-        let word = |word| if str::eq_ignore_ascii_case(word, "nan") { "1e39" } else { word };
+        // C prints -nan, and Windows -nan(ind).
+        let is_number = |word: &str| {
+            let word = word.trim_start_matches(['-', '+']).to_ascii_lowercase();
+            !(word.starts_with("nan") || word.starts_with("inf"))
+        };
+        let word = |word| if is_number(word) { word } else { "1e39" };
         line.split(' ').map(word).collect::<Vec<_>>().join(" ")
     };
-    text.lines().map(|text| line(text) + "\n").collect::<String>().into_bytes()
+    let Some((header, points)) = text.split_once("end_header") else { return file };
+    let points: String = points.lines().map(|text| line(text) + "\n").collect();
+    format!("{header}end_header{points}").into_bytes()
 }
 
 fn ply(path: &Path) -> anyhow::Result<Points> {

@@ -2,6 +2,22 @@
 
 use anyhow::{bail, ensure};
 
+use crate::document::plain;
+
+/// Names of the polynomial model and of OpenCV's fisheye, without separators.
+const POLYNOMIAL: [&str; 8] =
+    ["plumbbob", "rationalpolynomial", "thinprism", "radtan", "radialtangential", "brownconrady", "pinhole", "opencv"];
+const FISHEYE: [&str; 4] = ["equidistant", "fisheye", "kannalabrandt4", "opencvfisheye"];
+
+pub(crate) fn is_fisheye(model: &str) -> bool {
+    FISHEYE.contains(&plain(model).as_str())
+}
+
+/// Whether a text names a model of a lens.
+pub(crate) fn is_model(text: &str) -> bool {
+    is_fisheye(text) || POLYNOMIAL.contains(&plain(text).as_str())
+}
+
 /// How a lens moves the points of an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Distortion {
@@ -20,14 +36,11 @@ impl Distortion {
         }
         ensure!(coefficients.iter().all(|c| c.is_finite()), "the distortion coefficients must be finite");
         let model = model.unwrap_or("plumb_bob").to_lowercase().replace([' ', '-'], "_");
-        match (model.as_str(), coefficients) {
-            ("equidistant" | "fisheye" | "kannala_brandt4", &[k1, k2, k3, k4]) => {
-                Ok(Some(Self::Equidistant([k1, k2, k3, k4])))
+        match (coefficients, coefficients.len()) {
+            (&[k1, k2, k3, k4], _) if is_fisheye(&model) => Ok(Some(Self::Equidistant([k1, k2, k3, k4]))),
+            (_, 4 | 5 | 8 | 12) if POLYNOMIAL.contains(&plain(&model).as_str()) => {
+                Ok(Some(Self::Polynomial(std::array::from_fn(|i| coefficients.get(i).copied().unwrap_or(0.0)))))
             }
-            (
-                "plumb_bob" | "rational_polynomial" | "thin_prism" | "radtan" | "brown_conrady" | "pinhole",
-                &[_, _, _, _] | &[_, _, _, _, _] | &[_, _, _, _, _, _, _, _] | &[_, _, _, _, _, _, _, _, _, _, _, _],
-            ) => Ok(Some(Self::Polynomial(std::array::from_fn(|i| coefficients.get(i).copied().unwrap_or(0.0))))),
             _ => bail!(
                 "distortion `{model}` with {} coefficients is not supported: rectify the image, and give the intrinsics \
                  of the rectified one without distortion",

@@ -3,9 +3,8 @@ use std::io::BufReader;
 use std::path::Path;
 
 use anyhow::{Context, bail, ensure};
-use npyz::TypeChar;
 
-use crate::files::{self, Format};
+use crate::files::{self, Format, Values};
 
 /// Labels of pixels or points, with the shape of their array: height and width, or a count.
 pub(crate) struct Labels {
@@ -36,35 +35,20 @@ pub(crate) fn read(path: &Path) -> anyhow::Result<Labels> {
 }
 
 fn npy(path: &Path) -> anyhow::Result<Labels> {
-    let array = files::array(path, "labels")?;
-    let supported = [
-        (TypeChar::Bool, 1),
-        (TypeChar::Uint, 1),
-        (TypeChar::Uint, 2),
-        (TypeChar::Int, 4),
-        (TypeChar::Int, 8),
-        (TypeChar::Float, 2),
-        (TypeChar::Float, 4),
-        (TypeChar::Float, 8),
-    ];
-    let shape = array.shape().to_vec();
+    let array = files::array_of(path, &["labels", "label", "mask", "masks", "segmentation"])?;
+    let mut shape = array.shape().to_vec();
+    if let [_, _, 1] = shape[..] {
+        shape.pop();
+    }
     let whole = |value: f64| {
         ensure!(value.fract() == 0.0 && value.abs() < 1e9, "label {value}; must be a whole number from 0 to 65535");
         Ok(value as i64)
     };
-    let values: anyhow::Result<Vec<u16>> =
-        match files::kind(&array, "u8, u16, i32, i64, bool, or whole numbers as floats", &supported)? {
-            (TypeChar::Bool, _) => Ok(files::values::<bool>(array)?.into_iter().map(u16::from).collect()),
-            (TypeChar::Uint, 1) => Ok(files::values::<u8>(array)?.into_iter().map(u16::from).collect()),
-            (TypeChar::Uint, _) => Ok(files::values(array)?),
-            (TypeChar::Int, 4) => files::narrowed(files::values::<i32>(array)?, "label"),
-            (TypeChar::Int, _) => files::narrowed(files::values::<i64>(array)?, "label"),
-            _ => files::narrowed(
-                files::floats(array)?.into_iter().map(whole).collect::<anyhow::Result<Vec<i64>>>()?,
-                "label",
-            ),
-        };
-    Ok(Labels { values: values?, shape })
+    let values = match files::numbers(array, "integers, truth values, or whole numbers as floats")? {
+        Values::Integers(values) => values,
+        Values::Floats(values) => values.into_iter().map(whole).collect::<anyhow::Result<_>>()?,
+    };
+    Ok(Labels { values: files::narrowed(values, "label")?, shape })
 }
 
 fn png(path: &Path) -> anyhow::Result<Labels> {
@@ -72,14 +56,21 @@ fn png(path: &Path) -> anyhow::Result<Labels> {
     let png::Info { width, height, bit_depth, color_type, .. } = *reader.info();
     ensure!(
         color_type == png::ColorType::Grayscale || color_type == png::ColorType::Indexed,
-        "PNG is {color_type:?}; labels must be grey values or indices of 8 or 16 bits"
+        "PNG is {color_type:?}; labels must be grey values or indices"
     );
     let mut bytes = vec![0; reader.output_buffer_size().context("the image is too large")?];
     reader.next_frame(&mut bytes)?;
-    let values = match bit_depth {
-        png::BitDepth::Eight => bytes.into_iter().map(u16::from).collect(),
+    let line = reader.output_line_size(width);
+    let values: Vec<u16> = match bit_depth {
         png::BitDepth::Sixteen => bytes.as_chunks().0.iter().map(|&bytes| u16::from_be_bytes(bytes)).collect(),
-        _ => bail!("PNG has {bit_depth:?} bits; labels must have 8 or 16 bits"),
+        // Rows begin at a byte; the first pixel is in the highest bits.
+        depth => {
+            let (bits, width) = (depth as usize, width as usize);
+            let pixel =
+                |row: &[u8], at: usize| row[at * bits / 8] >> (8 - bits - at * bits % 8) & (u8::MAX >> (8 - bits));
+            let rows = bytes.chunks_exact(line.unwrap_or(1).max(1));
+            rows.flat_map(|row| (0..width).map(move |at| u16::from(pixel(row, at)))).collect()
+        }
     };
     Ok(Labels { values, shape: vec![height.into(), width.into()] })
 }

@@ -1,5 +1,6 @@
 //! Command line client of graspd.
 
+mod calibration;
 mod camera;
 mod cloud;
 mod demo;
@@ -85,7 +86,7 @@ impl Cli {
         for (argument, former) in FORMER_VARIABLES {
             let variable = former.replacen("GRASPD", "GRASP", 1);
             if env::var_os(former).is_some() && env::var_os(&variable).is_none() {
-                eprintln!("grasp: {former} is a variable of graspd; set {variable} instead");
+                eprintln!("grasp: {former} is the former name of {variable}; set {variable} instead");
                 command = command.mut_arg(argument, |given| given.env(former));
             }
         }
@@ -161,15 +162,15 @@ struct Detect {
     detect: DetectArgs,
 
     /// Also write the grasps as CSV.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, help_heading = "Output", value_name = "FILE")]
     csv: Option<PathBuf>,
 
     /// Also write the grasps as a list of moveit_msgs/Grasp, YAML.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, help_heading = "Output", value_name = "FILE")]
     moveit: Option<PathBuf>,
 
     /// Also write the grasps as isaac_grasp, YAML.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, help_heading = "Output", value_name = "FILE")]
     isaac: Option<PathBuf>,
 }
 
@@ -257,10 +258,35 @@ async fn main() -> ExitCode {
     match run(Cli::from_args()).await {
         Ok(code) => code,
         Err(error) => {
-            eprintln!("grasp: {error:#}");
+            eprintln!("grasp: {}", described(&error));
             ExitCode::FAILURE
         }
     }
+}
+
+/// Parts of errors whose remedy is a flag of this program.
+const FLAGS: [(&str, &str); 6] = [
+    ("values look like millimetres", "--depth-scale 0.001"),
+    ("points look like millimetres", "--cloud-scale 0.001"),
+    ("values look like metres", "--depth-scale 1"),
+    ("check the depth unit", "--depth-scale, such as 0.0001 for tenths of a millimetre"),
+    (
+        "check workspace.pose, the camera poses and the depth unit",
+        "--depth-scale, such as 0.0001 for tenths of a millimetre",
+    ),
+    ("send the header `authorization", "--token-file FILE"),
+];
+
+/// An error with its causes, each once, and the flag that helps.
+fn described(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain().map(ToString::to_string) {
+        if !text.contains(&cause) {
+            text = if text.is_empty() { cause } else { format!("{text}: {cause}") };
+        }
+    }
+    let flag = FLAGS.iter().find(|(part, _)| text.contains(part));
+    text + &flag.map_or_else(String::new, |(_, flag)| format!(" (here: {flag})"))
 }
 
 fn options(scene: &SceneArgs, detect: DetectOptions) -> Options {

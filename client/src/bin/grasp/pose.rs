@@ -1,19 +1,19 @@
 //! Poses from files, and from numbers on the command line.
 
+mod found;
+
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-use anyhow::{Context, anyhow, bail, ensure};
+use anyhow::{Context, bail, ensure};
 use grasp_client::Candidate;
-use nalgebra::{Isometry3, Matrix3, Matrix4, Quaternion, Rotation3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Quaternion, Translation3, Vector3};
 use serde_json::Value;
 
-use crate::document::{document, flat};
-use crate::files::{self, has_extension, in_file};
-use crate::numbers::Numbers;
-
-/// Largest deviation of the norm of a quaternion from 1, as in the server.
-const UNIT_TOLERANCE: f64 = 1e-3;
+use self::found::{all, pose, unit};
+use crate::document::document;
+use crate::files::in_file;
+use crate::numbers::{Numbers, counted};
 
 /// Poses as given on the command line: the numbers of one pose, or a file.
 #[derive(Clone, Debug)]
@@ -67,12 +67,14 @@ impl Poses {
         }
     }
 
-    /// One pose for each of `count` inputs; `inputs` names them in the error.
-    pub fn each(&self, count: usize, inputs: &str) -> anyhow::Result<Vec<Isometry3<f64>>> {
+    /// One pose for each of `count` inputs; `input` names one in the error.
+    pub fn each(&self, count: usize, input: &str) -> anyhow::Result<Vec<Isometry3<f64>>> {
         match self {
             Self::Numbers(pose) if count == 1 => Ok(vec![*pose]),
-            Self::Numbers(_) => bail!("the numbers of 1 pose for {count} {inputs}; give a file with one pose for each"),
-            Self::File(path) => each(path, count, inputs),
+            Self::Numbers(_) => {
+                bail!("the numbers of 1 pose for {}; give a file with one pose for each", counted(count, input))
+            }
+            Self::File(path) => each(path, count, input),
         }
     }
 }
@@ -81,52 +83,30 @@ impl Poses {
 pub(crate) fn one(path: &Path) -> anyhow::Result<Isometry3<f64>> {
     match in_file(path, poses)?[..] {
         [pose] => Ok(pose),
-        ref poses => bail!("{}: {} poses in the file, exactly one is needed", path.display(), poses.len()),
+        ref poses => {
+            bail!("{}: {} in the file, exactly one is needed", path.display(), counted(poses.len(), "pose"))
+        }
     }
 }
 
-/// One pose for each of `count` inputs; `inputs` names them in the error.
-fn each(path: &Path, count: usize, inputs: &str) -> anyhow::Result<Vec<Isometry3<f64>>> {
+/// One pose for each of `count` inputs; `input` names one in the error.
+fn each(path: &Path, count: usize, input: &str) -> anyhow::Result<Vec<Isometry3<f64>>> {
     let poses = in_file(path, poses)?;
     ensure!(
         poses.len() == count,
-        "{}: {} poses in the file for {count} {inputs}; give one pose for each",
+        "{}: {} in the file for {}; give one pose for each",
         path.display(),
-        poses.len()
+        counted(poses.len(), "pose"),
+        counted(count, input)
     );
     Ok(poses)
 }
 
-/// The rotation of a quaternion, with the server's check of its norm.
-fn unit(quaternion: Quaternion<f64>) -> Result<UnitQuaternion<f64>, String> {
-    let norm = quaternion.norm();
-    // Written so that NaN fails.
-    if (norm - 1.0).abs() <= UNIT_TOLERANCE {
-        Ok(UnitQuaternion::new_normalize(quaternion))
-    } else {
-        Err(format!("the norm of the quaternion is {norm}; it must be 1 ± {UNIT_TOLERANCE}"))
-    }
-}
-
-fn is_array(path: &Path) -> bool {
-    has_extension(path, "npy") || has_extension(path, "npz")
-}
-
 fn poses(path: &Path) -> anyhow::Result<Vec<Isometry3<f64>>> {
-    if is_array(path) {
-        return matrices(&files::floats(files::array(path, "pose")?)?);
-    }
-    match document(path)? {
-        value @ Value::Object(_) => Ok(vec![pose(&value)?]),
-        Value::Array(values) if values.iter().all(Value::is_object) => values.iter().map(pose).collect(),
-        value => matrices(&flat(&value)),
-    }
+    all(&document(path)?)
 }
 
 fn candidates(path: &Path) -> anyhow::Result<Vec<Candidate>> {
-    if is_array(path) {
-        return Ok(poses(path)?.into_iter().map(Candidate::from).collect());
-    }
     let value = document(path)?;
     let candidate = |value: &Value| {
         let width = value.get("width").filter(|width| !width.is_null());
@@ -134,88 +114,17 @@ fn candidates(path: &Path) -> anyhow::Result<Vec<Candidate>> {
         Ok(Candidate { pose: pose(value)?, width: width.transpose()? })
     };
     match value.get("grasps").unwrap_or(&value) {
-        value @ Value::Object(_) => Ok(vec![candidate(value)?]),
         Value::Array(values) if values.iter().all(Value::is_object) => values.iter().map(candidate).collect(),
-        value => Ok(matrices(&flat(value))?.into_iter().map(Candidate::from).collect()),
+        value @ Value::Object(_) if value.get("width").is_some() => Ok(vec![candidate(value)?]),
+        value => Ok(all(value)?.into_iter().map(Candidate::from).collect()),
     }
-}
-
-/// The pose of an object: position and orientation under the names of this program, of ROS or of easy_handeye, or a
-/// named matrix, alone or in another object.
-fn pose(value: &Value) -> anyhow::Result<Isometry3<f64>> {
-    if let Some(found) = find(value) {
-        return found;
-    }
-    let keys = value.as_object().map(|map| map.keys().cloned().collect::<Vec<_>>().join(", ")).unwrap_or_default();
-    bail!(
-        "a pose must have `position` (x, y, z) and `orientation` (quaternion x, y, z, w), or be a 4×4 matrix; keys in the \
-         file: {keys}"
-    )
-}
-
-fn find(value: &Value) -> Option<anyhow::Result<Isometry3<f64>>> {
-    let map = value.as_object()?;
-    // Arrays, or objects with these keys.
-    let part = |names: &[&'static str], keys: &[&str]| {
-        names.iter().find_map(|&name| {
-            let value = map.get(name)?;
-            let numbers = keys.iter().map(|key| value.get(*key)?.as_f64()).collect::<Option<_>>();
-            Some((name, numbers.unwrap_or_else(|| flat(value))))
-        })
-    };
-    let direct = |keys: &[&str]| keys.iter().map(|key| map.get(*key)?.as_f64()).collect::<Option<Vec<_>>>();
-    let position = part(&["position", "translation"], &["x", "y", "z"]).map(|(_, position)| position);
-    let position = position.or_else(|| direct(&["x", "y", "z"]));
-    // `grasp detect --json` writes `orientation_xyzw`.
-    let names = ["orientation", "orientation_xyzw", "rotation", "quaternion"];
-    let orientation = part(&names, &["x", "y", "z", "w"]).or_else(|| Some(("qw", direct(&["qx", "qy", "qz", "qw"])?)));
-    if let (Some(&[x, y, z]), Some((key, &[qx, qy, qz, qw]))) =
-        (position.as_deref(), orientation.as_ref().map(|(key, numbers)| (key, &numbers[..])))
-    {
-        let rotation = unit(Quaternion::new(qw, qx, qy, qz)).map_err(|reason| anyhow!("`{key}`: {reason}"));
-        return Some(rotation.map(|rotation| Isometry3::from_parts(Translation3::new(x, y, z), rotation)));
-    }
-    map.values().find_map(|inner| {
-        let numbers = flat(inner.get("data").unwrap_or(inner));
-        if numbers.len() == 16 {
-            return Some(matrices(&numbers).map(|poses| poses[0]));
-        }
-        find(inner)
-    })
-}
-
-/// Largest deviation of a rotation from an orthonormal matrix that is corrected: room for three decimals.
-const CORRECTED: f64 = 1e-2;
-
-fn matrices(numbers: &[f64]) -> anyhow::Result<Vec<Isometry3<f64>>> {
-    ensure!(
-        !numbers.is_empty() && numbers.len().is_multiple_of(16),
-        "{} numbers in the file; each pose is a 4×4 matrix",
-        numbers.len()
-    );
-    let pose = |numbers: &[f64]| {
-        let matrix = Matrix4::from_row_slice(numbers);
-        let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into();
-        let deviation = (rotation * rotation.transpose() - Matrix3::identity()).norm();
-        ensure!(
-            deviation < CORRECTED && rotation.determinant() > 0.0 && numbers[12..] == [0.0, 0.0, 0.0, 1.0],
-            "invalid pose matrix: the upper left 3×3 block must be a rotation (R·Rᵀ deviates from the identity by \
-             {deviation:.3}, at most {CORRECTED} is corrected), the last row 0 0 0 1; got {:?}",
-            numbers.chunks(4).collect::<Vec<_>>()
-        );
-        if deviation > 1e-3 {
-            eprintln!("warning: the rotation of a pose has few decimals; it was orthonormalised ({deviation:.4} off)");
-        }
-        let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&rotation));
-        Ok(Isometry3::from_parts(Translation3::new(numbers[3], numbers[7], numbers[11]), rotation))
-    };
-    numbers.chunks(16).map(pose).collect()
 }
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Point3;
+    use nalgebra::{Matrix4, Point3, UnitQuaternion};
 
+    use super::found::of_matrix;
     use super::*;
 
     #[test]
@@ -228,9 +137,9 @@ mod tests {
         assert_eq!(path.to_str(), Some("corner.json"));
         let refused = |text: &str| text.parse::<Poses>().unwrap_err();
         assert!(refused("1,2,3,0,0,0,0").contains("the norm of the quaternion is 0"));
-        assert!(refused("1,2,3,0,0,2,0").contains("the norm of the quaternion is 2; it must be 1 ± 0.001"));
+        assert!(refused("1,2,3,0,0,2,0").contains("the norm of the quaternion is 2; it must be 1 ± 0.01"));
         assert!(refused("1,2,3,0,0,nan,0").contains("NaN"));
-        let error = Poses::Numbers(pose).each(2, "images").unwrap_err().to_string();
+        let error = Poses::Numbers(pose).each(2, "image").unwrap_err().to_string();
         assert!(error.contains("1 pose for 2 images"), "{error}");
     }
 
@@ -256,14 +165,51 @@ mod tests {
             "header:\n  frame_id: base\npose:\n  position: {x: 1.0, y: 2.0, z: 3.0}\n  orientation: {x: 0.0, y: 0.0, z: 1.0, w: 0.0}\n",
             "parameters:\n  eye_on_hand: false\ntransformation: {qw: 0.0, qx: 0.0, qy: 0.0, qz: 1.0, x: 1.0, y: 2.0, z: 3.0}\n",
             "%YAML:1.0\n---\nState: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n   data: [-1, 0, 0, 1, 0, -1, 0, 2, 0, 0, 1, 3, 0, 0, 0, 1]\n",
-            r#"{"T_base_camera": [[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]}"#,
+            r#"{"T_base_camera": [[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], "K": [1, 2, 3]}"#,
+            r#"{"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"qx": 0, "qy": 0, "qz": 1, "qw": 0}}"#,
+            r#"{"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"X": 0, "Y": 0, "Z": 1, "W": 0}}"#,
+            r#"{"position": ["1", "2", "3"], "orientation": ["0", "0", "1", "0"]}"#,
+            r#"{"position": [1, 2, 3], "orientation": [0, 0, 0.991, 0]}"#,
+            r#"{"R": [[-1, 0, 0], [0, -1, 0], [0, 0, 1]], "t": [1, 2, 3]}"#,
+            r#"{"rotation": [-1, 0, 0, 0, -1, 0, 0, 0, 1], "translation": [[1], [2], [3]]}"#,
+            r#"{"camera": {"pose": [[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, 3]]}}"#,
+            r#"{"numbers": [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15], "T": [-1, 0, 0, 1, 0, -1, 0, 2, 0, 0, 1, 3, 0, 0, 1e-9, 1]}"#,
+            "transforms:\n- child_frame_id: camera\n  transform:\n    translation: {x: 1.0, y: 2.0, z: 3.0}\n    rotation: {x: 0.0, y: 0.0, z: 1.0, w: 0.0}\n",
+            // Text of numpy.savetxt, rows of poses, and a trajectory of TUM.
+            "-1.0 0 0 1\n0 -1 0 2\n0 0 1 3\n0 0 0 1\n",
+            "-1.0 0 0 1\n0 -1 0 2\n0 0 1 3\n",
+            "1 2 3 0 0 1 0\n",
+            "1311867170.4 1 2 3 0 0 1 0\n",
         ];
         for text in texts {
-            let found = pose(&crate::document::parse(text).unwrap()).unwrap();
-            assert!((found * Point3::new(1.0, 0.0, 0.0) - Point3::new(0.0, 2.0, 3.0)).norm() < 1e-12, "{text}");
+            let found = all(&crate::document::parse(text).unwrap()).unwrap();
+            assert_eq!(found.len(), 1, "{text}");
+            assert!((found[0] * Point3::new(1.0, 0.0, 0.0) - Point3::new(0.0, 2.0, 3.0)).norm() < 1e-12, "{text}");
         }
-        let rows = crate::document::parse("-1.0 0 0 1\n0 -1 0 2\n0 0 1 3\n0 0 0 1\n").unwrap();
-        assert!(matrices(&flat(&rows)).is_ok());
+    }
+
+    #[test]
+    fn poses_that_are_in_doubt_are_refused() {
+        let one = "[[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]";
+        let other = "[[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, -3], [0, 0, 0, 1]]";
+        let nested = r#"{"position": [0, 0, 0], "orientation": [0, 0, 0, 1]}"#;
+        let texts = [
+            (
+                format!(r#"{{"T_base_cam": {one}, "T_cam_base": {other}}}"#),
+                "several poses in the file: T_base_cam, T_cam_base",
+            ),
+            (format!(r#"{{"camera": {nested}, "base": {{"T": {one}}}}}"#), "several poses in the file: base.T, camera"),
+            (r#"{"position": [NaN, 0, 0], "orientation": [0, 0, 0, 1]}"#.to_owned(), "the position is [NaN, 0.0, 0.0]"),
+            ("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1]]".to_owned(), "send the matrix row by row"),
+            ("[[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]".to_owned(), "it mirrors"),
+            ("[1, 2, 3, 4, 5]".to_owned(), "no pose: each is a 4×4 or 3×4 matrix, or a row"),
+        ];
+        for (text, part) in texts {
+            let error = format!("{:#}", all(&crate::document::parse(&text).unwrap()).unwrap_err());
+            assert!(error.contains(part), "{text}: {error}");
+        }
+        let same = format!(r#"{{"T_base_cam": {one}, "again": {one}}}"#);
+        assert_eq!(all(&crate::document::parse(&same).unwrap()).unwrap().len(), 1);
         let error = super::pose(&serde_json::json!({ "where": 1 })).unwrap_err().to_string();
         assert!(error.ends_with("keys in the file: where"), "{error}");
     }
@@ -277,9 +223,9 @@ mod tests {
             numbers[4 * row + column] = (exact * 1000.0).round() / 1000.0;
         }
         numbers[15] = 1.0;
-        assert!(matrices(&numbers).unwrap()[0].rotation.angle_to(&rotation) < 1e-3);
+        assert!(of_matrix(&numbers).unwrap().rotation.angle_to(&rotation) < 1e-3);
         numbers[0] += 0.05;
-        let error = matrices(&numbers).unwrap_err().to_string();
+        let error = of_matrix(&numbers).unwrap_err().to_string();
         assert!(error.contains("deviates from the identity by"), "{error}");
     }
 
@@ -309,9 +255,9 @@ mod tests {
     #[test]
     fn an_invalid_matrix_is_printed() {
         let mut numbers: Vec<f64> = Matrix4::identity().iter().copied().collect();
-        assert!(matrices(&numbers).is_ok());
+        assert!(of_matrix(&numbers).is_ok());
         numbers[5] = 2.0;
-        let error = matrices(&numbers).unwrap_err().to_string();
-        assert!(error.contains("[0.0, 2.0, 0.0, 0.0]"), "{error}");
+        let error = of_matrix(&numbers).unwrap_err().to_string();
+        assert!(error.contains("[0.0, 2.0, 0.0]"), "{error}");
     }
 }

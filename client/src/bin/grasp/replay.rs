@@ -13,6 +13,7 @@ use prost::Message;
 use serde_json::{Value, json};
 use tonic::Code;
 
+use crate::numbers::counted;
 use crate::show;
 
 /// Extension of the files of recordings.
@@ -116,7 +117,8 @@ impl Replay {
                 format!("; median inference {:.1} ms, now {:.1} ms", 1e3 * before, 1e3 * now)
             });
             let unanswered = if unanswered > 0 { format!(", {unanswered} not answered") } else { String::new() };
-            format!("{recordings} recordings: {same} same, {changed} changed, {skipped} skipped{unanswered}{inference}")
+            let recordings = counted(recordings, "recording");
+            format!("{recordings}: {same} same, {changed} changed, {skipped} skipped{unanswered}{inference}")
         })?;
         Ok(changed == 0 && unanswered == 0)
     }
@@ -128,6 +130,7 @@ impl Replay {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((Outcome::Skipped, None)),
             bytes => bytes?,
         };
+        ensure!(!bytes.is_empty(), "the file is empty");
         let recording = Recording::decode(&*bytes).context("it is not a recording")?;
         let (Some(request), Some(answer)) = (recording.request, recording.answer) else {
             bail!("it has no request or no answer; it was recorded by a newer graspd");

@@ -13,7 +13,7 @@ use nalgebra::{Isometry3, Point3, Vector3};
 use crate::camera::{self, Camera};
 use crate::image::{self, Scale};
 use crate::labels::{self, Labels};
-use crate::numbers::Numbers;
+use crate::numbers::{Numbers, counted};
 use crate::pose::Poses;
 use crate::{cloud, volume};
 
@@ -24,8 +24,8 @@ pub(crate) struct SceneArgs {
     /// Volume, depth images or point clouds. A volume is a .npy file, or a .npz file with one array or an array `grid`:
     /// N×N×N values in [0, 1] (u8: 0 to 255), indexed x, y, z, 0.5 on the surface, 0 if unobserved. With --intrinsics
     /// the files are depth images: PNG, TIFF or .npy with 16 bits per pixel (see --depth-scale), or TIFF, EXR or .npy
-    /// with floats in metres; 0 and NaN mean no reading. With --camera-position they are point clouds: PCD, PLY, .npy,
-    /// or .npz with one array or an array `points`, N×3 or H×W×3, metres.
+    /// with floats in metres; 0 and NaN mean no reading. With --camera-position they are point clouds: PCD, PLY, text
+    /// with a point in each line, .npy, or .npz with one array or an array `points` or `xyz`, N×3 or H×W×3.
     #[arg(required = true)]
     files: Vec<PathBuf>,
 
@@ -40,27 +40,34 @@ pub(crate) struct SceneArgs {
 
     /// Unit of the depths, metres: 0.0001 for tenths of a millimetre. Default: that of the file of the intrinsics, or
     /// else 0.001 for integers and 1 for floats.
-    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, requires = "intrinsics")]
+    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, requires = "intrinsics", conflicts_with = "camera_position")]
     depth_scale: Option<f64>,
 
     /// Send depth images as PNG files: fewer bytes on a slow network. They must be in millimetres.
-    #[arg(long, requires = "intrinsics")]
+    #[arg(long, requires = "intrinsics", conflicts_with = "camera_position")]
     png: bool,
 
-    /// T_camera_task of each image: 4×4 or N×4×4 .npy, JSON with such matrices, or JSON with poses
-    /// {"position": [x, y, z], "orientation": [x, y, z, w]}; of one image also the numbers X,Y,Z or X,Y,Z,QX,QY,QZ,QW.
+    /// T_camera_task of each image: matrices (.npy, .npz, JSON, YAML or text), or poses
+    /// {"position": [x, y, z], "orientation": [x, y, z, w]} (JSON, or YAML of ROS and easy_handeye); of one image also
+    /// the numbers X,Y,Z or X,Y,Z,QX,QY,QZ,QW.
     #[arg(
         long,
         value_name = "FILE|NUMBERS",
         requires = "intrinsics",
-        conflicts_with = "frame_from_camera",
+        conflicts_with_all = ["frame_from_camera", "camera_position"],
         allow_hyphen_values = true
     )]
     camera_from_task: Option<Poses>,
 
     /// T_frame_camera of each image, as hand-eye calibration returns it, instead of T_camera_task. Same formats.
     /// Default for one image: identity, the grasps are then in the frame of the camera.
-    #[arg(long, value_name = "FILE|NUMBERS", requires = "intrinsics", allow_hyphen_values = true)]
+    #[arg(
+        long,
+        value_name = "FILE|NUMBERS",
+        requires = "intrinsics",
+        conflicts_with = "camera_position",
+        allow_hyphen_values = true
+    )]
     frame_from_camera: Option<Poses>,
 
     /// Find the table in the first depth image or point cloud, and place the workspace over the objects on it: all of
@@ -79,15 +86,21 @@ pub(crate) struct SceneArgs {
     camera_position: Vec<Numbers<3>>,
 
     /// Unit of the points, metres: 0.001 for millimetres. Default: 0.001 for integers and 1 for floats.
-    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, requires = "camera_position")]
+    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, requires = "camera_position", conflicts_with = "intrinsics")]
     cloud_scale: Option<f64>,
 
     /// T_frame_cloud of each point cloud, formats as for --camera-from-task. Default: identity.
-    #[arg(long, value_name = "FILE|NUMBERS", requires = "camera_position", allow_hyphen_values = true)]
+    #[arg(
+        long,
+        value_name = "FILE|NUMBERS",
+        requires = "camera_position",
+        conflicts_with = "intrinsics",
+        allow_hyphen_values = true
+    )]
     frame_from_cloud: Option<Poses>,
 
     /// Labels of the objects in each depth image or point cloud, in the order of these files: 8- or 16-bit grey PNG, or
-    /// .npy with integers; 0 is no object. Give it once for each.
+    /// .npy with whole numbers or truth values; 0 is no object. Give it once for each.
     #[arg(long, value_name = "FILE")]
     labels: Vec<PathBuf>,
 
@@ -172,16 +185,16 @@ impl SceneArgs {
         }
         ensure!(
             self.labels.len() == self.files.len(),
-            "--labels is given {} times for {} files; give it once for each",
-            self.labels.len(),
-            self.files.len()
+            "--labels is given {} for {}; give it once for each",
+            counted(self.labels.len(), "time"),
+            counted(self.files.len(), "file")
         );
         self.labels.iter().map(|path| labels::read(path).map(Some)).collect()
     }
 
     fn images(&self, intrinsics: &str) -> anyhow::Result<Vec<DepthView>> {
         let camera = Camera::read(intrinsics)?;
-        let scale = Scale::new(self.depth_scale, camera.depth_scale)?;
+        let scale = Scale { given: self.depth_scale, of_camera: camera.depth_scale };
         let of_camera = Poses::Numbers(Isometry3::identity());
         let (poses, direction): (_, fn(Isometry3<f64>) -> Extrinsics) =
             match (&self.camera_from_task, &self.frame_from_camera) {
@@ -195,7 +208,7 @@ impl SceneArgs {
                      --find-table, or the --workspace in the frame of the camera that `grasp table` finds"
                 ),
             };
-        let poses = poses.each(self.files.len(), "images")?;
+        let poses = poses.each(self.files.len(), "image")?;
         let view = |((file, pose), labels): ((&PathBuf, Isometry3<f64>), Option<Labels>)| {
             let view = camera.view(file, scale, labels, direction(pose))?;
             let depth = match view.depth {
@@ -216,12 +229,13 @@ impl SceneArgs {
             [of_all] => vec![*of_all; count],
             of_each if of_each.len() == count => of_each.to_vec(),
             other => bail!(
-                "--camera-position is given {} times for {count} point clouds; give it once for all or once for each",
-                other.len()
+                "--camera-position is given {} for {}; give it once for all or once for each",
+                counted(other.len(), "time"),
+                counted(count, "point cloud")
             ),
         };
         let poses = match &self.frame_from_cloud {
-            Some(poses) => poses.each(count, "point clouds")?,
+            Some(poses) => poses.each(count, "point cloud")?,
             None => vec![Isometry3::identity(); count],
         };
         let view =

@@ -83,14 +83,14 @@ pub(crate) fn detection_json(detection: &Detection) -> String {
         let (position, rotation) = (grasp.pose.translation.vector, grasp.pose.rotation.coords);
         json!({
             "quality": exact(grasp.quality),
-            "position": position.as_slice(),
-            "orientation_xyzw": rotation.as_slice(),
-            "width": grasp.width,
+            "position": rounded(position.as_slice()),
+            "orientation_xyzw": rounded(rotation.as_slice()),
+            "width": short(grasp.width),
             "pregrasp": pose(&grasp.pregrasp),
             "retreat": pose(&grasp.retreat),
             "collides": grasp.collides,
             "object": grasp.object,
-            "open_width": grasp.open_width,
+            "open_width": grasp.open_width.map(short),
         })
     });
     let object =
@@ -131,7 +131,7 @@ pub(crate) fn scores_json(scores: &Scores) -> String {
             "quality": exact(score.quality),
             "violations": violations(score),
             "object": score.object,
-            "open_width": score.open_width,
+            "open_width": score.open_width.map(short),
         })
     };
     let value = json!({
@@ -149,6 +149,15 @@ pub(crate) fn scores_json(scores: &Scores) -> String {
 /// The shortest number that is read as the same `f32`: 0.95 instead of 0.949999988079071.
 fn exact(number: f32) -> Value {
     number.to_string().parse::<f64>().map_or(Value::Null, Value::from)
+}
+
+/// A length or a part of a quaternion without the digits that are noise of 32-bit floats.
+fn short(number: f64) -> f64 {
+    (number * 1e8).round() / 1e8
+}
+
+fn rounded(numbers: &[f64]) -> Vec<f64> {
+    numbers.iter().copied().map(short).collect()
 }
 
 /// The names of the violations of a score.
@@ -192,7 +201,10 @@ fn warning_code(warning: &GeometryWarning) -> String {
 }
 
 fn pose(pose: &Isometry3<f64>) -> Value {
-    json!({ "position": pose.translation.vector.as_slice(), "orientation_xyzw": pose.rotation.coords.as_slice() })
+    json!({
+        "position": rounded(pose.translation.vector.as_slice()),
+        "orientation_xyzw": rounded(pose.rotation.coords.as_slice()),
+    })
 }
 
 const QUANTILES: [(&str, f64); 4] = [("p50", 0.5), ("p90", 0.9), ("p99", 0.99), ("max", 1.0)];

@@ -34,11 +34,11 @@ pub(crate) struct Table {
 
     /// Unit of the depths, metres. Default: that of the file of the intrinsics, or else 0.001 for integers and 1 for
     /// floats.
-    #[arg(long, value_name = "METRES", value_parser = image::parse_scale)]
+    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, conflicts_with = "camera_position")]
     depth_scale: Option<f64>,
 
     /// Unit of the points, metres: 0.001 for millimetres. Default: 0.001 for integers and 1 for floats.
-    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, requires = "camera_position")]
+    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, conflicts_with = "intrinsics")]
     cloud_scale: Option<f64>,
 
     /// Direction of gravity in the camera frame (z forward, x right, y down), or in the frame of the points: the
@@ -67,7 +67,7 @@ impl Table {
         });
         let gravity = gravity.transpose()?;
         let mut place = Workspace { find_table: true, gravity, ..Workspace::default() };
-        let (found, view) = in_file(&self.file, |_| self.find(&mut place))?;
+        let (found, view) = self.find(&mut place)?;
         let FoundTable { frame_from_task, tabletop, objects, .. } = found;
         let workspace = pose_json(&frame_from_task);
         if let Some(path) = &self.out {
@@ -97,13 +97,14 @@ impl Table {
             let cloud = Cloud { points, eye: Point3::from(eye), labels: None };
             let seen = overview(&cloud.points, &cloud.eye);
             let seen = seen.context("--camera-position must be the position from which the points were seen")?;
-            return Ok((workspace.find_table_in_cloud(&cloud, height, edge)?, seen));
+            let found = in_file(&self.file, |_| Ok(workspace.find_table_in_cloud(&cloud, height, edge)?))?;
+            return Ok((found, seen));
         }
         let camera = Camera::read(self.intrinsics.as_deref().unwrap_or_default())?;
-        let scale = Scale::new(self.depth_scale, camera.depth_scale)?;
+        let scale = Scale { given: self.depth_scale, of_camera: camera.depth_scale };
         let view = camera.view(&self.file, scale, None, Extrinsics::FrameFromCamera(Isometry3::identity()))?;
-        let mut frame: Frame = grasp_proto::frame(&(&view).into())?;
-        let found = workspace.find_table_in_frame(&mut frame, true, height, edge)?;
+        let mut frame: Frame = in_file(&self.file, |_| Ok(grasp_proto::frame(&(&view).into())?))?;
+        let found = in_file(&self.file, |_| Ok(workspace.find_table_in_frame(&mut frame, true, height, edge)?))?;
         Ok((found, frame.in_task(&Isometry3::identity())?))
     }
 }
