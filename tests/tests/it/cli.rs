@@ -341,7 +341,7 @@ fn help_is_in_groups_and_shells_get_completions() {
     let help = run(&["detect", "-h"]);
     let headings: Vec<&str> =
         text(&help.stdout).lines().filter(|line| line.ends_with(':') && !line.starts_with(' ')).collect();
-    assert_eq!(headings, ["Options:", "Input:", "Grasps:", "Connection:"]);
+    assert_eq!(headings, ["Options:", "Input:", "Grasps:", "Output:", "Connection:"]);
     let script = run(&["completions", "bash"]);
     assert!(script.status.success() && text(&script.stdout).contains("--find-table"), "{script:?}");
 }

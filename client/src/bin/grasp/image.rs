@@ -85,7 +85,7 @@ fn depth(stored: Stored, scale: Scale) -> anyhow::Result<Depth> {
     if scale == MILLIMETRE {
         return Ok(Depth::Millimetres(files::narrowed(integers, "depth").context("--depth-scale gives another unit")?));
     }
-    Ok(Depth::Metres(integers.into_iter().map(|depth| (depth as f64 * scale) as f32).collect()))
+    Ok(Depth::Metres(integers.into_iter().map(|depth| depth as f32 * scale as f32).collect()))
 }
 
 fn npy(path: &Path) -> anyhow::Result<(Stored, u32, u32)> {

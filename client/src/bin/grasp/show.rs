@@ -83,8 +83,8 @@ pub(crate) fn detection_json(detection: &Detection) -> String {
         let (position, rotation) = (grasp.pose.translation.vector, grasp.pose.rotation.coords);
         json!({
             "quality": exact(grasp.quality),
-            "position": rounded(position.as_slice()),
-            "orientation_xyzw": rounded(rotation.as_slice()),
+            "position": position.as_slice(),
+            "orientation_xyzw": rotation.as_slice(),
             "width": short(grasp.width),
             "pregrasp": pose(&grasp.pregrasp),
             "retreat": pose(&grasp.retreat),
@@ -151,13 +151,9 @@ fn exact(number: f32) -> Value {
     number.to_string().parse::<f64>().map_or(Value::Null, Value::from)
 }
 
-/// A length or a part of a quaternion without the digits that are noise of 32-bit floats.
+/// A length without the digits that are noise of 32-bit floats.
 fn short(number: f64) -> f64 {
     (number * 1e8).round() / 1e8
-}
-
-fn rounded(numbers: &[f64]) -> Vec<f64> {
-    numbers.iter().copied().map(short).collect()
 }
 
 /// The names of the violations of a score.
@@ -202,8 +198,8 @@ fn warning_code(warning: &GeometryWarning) -> String {
 
 fn pose(pose: &Isometry3<f64>) -> Value {
     json!({
-        "position": rounded(pose.translation.vector.as_slice()),
-        "orientation_xyzw": rounded(pose.rotation.coords.as_slice()),
+        "position": pose.translation.vector.as_slice(),
+        "orientation_xyzw": pose.rotation.coords.as_slice(),
     })
 }
 
