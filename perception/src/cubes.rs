@@ -298,7 +298,8 @@ impl Cubes {
             warnings.extend(unseen.first());
         }
         if scenes.is_empty() {
-            let reason = "none shows a surface in the workspace; check workspace.pose and the camera poses";
+            let reason =
+                "none shows a surface in the workspace; check workspace.pose, the camera poses and the depth unit";
             return Err(RequestError::refused("views", reason));
         }
         Ok(scenes)

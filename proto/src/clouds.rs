@@ -67,7 +67,7 @@ pub fn cloud(view: &pb::CloudView) -> Result<Cloud, RequestError> {
     let distance = median(points.iter().map(|point| (point - eye).norm()));
     if distance > FARTHEST {
         let reason = format_args!(
-            "the median distance from the camera is {distance:.0} m, so the points look like millimetres: divide by 1000"
+            "the median distance from the camera is {distance:.0} m, so the points look like millimetres: divide by 1000 (in Python `CloudView.scale`)"
         );
         return Err(RequestError::refused("points", reason));
     }

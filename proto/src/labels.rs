@@ -1,3 +1,5 @@
+use std::fmt::Display;
+
 use grasp::RequestError;
 
 use crate::{pb, png};
@@ -8,12 +10,16 @@ pub(crate) fn of_image(labels: &pb::Labels, width: usize, height: usize) -> Resu
         pb::LabelType::Png => {
             png::grey(&labels.data, width, height).map_err(|reason| RequestError::refused("data", reason))
         }
-        _ => of_points(labels, width * height),
+        _ => with_size(labels, width * height, &format_args!("{width} × {height} pixels")),
     }
 }
 
 /// The labels of `count` points or pixels. Errors name the field in the message.
 pub(crate) fn of_points(labels: &pb::Labels, count: usize) -> Result<Vec<u16>, RequestError> {
+    with_size(labels, count, &format_args!("{count} labels"))
+}
+
+fn with_size(labels: &pb::Labels, count: usize, named: &dyn Display) -> Result<Vec<u16>, RequestError> {
     let size = match labels.r#type() {
         pb::LabelType::U8 => 1,
         pb::LabelType::U16 => 2,
@@ -25,7 +31,7 @@ pub(crate) fn of_points(labels: &pb::Labels, count: usize) -> Result<Vec<u16>, R
     };
     if labels.data.len() != count * size {
         let (got, kind) = (labels.data.len(), labels.r#type().as_str_name());
-        let reason = format_args!("{got} bytes; {count} labels need {} ({kind})", count * size);
+        let reason = format_args!("{got} bytes; {named} need {} ({kind})", count * size);
         return Err(RequestError::refused("data", reason));
     }
     Ok(match size {
@@ -54,7 +60,7 @@ mod tests {
     #[test]
     fn invalid_labels_are_named() {
         let refused = |labels: &pb::Labels| of_image(labels, 3, 2).unwrap_err().to_string();
-        assert_eq!(refused(&labels(&[0; 5], pb::LabelType::U8)), "data: 5 bytes; 6 labels need 6 (LABEL_TYPE_U8)");
+        assert_eq!(refused(&labels(&[0; 5], pb::LabelType::U8)), "data: 5 bytes; 3 × 2 pixels need 6 (LABEL_TYPE_U8)");
         assert_eq!(
             refused(&labels(&[0; 6], pb::LabelType::Unspecified)),
             "type is 0, must be LABEL_TYPE_U8 (1), LABEL_TYPE_U16 (2) or LABEL_TYPE_PNG (3)"

@@ -267,7 +267,7 @@ mod tests {
         assert_eq!(converted.labels, Some((0..12).collect()));
         assert_eq!(
             refused(|view| view.labels = labels(vec![1; 11])),
-            "views[1].labels.data: 11 bytes; 12 labels need 12 (LABEL_TYPE_U8)"
+            "views[1].labels.data: 11 bytes; 4 × 3 pixels need 12 (LABEL_TYPE_U8)"
         );
     }
 

@@ -221,7 +221,9 @@ class InferenceTest(unittest.TestCase):
         body = json.dumps({"inputs": [{"name": "tsdf", "datatype": "FP32", "shape": [1, 1, *EDGE], "data": VOLUMES[0].tolist()}]})
         plain, gzipped = body.encode(), gzip.compress(body.encode())
         _, _, expected = self.rest(f"/models/{MODEL}/infer", plain)
-        for encoding, data in {"gzip": gzipped, "deflate": zlib.compress(plain), "identity": plain}.items():
+        in_two = gzip.compress(plain[:1000]) + gzip.compress(plain[1000:])
+        bodies = {"gzip": gzipped, "GZIP": gzipped, "x-gzip": in_two, "deflate": zlib.compress(plain), "identity": plain}
+        for encoding, data in bodies.items():
             with self.subTest(encoding):
                 status, _, text = self.rest(f"/models/{MODEL}/infer", data, Content_Encoding=encoding)
                 self.assertEqual(status, 200, text)

@@ -156,7 +156,7 @@ impl Bench {
             seed: self.scene.seed,
         };
         let setup = format!(
-            "{}, objects {}{}, views {}, noise {} ({}){}, {} objects per scene, {} {}, seed {}",
+            "{}, objects {}{}, views {}, noise {} ({}){}, {} {} per scene, {} {}, seed {}",
             self.scene.scene.name(),
             self.scene.objects.as_deref().unwrap_or("test"),
             self.scene.part.suffix(),
@@ -165,6 +165,7 @@ impl Bench {
             self.scene.sensor.name(),
             if benchmark.noise.is_scale_corrected { ", scale corrected" } else { "" },
             benchmark.count,
+            if benchmark.count == 1 { "object" } else { "objects" },
             benchmark.rounds,
             if benchmark.rounds == 1 { "round" } else { "rounds" },
             benchmark.seed

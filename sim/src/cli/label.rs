@@ -60,6 +60,7 @@ pub enum Format {
 
 impl Label {
     pub fn run(self) -> anyhow::Result<()> {
+        ensure!(self.scenes > 0, "--scenes is 0, must be greater than 0");
         let several = self.observations != 1 && self.format != Format::Packed;
         ensure!(
             !several && self.observations > 0,
@@ -82,9 +83,9 @@ impl Label {
         let end =
             self.first.checked_add(self.scenes).context("--first + --scenes exceeds 2^64 - 1; use smaller numbers")?;
         let style = "{wide_bar} {pos}/{len} scenes, {per_sec}, {eta} left";
-        let progress = ProgressBar::new(self.scenes).with_style(ProgressStyle::with_template(style)?);
-        progress.set_position(next.saturating_sub(self.first));
-        progress.reset_eta();
+        // Of this run alone: the scenes of an earlier one would count as the work of a moment.
+        let progress = ProgressBar::new(end.saturating_sub(next)).with_style(ProgressStyle::with_template(style)?);
+        eprintln!("writing to {}; after an interrupt the same command continues", self.out.display());
         ordered::for_each(
             next..end.max(next),
             |number| self.label(&config, number),

@@ -549,6 +549,7 @@ fn errors_name_the_cause() {
         ("tables --models nowhere".to_owned(), "nowhere"),
         ("tables --objects some/test".to_owned(), "--objects is some/test"),
         ("tables --objects a/things --objects b/things".to_owned(), "--objects a/things and --objects b/things"),
+        ("label --scenes 0 --out never".to_owned(), "--scenes is 0, must be greater than 0"),
         ("label --scenes 1 --observations 0 --out never".to_owned(), "--observations is 0, must be greater than 0"),
         ("label --scenes 1 --stretch 1.2 --export x.jsonl --out never".to_owned(), "leave out --stretch"),
         ("label --scenes 1 --clearance 0.02 --export x.jsonl --out never".to_owned(), "and --clearance"),

@@ -291,7 +291,7 @@ async fn grasps_of_chosen_objects_only() {
     first.labels = Some(vec![1; 7]);
     let refused =
         refusal(client.detect_from_depth(&[first, second], &tabletop(), options(DetectOptions::default())).await);
-    assert!(refused.starts_with("views[0].labels.data: 7 bytes; 19200 labels"), "{refused}");
+    assert!(refused.starts_with("views[0].labels.data: 7 bytes; 160 × 120 pixels need 19200"), "{refused}");
 }
 
 #[tokio::test]

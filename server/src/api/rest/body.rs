@@ -9,7 +9,7 @@ use axum::body::{Body, Bytes};
 use axum::http::HeaderValue;
 use axum::http::header::{CONTENT_ENCODING, CONTENT_LENGTH, EXPECT};
 use axum::http::request::Parts;
-use flate2::write::{GzDecoder, ZlibDecoder};
+use flate2::write::{MultiGzDecoder, ZlibDecoder};
 use http_body::{Body as _, Frame};
 use tokio::time::timeout;
 use tonic::{Code, Status};
@@ -75,7 +75,7 @@ async fn receive(body: &mut Body, parts: &Parts, limits: Limits) -> Result<Messa
 /// The content of a body, decompressed as it arrives.
 enum Content {
     Plain(Output),
-    Gzip(GzDecoder<Output>),
+    Gzip(MultiGzDecoder<Output>),
     /// In the zlib format, as HTTP defines it (RFC 9110).
     Deflate(ZlibDecoder<Output>),
 }
@@ -83,12 +83,13 @@ enum Content {
 impl Content {
     fn new(encoding: Option<&HeaderValue>, limit: usize) -> Result<Self, Status> {
         let output = Output { bytes: Vec::new(), limit, excess: None };
-        match encoding.map(HeaderValue::as_bytes) {
-            None | Some(b"identity") => Ok(Self::Plain(output)),
-            Some(b"gzip") => Ok(Self::Gzip(GzDecoder::new(output))),
-            Some(b"deflate") => Ok(Self::Deflate(ZlibDecoder::new(output))),
+        // Names of encodings have no case (RFC 9110).
+        let encoding = encoding.map(|name| String::from_utf8_lossy(name.as_bytes()).trim().to_ascii_lowercase());
+        match encoding.as_deref() {
+            None | Some("" | "identity") => Ok(Self::Plain(output)),
+            Some("gzip" | "x-gzip") => Ok(Self::Gzip(MultiGzDecoder::new(output))),
+            Some("deflate") => Ok(Self::Deflate(ZlibDecoder::new(output))),
             Some(other) => {
-                let other = String::from_utf8_lossy(other);
                 let reason = format!("the header Content-Encoding is {other:?}, must be gzip, deflate or absent");
                 Err(Status::invalid_argument(reason))
             }

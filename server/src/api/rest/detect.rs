@@ -18,9 +18,14 @@ fn descriptor(name: &str) -> MessageDescriptor {
 /// The request in a body.
 pub(super) fn request(body: &[u8]) -> Result<pb::DetectGraspsFromDepthRequest, Status> {
     let refused = |error: &dyn std::fmt::Display| {
-        Status::invalid_argument(format!("the body is not a grasp.v1.DetectGraspsFromDepthRequest in JSON: {error}"))
+        let error = error.to_string();
+        let advice = if error.contains("base64") { "; base64 must have no line breaks (base64 -w0)" } else { "" };
+        Status::invalid_argument(format!(
+            "the body is not a grasp.v1.DetectGraspsFromDepthRequest in JSON: {error}{advice}"
+        ))
     };
-    let mut json = serde_json::Deserializer::from_slice(body);
+    // Editors on Windows write a byte order mark.
+    let mut json = serde_json::Deserializer::from_slice(body.strip_prefix(b"\xef\xbb\xbf").unwrap_or(body));
     let descriptor = descriptor("grasp.v1.DetectGraspsFromDepthRequest");
     let message = DynamicMessage::deserialize(descriptor, &mut json).map_err(|error| refused(&error))?;
     json.end().map_err(|error| refused(&error))?;
