@@ -57,8 +57,8 @@ fn walk<'a>(
     found: &mut Vec<(String, Camera)>,
 ) -> anyhow::Result<()> {
     if let Value::Array(values) = value {
-        let items = values.iter().enumerate().filter(|(_, value)| has_camera(value));
-        return items.map(|(i, value)| walk(value, format!("{path}[{i}]"), around, found)).collect();
+        let mut items = values.iter().enumerate().filter(|(_, value)| has_camera(value));
+        return items.try_for_each(|(i, value)| walk(value, format!("{path}[{i}]"), around, found));
     }
     let Value::Object(map) = value else { return Ok(()) };
     let mut said = Vec::new();

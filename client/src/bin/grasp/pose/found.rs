@@ -201,8 +201,7 @@ fn finite(pose: Isometry3<f64>) -> anyhow::Result<Isometry3<f64>> {
 pub(super) fn unit(quaternion: Quaternion<f64>) -> Result<UnitQuaternion<f64>, String> {
     let norm = quaternion.norm();
     let deviation = (norm - 1.0).abs();
-    // Written so that NaN fails.
-    if !(deviation <= CORRECTED) {
+    if deviation.is_nan() || deviation > CORRECTED {
         return Err(format!("the norm of the quaternion is {norm}; it must be 1 ± {CORRECTED}"));
     }
     corrected(deviation);
