@@ -6,6 +6,8 @@ use grasp_client::{Detection, Proposal};
 use nalgebra::Isometry3;
 use serde_json::json;
 
+use crate::show::short;
+
 /// One row per grasp; metres, quaternions x y z w.
 pub(crate) fn csv(detection: &Detection) -> String {
     let mut text =
@@ -18,7 +20,8 @@ pub(crate) fn csv(detection: &Detection) -> String {
         let ([rx, ry, rz], _) = parts(retreat);
         let collides = collides.map(|collides| collides.to_string()).unwrap_or_default();
         let object = object.map(|object| object.to_string()).unwrap_or_default();
-        let open_width = open_width.map(|width| width.to_string()).unwrap_or_default();
+        let open_width = open_width.map(|width| short(width).to_string()).unwrap_or_default();
+        let width = short(*width);
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,

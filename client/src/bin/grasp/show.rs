@@ -152,7 +152,7 @@ fn exact(number: f32) -> Value {
 }
 
 /// A length without the digits that are noise of 32-bit floats.
-fn short(number: f64) -> f64 {
+pub(crate) fn short(number: f64) -> f64 {
     (number * 1e8).round() / 1e8
 }
 
