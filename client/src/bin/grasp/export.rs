@@ -6,7 +6,7 @@ use grasp_client::{Detection, Proposal};
 use nalgebra::Isometry3;
 use serde_json::json;
 
-use crate::show::short;
+use crate::numbers::short;
 
 /// One row per grasp; metres, quaternions x y z w.
 pub(crate) fn csv(detection: &Detection) -> String {

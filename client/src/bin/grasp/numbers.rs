@@ -14,6 +14,11 @@ impl<const N: usize> FromStr for Numbers<N> {
     }
 }
 
+/// A length without the digits that are noise of 32-bit floats.
+pub(crate) fn short(number: f64) -> f64 {
+    (number * 1e8).round() / 1e8
+}
+
 /// A count with its noun.
 pub(crate) fn counted(count: usize, noun: &str) -> String {
     format!("{count} {noun}{}", if count == 1 { "" } else { "s" })

@@ -10,6 +10,8 @@ use nalgebra::Isometry3;
 use serde_json::{Value, json};
 use tonic::Code;
 
+use crate::numbers::short;
+
 /// Prints a line. Returns false if stdout is a closed pipe, as after `| head`, which is not an error.
 pub(crate) fn print(text: &str) -> anyhow::Result<bool> {
     match writeln!(io::stdout().lock(), "{text}") {
@@ -149,11 +151,6 @@ pub(crate) fn scores_json(scores: &Scores) -> String {
 /// The shortest number that is read as the same `f32`: 0.95 instead of 0.949999988079071.
 fn exact(number: f32) -> Value {
     number.to_string().parse::<f64>().map_or(Value::Null, Value::from)
-}
-
-/// A length without the digits that are noise of 32-bit floats.
-pub(crate) fn short(number: f64) -> f64 {
-    (number * 1e8).round() / 1e8
 }
 
 /// The names of the violations of a score.
