@@ -404,6 +404,7 @@ impl From<&CloudView> for pb::CloudView {
             frame_from_cloud: Some((&view.frame_from_cloud).into()),
             camera_position: Some(pb::Vector3 { x, y, z }),
             labels: view.labels.as_deref().map(labels),
+            scale: None,
         }
     }
 }

@@ -143,7 +143,8 @@ impl From<Status> for Error {
                 "the server needs a client certificate (tls_cert and tls_key)".to_owned()
             } else if is_not_grpc {
                 format!(
-                    "{}; if no call succeeds, the address may be the port for HTTP, or need https:// and a CA",
+                    "no valid reply ({}): if no call succeeds, the address may be the port for HTTP, or need https:// \
+                     and a CA",
                     source(&status)
                 )
             } else {

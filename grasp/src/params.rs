@@ -149,7 +149,7 @@ impl DetectParams {
             return Ok(());
         }
         if let Some(first) = self.objects.first() {
-            return Err(RequestError::invalid("options.objects", format_args!("[{first}, …]"), NEEDED));
+            return Err(RequestError::refused("options.objects", format_args!("object {first} {NEEDED}")));
         }
         if !are_found && self.max_grasps_per_object < usize::MAX {
             return Err(RequestError::invalid("options.max_grasps_per_object", self.max_grasps_per_object, NEEDED));

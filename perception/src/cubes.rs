@@ -206,8 +206,8 @@ impl Cubes {
         // Of small objects that were found, other pixels in the same cells may be more.
         let missing = objects.as_ref().filter(|_| !are_found).and_then(|objects| objects.missing());
         if let Some(label) = missing {
-            let needed = "must have labels of the views only; no pixel or point with a depth has this one";
-            return Err(RequestError::invalid("options.objects", format_args!("[…, {label}, …]"), needed));
+            let reason = format_args!("no pixel or point with a depth has the label {label}");
+            return Err(RequestError::refused("options.objects", reason));
         }
         let scenes = self.integrate(&observation, params.margin, &mut warnings, is_wanted)?;
         let of_objects = |scene: Scene| Scene { volume: scene.volume.with_objects(objects.clone()), ..scene };

@@ -46,11 +46,15 @@ pub fn cloud(view: &pb::CloudView) -> Result<Cloud, RequestError> {
     if ![x, y, z].iter().all(|c| c.is_finite()) {
         return Err(RequestError::invalid("camera_position", format_args!("({x}, {y}, {z})"), "must be finite"));
     }
+    let scale = view.scale.unwrap_or(1.0);
+    if !(scale.is_finite() && scale > 0.0) {
+        return Err(RequestError::invalid("scale", scale, "must be above 0: 0.001 for points in millimetres"));
+    }
     let point = |bytes: &[u8; POINT]| {
         let [x, y, z] =
             [0, 4, 8].map(|at| f32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]));
         let finite = x.is_finite() && y.is_finite() && z.is_finite();
-        finite.then(|| frame_from_cloud * Point3::new(x, y, z).cast::<f64>())
+        finite.then(|| frame_from_cloud * (Point3::new(x, y, z).cast::<f64>() * scale))
     };
     let all = view.points.as_chunks().0;
     let points: Vec<_> = all.iter().filter_map(point).collect();
@@ -67,7 +71,8 @@ pub fn cloud(view: &pb::CloudView) -> Result<Cloud, RequestError> {
     let distance = median(points.iter().map(|point| (point - eye).norm()));
     if distance > FARTHEST {
         let reason = format_args!(
-            "the median distance from the camera is {distance:.0} m, so the points look like millimetres: divide by 1000 (in Python `CloudView.scale`)"
+            "the median distance from the camera is {distance:.0} m, so the points look like millimetres: set \
+             `CloudView.scale` to 0.001"
         );
         return Err(RequestError::refused("points", reason));
     }
@@ -95,6 +100,7 @@ mod tests {
             frame_from_cloud: Some((&Isometry3::translation(1.0, 0.0, 0.0)).into()),
             camera_position: Some(pb::Vector3::default()),
             labels: None,
+            scale: None,
         };
         let points = cloud(&view).unwrap().in_task(&Isometry3::translation(0.5, 0.0, 0.0));
         let [point] = points.points[..] else { panic!("the NaN point is ignored") };
@@ -116,16 +122,20 @@ mod tests {
             frame_from_cloud: None,
             camera_position: Some(pb::Vector3::default()),
             labels: labels(vec![4, 5, 6]),
+            scale: None,
         };
         let converted = super::cloud(&cloud).unwrap();
         assert_eq!((converted.points.len(), converted.labels), (2, Some(vec![4, 6])));
         let millimetres = points.iter().flatten().flat_map(|c| (c * 1000.0).to_le_bytes());
         let cloud = pb::CloudView { points: millimetres.collect::<Vec<u8>>().into(), ..cloud };
+        let wrong = |scale| clouds(&[pb::CloudView { scale, ..cloud.clone() }]).unwrap_err().to_string();
         assert!(
-            clouds(&[cloud])
-                .unwrap_err()
-                .to_string()
-                .contains("views[0].points: the median distance from the camera is 500 m, so the points look like")
+            wrong(None).contains("views[0].points: the median distance from the camera is 500 m, so the points look")
         );
+        for scale in [0.0, -1.0, f64::NAN] {
+            assert!(wrong(Some(scale)).starts_with("views[0].scale is "));
+        }
+        let [scaled] = clouds(&[pb::CloudView { scale: Some(1e-3), ..cloud }]).unwrap().try_into().unwrap();
+        assert!(scaled.points.iter().zip(&converted.points).all(|(a, b)| (a - b).norm() < 1e-6));
     }
 }

@@ -293,7 +293,7 @@ mod tests {
         let of_objects = params(&pb::Options { objects: vec![7, 3], ..Default::default() });
         assert_eq!(of_objects.objects, [3, 7].into());
         let refused = of_objects.check_objects(false, true).unwrap_err();
-        assert_eq!(refused.to_string(), "options.objects is [3, …], needs views with labels");
+        assert_eq!(refused.to_string(), "options.objects: object 3 needs views with labels");
         assert!(of_objects.check_objects(true, false).is_ok());
         let limited = params(&pb::Options { max_grasps_per_object: 2, ..Default::default() });
         assert_eq!(limited.check_objects(false, false).unwrap_err().field(), "options.max_grasps_per_object");

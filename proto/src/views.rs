@@ -173,9 +173,17 @@ fn intrinsics(camera: &pb::Camera) -> Result<Intrinsics, RequestError> {
     }
     let [u, v] = [cx / f64::from(camera.width) - 0.5, cy / f64::from(camera.height) - 0.5];
     if u.abs().min(v.abs()) > OFF_CENTRE && (u - v).abs() <= OFF_CENTRE {
+        // The factor that moves the principal point to the centre.
+        let factor = 1.0 / (1.0 + u + v);
+        let [fx, cx, fy, cy] = [fx, cx, fy, cy].map(|value| (value * factor * 10.0).round() / 10.0);
+        let resized = if (0.1..=10.0).contains(&factor) {
+            format!(", about [{fx}, 0, {cx}, 0, {fy}, {cy}, 0, 0, 1] if it was resized by {factor:.2}")
+        } else {
+            String::new()
+        };
         let needed = format_args!(
             "must be of an image of {} × {} pixels, but its principal point (third and sixth number) is far from the \
-             centre: send the intrinsics of this resolution; if the image was cropped, send the whole image",
+             centre: send the intrinsics of this resolution{resized}; if the image was cropped, send the whole image",
             camera.width, camera.height
         );
         return Err(RequestError::invalid("camera.k", format_args!("{k:?}"), needed));
@@ -322,7 +330,11 @@ mod tests {
         assert!(refused(|v| v.camera = camera(&[f64::NAN; 9])).ends_with("must be finite"));
         for scale in [2.0, 0.75, 0.5] {
             let k = [5.0 * scale, 0.0, 2.0 * scale, 0.0, 5.0 * scale, 1.5 * scale, 0.0, 0.0, 1.0];
-            assert!(refused(|v| v.camera = camera(&k)).contains("send the intrinsics of this resolution"));
+            let of_this = format!(
+                "send the intrinsics of this resolution, about [5, 0, 2, 0, 5, 1.5, 0, 0, 1] if it was resized by {:.2};",
+                1.0 / scale
+            );
+            assert!(refused(|v| v.camera = camera(&k)).contains(&of_this));
         }
         let negative = [-5.0, 0.0, 2.0, 0.0, 5.0, 1.5, 0.0, 0.0, 1.0];
         assert!(refused(|v| v.camera = camera(&negative)).contains("focal lengths above 0"));

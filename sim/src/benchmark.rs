@@ -1,6 +1,7 @@
 //! The clutter-removal benchmark: a planner's best grasp is executed repeatedly until the table is empty, no object is
 //! visible, no grasp is proposed, or two grasps in a row fail.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -98,7 +99,8 @@ pub enum Event<'a> {
 }
 
 impl Benchmark {
-    /// Runs every round, on all cores. `watch` receives the events.
+    /// Runs every round, on all cores. `watch` receives the events. Once `is_stopped` is set, rounds that have not ended
+    /// are left out.
     ///
     /// # Errors
     /// The first error of a planner.
@@ -107,6 +109,7 @@ impl Benchmark {
         planner: &PlannerSpec,
         params: &DecodeParams,
         options: &Options,
+        is_stopped: &AtomicBool,
         watch: impl Fn(Event<'_>) + Sync,
     ) -> anyhow::Result<Vec<Round>> {
         // Idle planners are reused, so that there are at most as many planners as threads.
@@ -114,13 +117,19 @@ impl Benchmark {
         let idle = || idle.lock().unwrap_or_else(PoisonError::into_inner);
         (0..self.rounds)
             .into_par_iter()
-            .map(|number| {
+            .filter_map(|number| {
+                if is_stopped.load(Ordering::Relaxed) {
+                    return None;
+                }
                 let waiting = idle().pop();
-                let mut planner = waiting.map_or_else(|| planner.build(params, options), Ok)?;
-                let round = self.round(number, &mut planner, &watch);
+                let mut planner = match waiting.map_or_else(|| planner.build(params, options), Ok) {
+                    Ok(planner) => planner,
+                    Err(error) => return Some(Err(error)),
+                };
+                let round = self.round(number, &mut planner, is_stopped, &watch);
                 idle().push(planner);
                 watch(Event::Round);
-                round
+                round.transpose()
             })
             .collect()
     }
@@ -140,7 +149,14 @@ impl Benchmark {
         Observation::new(observe(world, &self.views, self.noise, rng))
     }
 
-    fn round(&self, number: u64, planner: &mut BenchPlanner, watch: impl Fn(Event<'_>)) -> anyhow::Result<Round> {
+    /// Runs a round; `None` if it was stopped.
+    fn round(
+        &self,
+        number: u64,
+        planner: &mut BenchPlanner,
+        is_stopped: &AtomicBool,
+        watch: impl Fn(Event<'_>),
+    ) -> anyhow::Result<Option<Round>> {
         let (mut world, mut rng) = self.scene(number);
         let mut round = Round {
             objects: world.objects().len(),
@@ -151,6 +167,9 @@ impl Benchmark {
         };
         let mut failures = 0;
         while !world.objects().is_empty() {
+            if is_stopped.load(Ordering::Relaxed) {
+                return Ok(None);
+            }
             let Some(observation) = self.observe(&world, &mut rng) else {
                 round.ending = Ending::NothingSeen;
                 break;
@@ -186,6 +205,6 @@ impl Benchmark {
             }
             settle(&mut world);
         }
-        Ok(round)
+        Ok(Some(round))
     }
 }

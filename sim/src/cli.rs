@@ -10,6 +10,7 @@ mod label;
 mod merge;
 mod objects;
 mod observe;
+mod progress;
 mod proposals;
 mod reliability;
 mod replay;

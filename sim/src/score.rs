@@ -109,7 +109,7 @@ fn proportion(part: usize, whole: usize) -> (f64, f64) {
 
 /// The 95 % Wilson score interval of a proportion (Wilson 1927), which is also valid near 0 and 1. NaN without attempts.
 #[must_use]
-pub(crate) fn wilson(part: u64, whole: u64) -> [f64; 2] {
+pub fn wilson(part: u64, whole: u64) -> [f64; 2] {
     const Z: f64 = 1.96;
     let n = whole as f64;
     let share = part as f64 / n;

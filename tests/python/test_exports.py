@@ -51,7 +51,7 @@ class ExportTest(unittest.TestCase):
             for name, way in ways.items():
                 direction, distance = found[name]["direction"], found[name]["desired_distance"]
                 self.assertEqual(direction["header"]["frame_id"], "base")
-                np.testing.assert_allclose([distance * direction["vector"][axis] for axis in "xyz"], way, atol=1e-9)
+                np.testing.assert_allclose([distance * direction["vector"][axis] for axis in "xyz"], way, atol=1e-7)
                 self.assertLess(found[name]["min_distance"], distance)
 
     def test_isaac_files_have_the_fields_of_the_format(self):

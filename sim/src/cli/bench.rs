@@ -3,9 +3,10 @@ use std::fmt;
 use std::fs::{self, File, OpenOptions};
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 
-use anyhow::{Context, anyhow};
+use anyhow::{Context, anyhow, bail};
 use clap::Args;
 use grasp::{Clearance, DecodeParams, FINGER_DEPTH, Grasp};
 use grasp_models::{Choice, Options, Precision, Provider};
@@ -13,7 +14,7 @@ use grasp_picture::{Picture, quality_color, save_sheet};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::{Benchmark, Event};
 use grasp_sim::planner::PlannerSpec;
-use grasp_sim::score::{Spread, Summary};
+use grasp_sim::score::{Spread, Summary, wilson};
 use indicatif::ProgressBar;
 use serde_json::{Value, json};
 
@@ -178,15 +179,13 @@ impl Bench {
         let watcher = Watcher::new(&self)?;
         let params = self.decoding.params();
         let options = Options { provider: self.provider.0, precision: self.precision.0, ..Options::default() };
-        if !self.json {
-            println!("{setup}, seeds: {}, networks with {}\n\n{MARKDOWN_HEAD}", self.seeds, self.decoding);
-        }
-        for (name, planner) in planners {
+        let is_stopped = stopped_by_ctrl_c()?;
+        for (index, (name, planner)) in planners.into_iter().enumerate() {
             let progress = ProgressBar::new(self.rounds * self.seeds).with_message(name.clone());
             let mut conditions = Vec::new();
             for seed in benchmark.seed..benchmark.seed + self.seeds {
                 let benchmark = Benchmark { seed, ..benchmark.clone() };
-                let rounds = benchmark.run(&planner, &params, &options, |event| match event {
+                let rounds = benchmark.run(&planner, &params, &options, &is_stopped, |event| match event {
                     Event::Round => progress.inc(1),
                     Event::Attempt { .. } => watcher.attempt(name, seed, &event),
                 });
@@ -194,6 +193,10 @@ impl Bench {
                 watcher.finish()?;
             }
             progress.finish_and_clear();
+            let is_interrupted = is_stopped.load(Ordering::Relaxed);
+            if is_interrupted {
+                conditions.retain(|rounds| !rounds.is_empty());
+            }
             let whole = Summary::new(&conditions.concat());
             let each: Vec<Summary> = conditions.iter().map(|rounds| Summary::new(rounds)).collect();
             let spread = |figure: fn(&Summary) -> f64| Spread::new(&each.iter().map(figure).collect::<Vec<_>>());
@@ -207,15 +210,36 @@ impl Bench {
                 line["setup"] = setup.as_str().into();
                 println!("{line}");
             } else {
+                // Before the first row, not before the first round: without a row there is no table.
+                if index == 0 {
+                    println!("{setup}, seeds: {}, networks with {}\n\n{MARKDOWN_HEAD}", self.seeds, self.decoding);
+                }
                 println!("{}", markdown(name, &whole, gsr, dr));
             }
             // After the figures, so that an error does not lose them.
             if let Some(path) = &self.failures {
                 watcher.draw_failures(path)?;
             }
+            if is_interrupted {
+                bail!("interrupted: {} of {} rounds of `{name}`", whole.rounds, self.rounds * self.seeds);
+            }
         }
         Ok(())
     }
+}
+
+/// A flag that Ctrl-C sets, so that the rounds that have ended are printed. The second Ctrl-C ends the program at once.
+fn stopped_by_ctrl_c() -> anyhow::Result<Arc<AtomicBool>> {
+    const INTERRUPTED: i32 = 130;
+    let flag = Arc::new(AtomicBool::new(false));
+    let set = Arc::clone(&flag);
+    let stop = move || {
+        if set.swap(true, Ordering::Relaxed) {
+            std::process::exit(INTERRUPTED);
+        }
+    };
+    ctrlc::set_handler(stop).context("cannot install the handler of Ctrl-C")?;
+    Ok(flag)
 }
 
 /// The decoding parameters that a planner uses; null for random grasps.
@@ -238,17 +262,21 @@ rounds ended: cleared, unseen, no proposal, gave up | fusion ms, p50 / p95 | pla
 
 /// A row of the table: mean ± standard deviation over the seeds, or with one seed the 95 % interval.
 fn markdown(planner: &str, whole: &Summary, gsr: Option<Spread>, dr: Option<Spread>) -> String {
-    let figure = |spread: Option<Spread>, pooled: f64, interval: f64| match spread {
+    let figure = |spread: Option<Spread>, all: usize| match spread {
         Some(spread @ Spread { std: Some(_), .. }) => spread.percent(),
-        _ => format!("{:.1} (±{:.1})", pooled * 100.0, interval * 100.0),
+        _ if all == 0 => "–".to_owned(),
+        _ => {
+            let [low, high] = wilson(whole.successes as u64, all as u64).map(|share| share * 100.0);
+            format!("{:.1} ({low:.1}–{high:.1})", 100.0 * whole.successes as f64 / all as f64)
+        }
     };
     let Summary { attempts, blocked_at_pregrasp, closed_on_nothing, lost_in_lift, stopped_short, .. } = whole;
     let Summary { cleared, nothing_seen, nothing_proposed, gave_up, .. } = whole;
     format!(
         "| {planner} | {} | {} | {attempts} | {blocked_at_pregrasp}, {closed_on_nothing}, {lost_in_lift} \
          ({stopped_short}) | {cleared}, {nothing_seen}, {nothing_proposed}, {gave_up} | {:.2} / {:.2} | {:.1} / {:.1} |",
-        figure(gsr, whole.gsr, whole.gsr_interval),
-        figure(dr, whole.dr, whole.dr_interval),
+        figure(gsr, whole.attempts),
+        figure(dr, whole.objects),
         whole.fusion_p50_ms,
         whole.fusion_p95_ms,
         whole.planning_p50_ms,

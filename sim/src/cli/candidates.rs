@@ -4,9 +4,9 @@ use anyhow::Context;
 use clap::Args;
 use grasp_data::Candidates as Tried;
 use grasp_sim::ordered;
-use indicatif::{ProgressBar, ProgressStyle};
 
 use super::data::DataArgs;
+use super::progress;
 
 /// Writes the training data of `grasp-train classify`: an .npz with `images`, `labels` and `scenes`. The same seed
 /// gives the same file on any number of threads.
@@ -34,8 +34,7 @@ impl Candidates {
         if let Some(folder) = self.out.parent() {
             std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
         }
-        let style = "{wide_bar} {pos}/{len} scenes, {per_sec}, {eta} left";
-        let progress = ProgressBar::new(self.scenes).with_style(ProgressStyle::with_template(style)?);
+        let progress = progress::of_scenes(self.scenes)?;
         let mut tried = Tried::default();
         ordered::for_each(
             0..self.scenes,

@@ -8,9 +8,9 @@ use grasp_data::{DataFormat, Setup, Trial, packed, processed, raw, scene_id, sce
 use grasp_sim::export::{Export, Line};
 use grasp_sim::label::{LabelledScene, SceneConfig};
 use grasp_sim::ordered;
-use indicatif::{ProgressBar, ProgressStyle};
 
 use super::data::DataArgs;
+use super::progress;
 
 /// The same seed gives the same data on any number of threads. An interrupted run continues where it stopped, also with
 /// a larger number of scenes.
@@ -82,9 +82,8 @@ impl Label {
 
         let end =
             self.first.checked_add(self.scenes).context("--first + --scenes exceeds 2^64 - 1; use smaller numbers")?;
-        let style = "{wide_bar} {pos}/{len} scenes, {per_sec}, {eta} left";
         // Of this run alone: the scenes of an earlier one would count as the work of a moment.
-        let progress = ProgressBar::new(end.saturating_sub(next)).with_style(ProgressStyle::with_template(style)?);
+        let progress = progress::of_scenes(end.saturating_sub(next))?;
         eprintln!("writing to {}; after an interrupt the same command continues", self.out.display());
         ordered::for_each(
             next..end.max(next),

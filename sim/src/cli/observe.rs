@@ -7,9 +7,8 @@ use grasp_data::{Occupancy, Provenance, Setup, quantise};
 use grasp_sim::camera::DepthNoise;
 use grasp_sim::label::SceneConfig;
 use grasp_sim::ordered;
-use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{Part, Scene, Sensor, VIEWS, parse_share, parse_views};
+use super::{Part, Scene, Sensor, VIEWS, parse_share, parse_views, progress};
 
 /// Much faster than labelling, because no grasp is tried. An interrupted run continues where it stopped.
 #[derive(Args)]
@@ -104,8 +103,7 @@ impl Observe {
         let mut writer = Writer::open(&self.out, &setup)?;
         let next = writer.next().unwrap_or(0);
         let done = scenes.partition_point(|&index| data.number(index) < next);
-        let style = "{wide_bar} {pos}/{len} scenes, {per_sec}, {eta} left";
-        let progress = ProgressBar::new(scenes.len() as u64).with_style(ProgressStyle::with_template(style)?);
+        let progress = progress::of_scenes(scenes.len() as u64)?;
         progress.set_position(done as u64);
         progress.reset_eta();
         let noise =

@@ -8,9 +8,9 @@ use grasp_models::{Network, Options};
 use grasp_planner::{Evaluator, NetworkPlanner, Planner};
 use grasp_sim::ordered;
 use grasp_sim::planner::PlannerSpec;
-use indicatif::{ProgressBar, ProgressStyle};
 
 use super::data::DataArgs;
+use super::progress;
 
 /// Writes the training data of `grasp-train classify --network evaluator`: a packed data set. Each scene is observed
 /// once. Each grasp is moved at random and executed with a pose error. An interrupted run continues where it stopped.
@@ -58,8 +58,7 @@ impl Proposals {
         });
         let mut writer = packed::Writer::open(&self.out, &setup)?;
         let next = writer.next().unwrap_or(0);
-        let style = "{wide_bar} {pos}/{len} scenes, {per_sec}, {eta} left";
-        let progress = ProgressBar::new(self.scenes).with_style(ProgressStyle::with_template(style)?);
+        let progress = progress::of_scenes(self.scenes)?;
         progress.set_position(next);
         progress.reset_eta();
         ordered::for_each(

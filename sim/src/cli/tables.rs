@@ -5,6 +5,7 @@ mod pybullet;
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 use anyhow::{Context, bail, ensure};
@@ -378,7 +379,7 @@ impl Tables {
             }
             milliseconds = Spread::new(times.get(1..).unwrap_or_default());
         } else {
-            let rounds = benchmark.run(&planner, &params, &Options::default(), |event| {
+            let rounds = benchmark.run(&planner, &params, &Options::default(), &AtomicBool::new(false), |event| {
                 if let Event::Round = event {
                     progress.inc(1);
                 }

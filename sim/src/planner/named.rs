@@ -29,8 +29,10 @@ fn named(name: &str, folder: &Path) -> Result<PlannerSpec, String> {
         });
     }
     let names = || specs.iter().map(ModelSpec::name);
-    let closest = names().max_by(|a, b| strsim::jaro(name, a).total_cmp(&strsim::jaro(name, b)));
-    let meant = closest.filter(|closest| strsim::jaro(name, closest) >= SIMILAR);
+    let lower = name.to_lowercase();
+    let similarity = |other: &str| strsim::jaro(&lower, other);
+    let closest = names().max_by(|a, b| similarity(a).total_cmp(&similarity(b)));
+    let meant = closest.filter(|closest| similarity(closest) >= SIMILAR);
     let meant = meant.map_or_else(String::new, |meant| format!(" Did you mean `{meant}`?"));
     let available = names().collect::<Vec<_>>().join(", ");
     Err(format!("no file `{name}`, and no model of that name in {}.{meant} Its models: {available}", folder.display()))
@@ -52,6 +54,7 @@ mod tests {
         assert_eq!(named("shaf", zoo), Ok(PlannerSpec::Highest));
         let error = named("vgn-pakced", zoo).unwrap_err();
         assert!(error.contains("no file `vgn-pakced`") && error.contains("Did you mean `vgn-packed`?"), "{error}");
+        assert!(named("VGN-Packed", zoo).unwrap_err().contains("Did you mean `vgn-packed`?"));
         let error = named("yolo", zoo).unwrap_err();
         assert!(!error.contains("Did you mean") && error.contains("Its models: transformer-packed, "), "{error}");
     }

@@ -307,6 +307,35 @@ fn a_benchmark_reports_every_attempt() {
 }
 
 #[test]
+fn an_interrupted_benchmark_prints_the_rounds_that_have_ended() {
+    let desk = Desk::new();
+    let command = "bench --planner random --rounds 100000 --pictures pictures";
+    let mut child = desk.command(command).env("RAYON_NUM_THREADS", "1").spawn().unwrap();
+    // random-SEED-ROUND-ATTEMPT-OUTCOME.png: with three rounds, two have ended.
+    let rounds = || {
+        let names = fs::read_dir(desk.path("pictures")).into_iter().flatten().flatten().map(|file| file.file_name());
+        names.filter_map(|name| name.to_str()?.split('-').nth(2).map(str::to_owned)).collect::<BTreeSet<_>>().len()
+    };
+    while rounds() < 3 && child.try_wait().unwrap().is_none() {
+        sleep(Duration::from_millis(20));
+    }
+    assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+    let reason = stderr(&output);
+    let table = String::from_utf8(output.stdout).unwrap();
+    assert!(table.lines().last().unwrap().starts_with("| random | "), "{table}");
+    assert!(reason.contains("interrupted: ") && reason.contains(" of 100000 rounds of `random`"), "{reason}");
+}
+
+#[test]
+fn a_benchmark_without_a_result_has_no_table() {
+    let output = Desk::new().command("bench --planner missing.onnx --rounds 1").output().unwrap();
+    assert_eq!(String::from_utf8(output.stdout).unwrap(), "");
+    assert!(String::from_utf8(output.stderr).unwrap().contains("missing.onnx"));
+}
+
+#[test]
 fn objects_can_be_low_only() {
     let desk = Desk::new();
     assert_eq!(

@@ -148,6 +148,13 @@ async fn tls_needs_the_ca_of_the_server() {
         .output()
         .unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+
+    let output = Command::new(grasp())
+        .args(["--server", &server.grpc().to_string(), "--tls-ca", &authority.path("server.key"), "health"])
+        .output()
+        .unwrap();
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert!(error.contains("server.key has no certificate in PEM"), "{error}");
 }
 
 #[tokio::test]

@@ -56,7 +56,9 @@ class Connection(Generic[Channel]):
             raise TypeError(f"retry is {retry!r}, must be a graspd.Retry, such as Retry.RECOMMENDED")
         if (tls_cert is None) != (tls_key is None):
             raise ValueError("tls_cert and tls_key must be given together")
-        ca, cert, key = (None if file is None else Path(file).read_bytes() for file in (tls_ca, tls_cert, tls_key))
+        ca = pem("tls_ca", tls_ca, "CERTIFICATE")
+        cert = pem("tls_cert", tls_cert, "CERTIFICATE")
+        key = pem("tls_key", tls_key, "PRIVATE KEY")
         credentials = None
         if ca or cert or address.startswith("https://"):
             credentials = grpc.ssl_channel_credentials(ca, key, cert)
@@ -79,6 +81,16 @@ class Connection(Generic[Channel]):
 
     def _open(self, target: str, credentials: grpc.ChannelCredentials | None, options: ChannelOptions) -> Channel:
         raise NotImplementedError
+
+
+def pem(name: str, file: File | None, label: str) -> bytes | None:
+    """The content of a PEM file; with another file, gRPC only says that the connection fails."""
+    if file is None:
+        return None
+    content = Path(file).read_bytes()
+    if not re.search(rb"^-----BEGIN [A-Z ]*" + label.encode(), content, re.MULTILINE):
+        raise ValueError(f"{name} {file} has no {label.lower()} in PEM")
+    return content
 
 
 def positive(name: str, value: float) -> float:

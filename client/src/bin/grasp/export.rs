@@ -20,8 +20,7 @@ pub(crate) fn csv(detection: &Detection) -> String {
         let ([rx, ry, rz], _) = parts(retreat);
         let collides = collides.map(|collides| collides.to_string()).unwrap_or_default();
         let object = object.map(|object| object.to_string()).unwrap_or_default();
-        let open_width = open_width.map(|width| short(width).to_string()).unwrap_or_default();
-        let width = short(*width);
+        let open_width = open_width.map(|width| width.to_string()).unwrap_or_default();
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
@@ -90,5 +89,5 @@ pub(crate) fn isaac(detection: &Detection, opening: f64) -> String {
 }
 
 fn parts(pose: &Isometry3<f64>) -> ([f64; 3], [f64; 4]) {
-    (pose.translation.vector.into(), pose.rotation.coords.into())
+    (pose.translation.vector.map(short).into(), pose.rotation.coords.map(short).into())
 }

@@ -29,14 +29,14 @@ mod watch;
 use std::env;
 use std::fs;
 use std::io::{self, IsTerminal};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::pin::pin;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
-use anyhow::{Context, anyhow};
+use anyhow::{Context, anyhow, ensure};
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 use clap_complete::{Shell, generate};
 use grasp_client::{
@@ -238,11 +238,24 @@ impl AccessArgs {
             Some(path) => fs::read(path).map(Some).with_context(|| format!("cannot read {}", path.display())),
             None => Ok(None),
         };
+        let pem = |flag: &str, path: &Option<PathBuf>, label: &str| {
+            let bytes = file(path)?;
+            let has_label = bytes.as_ref().is_none_or(|bytes| {
+                String::from_utf8_lossy(bytes)
+                    .lines()
+                    .any(|line| line.starts_with("-----BEGIN") && line.contains(label))
+            });
+            let path = path.as_deref().unwrap_or(Path::new("")).display();
+            ensure!(has_label, "{flag} {path} has no {} in PEM", label.to_lowercase());
+            anyhow::Ok(bytes)
+        };
         let token =
             |bytes: Vec<u8>| String::from_utf8_lossy(&bytes).lines().next().unwrap_or_default().parse::<Token>();
         Ok(Access {
-            ca: file(&self.tls_ca)?.map(Certificate::from_pem),
-            identity: file(&self.tls_cert)?.zip(file(&self.tls_key)?).map(|(cert, key)| Identity::from_pem(cert, key)),
+            ca: pem("--tls-ca", &self.tls_ca, "CERTIFICATE")?.map(Certificate::from_pem),
+            identity: pem("--tls-cert", &self.tls_cert, "CERTIFICATE")?
+                .zip(pem("--tls-key", &self.tls_key, "PRIVATE KEY")?)
+                .map(|(cert, key)| Identity::from_pem(cert, key)),
             token: file(&self.token_file)?
                 .map(token)
                 .transpose()

@@ -14,7 +14,7 @@ impl<const N: usize> FromStr for Numbers<N> {
     }
 }
 
-/// A length without the digits that are noise of 32-bit floats.
+/// A coordinate to eight decimals: the digits beyond are noise of 32-bit floats.
 pub(crate) fn short(number: f64) -> f64 {
     (number * 1e8).round() / 1e8
 }

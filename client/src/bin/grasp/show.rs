@@ -82,17 +82,16 @@ fn found(table: Option<&FoundTable>, depth_factors: &[f64]) -> String {
 
 pub(crate) fn detection_json(detection: &Detection) -> String {
     let grasps = detection.grasps.iter().map(|grasp| {
-        let (position, rotation) = (grasp.pose.translation.vector, grasp.pose.rotation.coords);
         json!({
             "quality": exact(grasp.quality),
-            "position": position.as_slice(),
-            "orientation_xyzw": rotation.as_slice(),
-            "width": short(grasp.width),
+            "position": grasp.pose.translation.vector.map(short).as_slice(),
+            "orientation_xyzw": grasp.pose.rotation.coords.map(short).as_slice(),
+            "width": grasp.width,
             "pregrasp": pose(&grasp.pregrasp),
             "retreat": pose(&grasp.retreat),
             "collides": grasp.collides,
             "object": grasp.object,
-            "open_width": grasp.open_width.map(short),
+            "open_width": grasp.open_width,
         })
     });
     let object =
@@ -133,7 +132,7 @@ pub(crate) fn scores_json(scores: &Scores) -> String {
             "quality": exact(score.quality),
             "violations": violations(score),
             "object": score.object,
-            "open_width": score.open_width.map(short),
+            "open_width": score.open_width,
         })
     };
     let value = json!({
@@ -195,8 +194,8 @@ fn warning_code(warning: &GeometryWarning) -> String {
 
 fn pose(pose: &Isometry3<f64>) -> Value {
     json!({
-        "position": pose.translation.vector.as_slice(),
-        "orientation_xyzw": pose.rotation.coords.as_slice(),
+        "position": pose.translation.vector.map(short).as_slice(),
+        "orientation_xyzw": pose.rotation.coords.map(short).as_slice(),
     })
 }
 

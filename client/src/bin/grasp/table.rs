@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use crate::camera::Camera;
 use crate::files::in_file;
 use crate::image::{self, Scale};
-use crate::numbers::Numbers;
+use crate::numbers::{Numbers, short};
 use crate::overlay::Overlay;
 use crate::{cloud, show};
 
@@ -110,7 +110,7 @@ impl Table {
 }
 
 fn pose_json(pose: &Isometry3<f64>) -> Value {
-    json!({ "position": pose.translation.vector.as_slice(), "orientation": pose.rotation.coords.as_slice() })
+    json!({ "position": pose.translation.vector.map(short).as_slice(), "orientation": pose.rotation.coords.map(short).as_slice() })
 }
 
 fn json(table: &Tabletop, objects: usize, workspace: Value) -> Value {

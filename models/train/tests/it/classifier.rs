@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
+use std::sync::atomic::AtomicBool;
 
 use grasp::gpd::{Candidate, Cloud, Image};
 use grasp::{DecodeParams, Grasp, Patch, SurfacePoint, Volume};
@@ -117,7 +118,9 @@ fn a_trained_classifier_plans_in_the_benchmark() {
         seed: 1,
     };
     let planner = format!("gpd:{}", path.display()).parse::<PlannerSpec>().unwrap();
-    let rounds = benchmark.run(&planner, &DecodeParams::benchmark(), &Options::default(), |_| ()).unwrap();
+    let rounds = benchmark
+        .run(&planner, &DecodeParams::benchmark(), &Options::default(), &AtomicBool::new(false), |_| ())
+        .unwrap();
     let summary = Summary::new(&rounds);
     assert!(summary.rounds == 2 && summary.objects >= 2, "{summary:?}");
     assert!(summary.attempts > 0 || summary.nothing_proposed == 2, "{summary:?}");

@@ -106,13 +106,13 @@ impl Context {
                     self.params.poses(&detected.grasp.pose).map(|pose| Some((&pose).into()));
                 pb::Grasp {
                     pose,
-                    width: detected.grasp.width,
+                    width: rounded(detected.grasp.width),
                     quality: detected.grasp.quality,
                     pregrasp,
                     retreat,
                     collides: detected.collides,
                     object: detected.object.map(u32::from),
-                    open_width: detected.open_width,
+                    open_width: detected.open_width.map(rounded),
                 }
             })
             .collect();
@@ -179,8 +179,13 @@ fn score(score: &Score) -> pb::Score {
         quality: score.quality,
         violations: score.violations.iter().map(|found| violation(found).into()).collect(),
         object: score.object.map(u32::from),
-        open_width: score.open_width,
+        open_width: score.open_width.map(rounded),
     }
+}
+
+/// A width without the digits that are noise of the networks' 32-bit floats.
+fn rounded(width: f64) -> f64 {
+    (width * 1e8).round() / 1e8
 }
 
 fn latency(timings: &StageTimings) -> pb::Latency {
