@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use grasp::{DecodeParams, Grasp};
+use grasp::{DecodeParams, Grasp, MAX_OPENING};
 use grasp_models::Options;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -77,6 +77,9 @@ pub struct Attempt {
     pub outcome: Outcome,
     /// Distance from the grasp at which the hand closed because its approach was in contact, metres; else 0.
     pub short_by: f64,
+    /// Room beside each finger of the open hand at the narrower horizontal side of the standing object nearest to the
+    /// grasp, metres; below 0 if the object does not fit. `None` without an object nearby.
+    pub room: Option<f64>,
 }
 
 /// Progress of a running benchmark.
@@ -184,7 +187,12 @@ impl Benchmark {
             };
             let before = world.clone();
             let (outcome, short_by) = execute(&mut world, &best.pose);
-            let attempt = Attempt { grasp: *best, outcome, short_by };
+            let nearest = before.nearest(&best.pose.translation.vector.into()).map(|index| &before.objects()[index]);
+            let room = nearest.map(|body| {
+                let sides = body.object.visual.extents() * body.scale;
+                (MAX_OPENING - sides.x.min(sides.y)) / 2.0
+            });
+            let attempt = Attempt { grasp: *best, outcome, short_by, room };
             watch(Event::Attempt {
                 round: number,
                 number: round.attempts.len(),

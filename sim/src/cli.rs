@@ -90,8 +90,8 @@ struct SceneArgs {
     #[arg(long, value_enum, default_value = "packed")]
     scene: Scene,
 
-    /// Objects: the procedural sets `train`, `test` or `generated` (a new object at every draw), or a folder of URDF
-    /// files [default: train for labels and candidates, otherwise test].
+    /// Objects: the procedural sets `train`, `test`, `containers` (cartons, cans, bottles and tubs) or `generated` (a new
+    /// object at every draw), or a folder of URDF files [default: train for labels and candidates, otherwise test].
     #[arg(long)]
     objects: Option<String>,
 
@@ -221,6 +221,7 @@ impl Scene {
             ("train", _) => ObjectSet::procedural(Split::Train),
             ("test", Self::Pile) => ObjectSet::procedural(Split::PileTest),
             ("test", Self::Packed) => ObjectSet::procedural(Split::PackedTest),
+            ("containers", _) => ObjectSet::containers(self.kind().mean_scale()),
             (folder, _) => ObjectSet::load(&PathBuf::from(folder))?,
         })
     }

@@ -108,6 +108,14 @@ impl ObjectSet {
         ObjectSet { objects: Vec::new(), stretch: None, clearance: None }
     }
 
+    /// 72 cartons, cans, bottles and tubs, a test set: they have the sizes of real ones, 30 to 78 mm in their narrower
+    /// horizontal side, in scenes that add objects at `scale` on average.
+    #[must_use]
+    pub fn containers(scale: f64) -> ObjectSet {
+        let objects = procedural::containers(scale).into_iter().map(Arc::new).collect();
+        ObjectSet { objects, ..Self::generated() }
+    }
+
     /// Reads all `*.urdf` files of a folder, in the order of their names.
     ///
     /// # Errors

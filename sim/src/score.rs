@@ -26,6 +26,10 @@ pub struct Summary {
     pub gsr_interval: f64,
     /// Distance of `dr` from the farther end of its 95 % interval.
     pub dr_interval: f64,
+    /// Attempts by the room beside each finger of the open hand ([`Attempt::room`]): none, 0 to 4 mm, 4 to 8 mm, 8 mm and
+    /// more.
+    #[serde(default)]
+    pub by_room: [OfRoom; 4],
     /// Failed attempts with a contact at the pre-grasp.
     pub blocked_at_pregrasp: usize,
     /// Empty grasps.
@@ -52,6 +56,31 @@ pub struct Summary {
     pub planning_p95_ms: f64,
 }
 
+/// Attempts on objects that leave a similar room beside the fingers.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct OfRoom {
+    /// Executed grasps.
+    pub attempts: usize,
+    /// Lifted objects.
+    pub successes: usize,
+}
+
+/// Bounds between the rooms of [`Summary::by_room`], metres.
+const ROOMS: [f64; 3] = [0.0, 0.004, 0.008];
+
+impl OfRoom {
+    fn all(attempts: &[Attempt]) -> [Self; 4] {
+        let mut all = [Self::default(); 4];
+        for Attempt { outcome, room, .. } in attempts {
+            let Some(room) = room else { continue };
+            let of = &mut all[ROOMS.iter().filter(|bound| room >= bound).count()];
+            of.attempts += 1;
+            of.successes += usize::from(outcome.is_success());
+        }
+        all
+    }
+}
+
 impl Summary {
     /// Pools the rounds, as in the papers.
     #[must_use]
@@ -74,6 +103,7 @@ impl Summary {
             dr,
             gsr_interval,
             dr_interval,
+            by_room: OfRoom::all(&attempts),
             blocked_at_pregrasp: count(|o| *o == Outcome::BlockedAtPregrasp),
             closed_on_nothing: count(|o| *o == Outcome::ClosedOnNothing),
             lost_in_lift: count(|o| *o == Outcome::LostInLift),

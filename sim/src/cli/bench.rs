@@ -14,7 +14,7 @@ use grasp_picture::{Picture, quality_color, save_sheet};
 use grasp_sim::TABLE_HEIGHT;
 use grasp_sim::benchmark::{Benchmark, Event};
 use grasp_sim::planner::PlannerSpec;
-use grasp_sim::score::{Spread, Summary, wilson};
+use grasp_sim::score::{OfRoom, Spread, Summary, wilson};
 use indicatif::ProgressBar;
 use serde_json::{Value, json};
 
@@ -180,6 +180,7 @@ impl Bench {
         let params = self.decoding.params();
         let options = Options { provider: self.provider.0, precision: self.precision.0, ..Options::default() };
         let is_stopped = stopped_by_ctrl_c()?;
+        let mut rooms = Vec::new();
         for (index, (name, planner)) in planners.into_iter().enumerate() {
             let progress = ProgressBar::new(self.rounds * self.seeds).with_message(name.clone());
             let mut conditions = Vec::new();
@@ -215,16 +216,34 @@ impl Bench {
                     println!("{setup}, seeds: {}, networks with {}\n\n{MARKDOWN_HEAD}", self.seeds, self.decoding);
                 }
                 println!("{}", markdown(name, &whole, gsr, dr));
+                rooms.push(format!("{name}: {}", of_rooms(&whole.by_room)));
             }
             // After the figures, so that an error does not lose them.
             if let Some(path) = &self.failures {
                 watcher.draw_failures(path)?;
             }
             if is_interrupted {
+                print_rooms(&rooms);
                 bail!("interrupted: {} of {} rounds of `{name}`", whole.rounds, self.rounds * self.seeds);
             }
         }
+        print_rooms(&rooms);
         Ok(())
+    }
+}
+
+/// The successes by the room beside the fingers.
+fn of_rooms(rooms: &[OfRoom; 4]) -> String {
+    let names = ["no room", "up to 4 mm", "4 to 8 mm", "from 8 mm"];
+    let share = |(name, OfRoom { attempts, successes }): (&str, &OfRoom)| format!("{name} {successes} of {attempts}");
+    names.into_iter().zip(rooms).map(share).collect::<Vec<_>>().join(", ")
+}
+
+/// After the table, because a line between two rows would end it.
+fn print_rooms(rooms: &[String]) {
+    if !rooms.is_empty() {
+        println!("\nlifted, by the room beside each finger of the open hand:\n");
+        rooms.iter().for_each(|line| println!("- {line}"));
     }
 }
 
@@ -341,6 +360,7 @@ impl<'a> Watcher<'a> {
                 "object": object, "short_by": attempt.short_by, "position": pose.translation.vector.as_slice(),
                 "quaternion_xyzw": pose.rotation.coords.as_slice(), "width": width, "quality": quality,
                 "proposals": proposals.len(), "objects": before.objects().len(),
+                "room": attempt.room,
             });
             let mut file = file.lock().unwrap_or_else(PoisonError::into_inner);
             writeln!(file, "{line}").with_context(|| path.display().to_string())?;

@@ -20,11 +20,11 @@ const PITCH: f64 = 0.16;
 /// Draw the objects of scenes, or write them as files for another simulator.
 #[derive(Args)]
 pub struct Objects {
-    /// Objects: the procedural sets `train`, `test` or `generated`, or a folder of URDF files.
+    /// Objects: the procedural sets `train`, `test`, `containers` or `generated`, or a folder of URDF files.
     #[arg(long, default_value = "train")]
     objects: String,
 
-    /// Scenario of the test objects.
+    /// Scenario of `test` and `containers`.
     #[arg(long, value_enum, default_value = "packed")]
     scene: Scene,
 

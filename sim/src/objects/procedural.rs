@@ -3,6 +3,7 @@
 //! A kind (bottle, mug, pliers) defines random proportions. The size is drawn from the range of real objects, and the
 //! density gives the mass.
 
+mod containers;
 mod dice;
 mod food;
 mod packaging;
@@ -14,6 +15,7 @@ mod toys;
 use std::ops::Range;
 
 use super::{Object, Split};
+pub(super) use containers::containers;
 use dice::Dice;
 use grasp_picture::Mesh;
 use shape::Shape;

@@ -324,8 +324,19 @@ fn an_interrupted_benchmark_prints_the_rounds_that_have_ended() {
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
     let reason = stderr(&output);
     let table = String::from_utf8(output.stdout).unwrap();
-    assert!(table.lines().last().unwrap().starts_with("| random | "), "{table}");
+    assert!(table.lines().any(|line| line.starts_with("| random | ")), "{table}");
     assert!(reason.contains("interrupted: ") && reason.contains(" of 100000 rounds of `random`"), "{reason}");
+}
+
+#[test]
+fn the_benchmark_tells_the_room_beside_the_fingers() {
+    let desk = Desk::new();
+    let table = desk.run("bench --planner random --objects containers --rounds 4 --attempts attempts.jsonl");
+    let of_rooms = table.lines().find(|line| line.starts_with("- random: no room ")).unwrap();
+    let attempts = fs::read_to_string(desk.path("attempts.jsonl")).unwrap();
+    let rooms = attempts.lines().filter_map(|line| serde_json::from_str::<Value>(line).unwrap()["room"].as_f64());
+    let tight = rooms.filter(|room| (0.0..0.004).contains(room)).count();
+    assert!(of_rooms.contains(&format!(" of {tight}, 4 to 8 mm ")), "{of_rooms}: {tight}");
 }
 
 #[test]

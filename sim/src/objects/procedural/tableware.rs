@@ -105,7 +105,7 @@ fn vessel(bottom: f64, top: f64, height: f64, thickness: f64, segments: usize) -
 }
 
 /// The handle of a cup at x = `from`, around the height `z`.
-fn handle(from: f64, z: f64, reach: f64, height: f64) -> Shape {
+pub(super) fn handle(from: f64, z: f64, reach: f64, height: f64) -> Shape {
     let mut path = arc(0.0, 0.0, 1.0, FRAC_PI_2, -FRAC_PI_2, 7);
     path.iter_mut().for_each(|p| *p = (from - 0.002 + p.0 * reach, z + p.1 * height));
     pipe(&uniform(path, Section::Round(0.0045, 0.006)))
