@@ -6,7 +6,7 @@ use indicatif::{HumanDuration, ProgressBar, ProgressState, ProgressStyle};
 /// The progress bar of this many scenes.
 ///
 /// # Errors
-/// None: the template is valid.
+/// Only if the template of the bar is invalid.
 pub fn of_scenes(scenes: u64) -> anyhow::Result<ProgressBar> {
     // Neither the rate nor the remaining time is known before the first scene.
     let speed = |state: &ProgressState, text: &mut dyn Write| {
