@@ -247,17 +247,11 @@ fn print_rooms(rooms: &[String]) {
     }
 }
 
-/// A flag that Ctrl-C sets, so that the rounds that have ended are printed. The second Ctrl-C ends the program at once.
+/// A flag that Ctrl-C sets, so that the rounds that have ended are printed after the attempts in progress.
 fn stopped_by_ctrl_c() -> anyhow::Result<Arc<AtomicBool>> {
-    const INTERRUPTED: i32 = 130;
     let flag = Arc::new(AtomicBool::new(false));
     let set = Arc::clone(&flag);
-    let stop = move || {
-        if set.swap(true, Ordering::Relaxed) {
-            std::process::exit(INTERRUPTED);
-        }
-    };
-    ctrlc::set_handler(stop).context("cannot install the handler of Ctrl-C")?;
+    ctrlc::set_handler(move || set.store(true, Ordering::Relaxed)).context("cannot install the handler of Ctrl-C")?;
     Ok(flag)
 }
 
