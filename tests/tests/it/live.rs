@@ -289,13 +289,13 @@ async fn depth_images_and_clouds_are_shown_with_their_workspace() {
         assert!(viewer.grasps() > 3 && viewer.largest < 1_000_000, "{} bytes", viewer.largest);
 
         let (frame_from_task, [x, y, z], table) = viewer.workspace();
-        assert!((table - TABLE).abs() < 1e-7 && (z - 0.3).abs() < 1e-9, "{table} m, {z} m");
+        assert!((table - TABLE).abs() < 1e-9 && (z - 0.3).abs() < 1e-9, "{table} m, {z} m");
         if let Some(found) = printed["table"]["workspace"]["position"].as_array() {
             let position: Vec<f64> = found.iter().filter_map(Value::as_f64).collect();
             assert!((frame_from_task.translation.vector - Point3::from_slice(&position).coords).norm() < 1e-7);
         }
         let extent = if args.contains(&"--extent") { [0.35, 0.3] } else { [x.min(0.3), y.min(0.3)] };
-        assert!(args.contains(&"--find-table") || (x - extent[0]).abs() + (y - extent[1]).abs() < 1e-7, "{x}, {y}");
+        assert!(args.contains(&"--find-table") || (x - extent[0]).abs() + (y - extent[1]).abs() < 1e-9, "{x}, {y}");
         // Above the table is only the block, of 0.1 m.
         for topic in ["/cloud", "/surface"] {
             let heights =

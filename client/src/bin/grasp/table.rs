@@ -110,7 +110,8 @@ impl Table {
 }
 
 fn pose_json(pose: &Isometry3<f64>) -> Value {
-    json!({ "position": pose.translation.vector.map(short).as_slice(), "orientation": pose.rotation.coords.map(short).as_slice() })
+    let (position, rotation) = (pose.translation.vector.map(short), pose.rotation.coords.map(short));
+    json!({ "position": position.as_slice(), "orientation": rotation.as_slice() })
 }
 
 fn json(table: &Tabletop, objects: usize, workspace: Value) -> Value {
