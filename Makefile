@@ -10,6 +10,8 @@ export CARGO_TARGET_DIR
 # Everything but grasp-train, which needs libtorch.
 WORKSPACE = --workspace --exclude grasp-train --locked
 TRAIN = --package grasp-train --locked
+# Compiles in half the time of a release; what computes is optimised as well.
+DEBUG = $(CARGO_TARGET_DIR)/debug
 RELEASE = $(CARGO_TARGET_DIR)/release
 
 # Prefixes of commands. A recipe stops if the library or program is not available.
@@ -25,8 +27,8 @@ help: ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):[^#]*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "  make %-12s %s\n", $$1, $$2 }'
 
 demo: ## simulate a cluttered table, detect grasps with the server, execute the best, draw demo.png
-	$(with_onnxruntime) $(CARGO) build --release --package graspd --package grasp-sim --locked && \
-		$(RELEASE)/grasp-sim demo --graspd $(RELEASE)/graspd --models models/zoo --seed 3 --picture demo.png
+	$(with_onnxruntime) $(CARGO) build --package graspd --package grasp-sim --locked && \
+		$(DEBUG)/grasp-sim demo --graspd $(DEBUG)/graspd --models models/zoo --seed 3 --picture demo.png
 
 build: ## build the server, the simulator and the client, optimised
 	$(CARGO) build --release $(WORKSPACE)
@@ -62,7 +64,7 @@ test-some: ## compile, and run the tests whose names contain NAME: make test-som
 test-ros2: ## test the ROS 2 packages of ros2/ with ROS 2 from PyPI; TEST="-k NAME" selects tests
 	$(with_libtorch) $(CARGO) build --workspace --locked --bins
 	$(with_onnxruntime) GRASPD_ROS2="$$($(PYTHON) tests/tools.py ros2)" && \
-		GRASPD="$(CARGO_TARGET_DIR)/debug/graspd" GRASP_SIM="$(CARGO_TARGET_DIR)/debug/grasp-sim" \
+		GRASPD="$(DEBUG)/graspd" GRASP_SIM="$(DEBUG)/grasp-sim" \
 		"$$GRASPD_ROS2" tests/ros2/run.py $(TEST)
 
 test-faults: ## run the test that `test` excludes: ten thousand connections
