@@ -61,7 +61,7 @@ fn unused(said: &Said) {
     let is_usual = number(said.value).is_some_and(|number| number == 1.0 || number == 1e-3);
     let is_pair = numbers(said.value).is_some_and(|numbers| numbers.len() > 1);
     let is_unit = said.role == Role::UnitLike || said.role == Role::Size && plain(said.key) == "depthresolution";
-    if is_unit && said.distance % 2 == 0 && !is_usual && !is_pair {
+    if is_unit && said.distance.is_multiple_of(2) && !is_usual && !is_pair {
         note(format_args!(
             "`{}` is {}, which is not used; if it is the unit of the depths, give that in metres as --depth-scale",
             said.key,
