@@ -41,8 +41,10 @@ pub struct DepthImage<'a> {
 pub enum Unit {
     /// Metres, or no valid pixel.
     Metres,
-    /// The median is above 20: beyond the range of depth cameras, so probably millimetres.
+    /// The median is from 100 to 10,000: beyond the range of depth cameras, so probably millimetres.
     Millimetres,
+    /// The median is another number above 20.
+    Far,
     /// The median is below 0.02: closer than depth cameras measure, so probably metres divided by 1000.
     Thousandths,
 }
@@ -125,7 +127,8 @@ impl<'a> DepthImage<'a> {
         // Beyond 20 m, some renderers have pixels without a surface; then others are nearer.
         let is_far = sample.iter().filter(|depth| **depth <= 20.0).count() * 20 < count;
         match sample.select_nth_unstable_by(middle, f32::total_cmp).1 {
-            median if *median > 20.0 && is_far => Unit::Millimetres,
+            median if (100.0..=10_000.0).contains(median) && is_far => Unit::Millimetres,
+            median if *median > 20.0 && is_far => Unit::Far,
             median if *median < 0.02 => Unit::Thousandths,
             _ => Unit::Metres,
         }
@@ -180,6 +183,7 @@ mod tests {
         };
         assert_eq!([0.3, 2.0, 0.05].map(unit), [Unit::Metres; 3]);
         assert_eq!([350.0, 1800.0].map(unit), [Unit::Millimetres; 2]);
+        assert_eq!([60.0, 600_000.0].map(unit), [Unit::Far; 2]);
         assert_eq!([0.0006, 0.002].map(unit), [Unit::Thousandths; 2]);
         assert_eq!(unit(0.0), Unit::Metres, "an image without measurements counts as metres");
     }

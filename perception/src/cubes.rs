@@ -361,7 +361,18 @@ impl Cube {
 
 /// The error for a view that sees none of the workspace. It contains the camera's position, which shows wrong poses.
 pub(crate) fn sees_nothing(index: usize, eye: &Point3<f64>, reason: impl Display) -> RequestError {
+    /// Farther from the workspace than any depth camera, metres.
+    const FAR: f64 = 20.0;
     let position = format!("({:.3}, {:.3}, {:.3})", eye.x, eye.y, eye.z);
+    let distance = eye.coords.norm();
+    let reason = if distance > FAR {
+        let unit = if distance > 5.0 * FAR { "looks like millimetres" } else { "may have another unit" };
+        format!(
+            "that is {distance:.0} m away: the position of its pose, or of the workspace, {unit}, must be in metres"
+        )
+    } else {
+        reason.to_string()
+    };
     let reason = format!("camera at {position} in the task frame sees none of the workspace; {reason}");
     RequestError::refused(format!("views[{index}]"), reason)
 }

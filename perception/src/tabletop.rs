@@ -30,7 +30,11 @@ pub struct Tabletop {
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 pub enum NoTabletop {
     /// The image has too few pixels with depth.
-    #[error("only {:.0} % of the image has a depth of at most {DEPTH_MAX} m; a table needs {:.0} %; check the depth unit", share * 100.0, FEWEST * 100.0)]
+    #[error(
+        "{} a depth of at most {DEPTH_MAX} m; a table needs {:.0} % of the image; check the depth unit",
+        if *share > 0.0 { format!("only {:.1} % of the image has", share * 100.0) } else { "no pixel has".to_owned() },
+        FEWEST * 100.0
+    )]
     FewReadings {
         /// Share of the pixels with a depth.
         share: f64,

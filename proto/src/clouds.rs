@@ -1,3 +1,5 @@
+use std::ops::RangeInclusive;
+
 use grasp::RequestError;
 use grasp_perception::Cloud;
 use nalgebra::{Isometry3, Point3};
@@ -9,6 +11,9 @@ use crate::{labels, pb};
 /// Median distance of the points of a cloud from its camera beyond which they are probably not in metres: far beyond
 /// the range of depth cameras.
 const FARTHEST: f64 = 20.0;
+
+/// Distances of millimetres that are read as metres.
+const MILLIMETRES: RangeInclusive<f64> = 100.0..=10_000.0;
 
 const FRAME_FROM_CLOUD: PoseFields =
     PoseFields { position: "frame_from_cloud.position", orientation: "frame_from_cloud.orientation" };
@@ -65,15 +70,19 @@ pub fn cloud(view: &pb::CloudView) -> Result<Cloud, RequestError> {
         finite.map(|(_, label)| label).collect()
     });
     if points.is_empty() {
-        return Err(RequestError::invalid("points", "NaN throughout", "must have at least one finite point"));
+        let reason = format_args!("none of the {} points is finite; at least one must be", all.len());
+        return Err(RequestError::refused("points", reason));
     }
     let eye = frame_from_cloud * Point3::new(x, y, z);
     let distance = median(points.iter().map(|point| (point - eye).norm()));
     if distance > FARTHEST {
-        let reason = format_args!(
-            "the median distance from the camera is {distance:.0} m, so the points look like millimetres: set \
-             `CloudView.scale` to 0.001"
-        );
+        let advice = if MILLIMETRES.contains(&distance) && scale == 1.0 && Point3::new(x, y, z).coords.norm() < FARTHEST
+        {
+            "so the points look like millimetres: set `CloudView.scale` to 0.001"
+        } else {
+            "farther than depth cameras measure: check the depth unit and `camera_position`, which is in metres"
+        };
+        let reason = format_args!("the median distance from the camera is {distance:.0} m, {advice}");
         return Err(RequestError::refused("points", reason));
     }
     Ok(Cloud { points, eye, labels })

@@ -125,13 +125,18 @@ fn image(view: &pb::DepthView) -> Result<DepthImage<'static>, RequestError> {
     let image = DepthImage::new(intrinsics, depth).map_err(|error| RequestError::refused("camera", error))?;
     let refuse = |reason: &str| Err(RequestError::refused("data", reason));
     match (image.unit(), view.unit()) {
-        (DepthUnit::Millimetres, pb::DepthUnit::U16Millimetres | pb::DepthUnit::PngMillimetres) => refuse(
-            "the median depth is above 20,000 mm, farther than depth cameras measure: send 0 for pixels without a reading",
-        ),
+        (DepthUnit::Millimetres | DepthUnit::Far, pb::DepthUnit::U16Millimetres | pb::DepthUnit::PngMillimetres) => {
+            refuse(
+                "the median depth is above 20,000 mm, farther than depth cameras measure: send 0 for pixels without a reading",
+            )
+        }
         (DepthUnit::Millimetres, _) => refuse(
             "the median depth is above 20 m, so the values look like millimetres: send u16 with \
              DEPTH_UNIT_U16_MILLIMETRES, or divide by 1000",
         ),
+        (DepthUnit::Far, _) => {
+            refuse("the median depth is above 20 m, farther than depth cameras measure: check the depth unit")
+        }
         (DepthUnit::Thousandths, pb::DepthUnit::U16Millimetres | pb::DepthUnit::PngMillimetres) => refuse(
             "the median depth is below 20 mm, so the values look like metres: send f32 with DEPTH_UNIT_F32_METRES",
         ),
@@ -371,6 +376,7 @@ mod tests {
         let f32s = |value: f32| [value; 12].iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
         let metres = |value: f32| refused(|v| (v.data, v.unit) = (f32s(value).into(), pb::DepthUnit::F32Metres.into()));
         assert!(metres(500.0).contains("look like millimetres"), "{}", metres(500.0));
+        assert!(metres(60.0).contains("check the depth unit") && metres(6e5).contains("check the depth unit"));
         assert!(metres(0.0005).contains("not divided by 1000 twice"));
         let millimetres =
             refused(|v| v.data = [1_u16; 12].iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>().into());

@@ -195,7 +195,9 @@ def clouds(folder):
     (folder / "nan.xyz").write_text(rows.replace("nan", "-nan"))
     (folder / "header.csv").write_text("index,x,y,z\n" + "".join(f"{i},{x},{y},{z}\n" for i, (x, y, z) in enumerate(valid)))
     (folder / "count.pts").write_text(f"{len(organised)}\n" + rows)
-    more = ["five.npy", "i4_mm.npy", "structured_mm.npy", "minus_nan.ply", "nan.xyz", "header.csv", "count.pts"]
+    cells = [",,,7" if np.isnan(row).any() else f"{row[0]},{row[1]},{row[2]},7" for row in organised]
+    (folder / "empty_cells.csv").write_text("\n".join(["x [m],y [m],z [m],point id", *cells]))
+    more = ["empty_cells.csv", "five.npy", "i4_mm.npy", "structured_mm.npy", "minus_nan.ply", "nan.xyz", "header.csv", "count.pts"]
     names = [*more, "nan.ply", "short_mm.ply", "count0.pcd", "short_mm.pcd", "xyzrgb.npy", "xyz1.npy", "structured.npy"]
     return [(name, ()) for name in [*names, "xyz_rgb.npz", "points.xyz"]] + [("float_mm.ply", ("--cloud-scale", "0.001"))]
 

@@ -90,7 +90,13 @@ class FilesTest(unittest.TestCase):
                 placed = ["--camera-position", "0,0,0", "--frame-from-cloud", "rows.json", WORKSPACE]
                 self.assert_right(self.grasp("detect", name, *placed, *scale, "--origin", "tcp", "--json"))
         placed = ["--camera-position", "0,0,0", "--frame-from-cloud", "rows.json", WORKSPACE]
-        self.assert_refused(self.grasp("detect", "float_mm.ply", *placed), "look like millimetres")
+        self.assert_refused(self.grasp("detect", "float_mm.ply", *placed), "look like millimetres", "(here: --cloud-scale 0.001)")
+        self.assert_refused(self.grasp("table", "float_mm.ply", *placed[:2]), "check the depth unit (here: --cloud-scale")
+        np.save(self.folder / "micrometres_xyz.npy", np.rint(files.POINTS * 1e6).astype(np.int32))
+        micrometres = self.grasp("detect", "micrometres_xyz.npy", *placed)
+        self.assert_refused(micrometres, "read as millimetres most are beyond 100 m; give --cloud-scale")
+        given = self.grasp("detect", "float_mm.ply", *placed, "--cloud-scale", "0.1")
+        self.assert_refused(given, "check the depth unit", "(here: --cloud-scale is 0.1)")
 
     def test_lenses(self):
         """The depth image of a lens with distortion gives the grasps of one without."""
@@ -99,6 +105,11 @@ class FilesTest(unittest.TestCase):
                 np.save(self.folder / "seen.npy", files.distorted(d, model))
                 (self.folder / "lens.yaml").write_text(files.camera_info(d=d, model=model))
                 self.assert_right(self.detect("seen.npy", k="lens.yaml"))
+        # The image is rectified already.
+        self.assertIn("add --rectified", self.detect("depth.png", k="lens.yaml").stderr)
+        result = self.detect("depth.png", "--rectified", k="lens.yaml")
+        self.assert_right(result)
+        self.assertEqual(result.stderr, "")
         (self.folder / "lens.yaml").write_text(files.camera_info(d=[0.1] * 4, model="double_sphere"))
         self.assert_refused(self.detect("depth.png", k="lens.yaml"), "double_sphere")
 
@@ -130,6 +141,11 @@ class FilesTest(unittest.TestCase):
             ({"width": 848, "height": 480, "intrinsics": k}, "of 848 × 480 pixels"),
             ({"cam0": k, "cam1": k | {"fx": 2 * fx}}, "several cameras in the file: cam0, cam1"),
             ({"model": 2, "coeffs": [0.1, 0, 0, 0, 0], **k}, "inverse_brown_conrady"),
+            ({"undistortion": [0.1, 0.2], **k}, "`undistortion` is [0.1,0.2], which may be the distortion"),
+            ({"image_shape": [480, 640], **k}, "of 640 × 480 pixels"),
+            ({"width": 120, "height": 160, **k}, "width and height are exchanged"),
+            ({"K": str(files.K.flatten().tolist())}, "`K` is the text"),
+            ({}, "no intrinsics found: the file has no keys"),
         ]:
             with self.subTest(intrinsics):
                 (self.folder / "doubt.json").write_text(json.dumps(intrinsics))
@@ -145,6 +161,7 @@ class FilesTest(unittest.TestCase):
         documents = [{"camera_matrix": k, "distCoeffs": [d]}, {"K": k, "k1": d[0], "k2": d[1], "p1": d[2], "p2": d[3]}]
         documents += [{"K": k, "distortion": {"k1": d[0], "k2": d[1], "p1": d[2], "p2": d[3]}}]
         documents += [{"distortion": d, "intrinsics": {"K": k}}, {"K": k, "d": list(map(str, d))}]
+        documents += [{"K": k, "RadialDistortion": d[:2], "TangentialDistortion": d[2:4]}, {"K": k, "lens_distortion": d}]
         for document in documents:
             with self.subTest(document):
                 (self.folder / "named.json").write_text(json.dumps(document))
@@ -177,7 +194,8 @@ class FilesTest(unittest.TestCase):
         (self.folder / "cut.npy").write_bytes(whole[: len(whole) // 2])
         self.assert_refused(self.detect("cut.npy"), "cut.npy: the file is cut short")
         files.pickled(self.folder / "dict.npy")
-        self.assert_refused(self.detect("dict.npy"), "pickled", "save")
+        self.assert_refused(self.detect("dict.npy"), "pickled", 'numpy.save(FILE, data["depth"])')
+        self.assert_refused(self.detect("depth.png", k="dict.npy"), "pickled", 'numpy.save(FILE, data["K"])')
         for name, content in NAMED.items():
             (self.folder / "file").write_bytes(content)
             with self.subTest(name):

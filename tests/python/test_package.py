@@ -24,6 +24,7 @@ import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from pathlib import Path
+from unittest.mock import patch
 from xml.etree import ElementTree
 
 import grpc
@@ -44,7 +45,7 @@ sys.path.insert(0, INSTALLED.name)
 import graspd
 import graspd.aio
 from graspd import grasp_pb2, wire
-from graspd.connection import with_port
+from graspd.connection import proxied, with_port
 
 CAMERAS = [scene.camera(30, -90), scene.camera(40, 90)]
 LOW = graspd.Options(threshold=0.5)
@@ -339,6 +340,19 @@ class DetectTest(ServerTest):
         command = [sys.executable, "-c", code, self.server.grpc]
         run = subprocess.run(command, env=environment, capture_output=True, text=True)
         self.assertEqual(run.stdout.split()[:2], ["True", "graspd.aio"], run.stderr)
+        for address in ["LOCALHOST:50051", "0.0.0.0:50051", "127.0.0.1:50051", "unix:/run/graspd.sock"]:
+            with self.subTest(address), patch.dict(os.environ, {"http_proxy": "http://127.0.0.1:9"}):
+                self.assertEqual(proxied(address), "")
+        for variables, expected in [
+            ({"http_proxy": "http://user:secret@127.0.0.1:9"}, "proxy 127.0.0.1:9 of the variable http_proxy.* no_proxy=192.0.2.1$"),
+            ({"https_proxy": "http://127.0.0.1:9", "no_proxy": "robot,192.0.3.0/24"}, "the variable https_proxy"),
+            ({"http_proxy": "http://127.0.0.1:9", "no_proxy": "192.0.2.0/24"}, "^$"),
+        ]:
+            with self.subTest(variables), patch.dict(os.environ, variables, clear=True):
+                self.assertRegex(proxied("192.0.2.1:50051"), expected)
+                client = graspd.Client("192.0.2.1:50051", retry=graspd.Retry.NONE, timeout=5)
+                with client, self.assertRaisesRegex(graspd.Error, expected.lstrip("^")):
+                    client.health()
         self.assertIn(f'version = "{run.stdout.split()[2]}"', (PACKAGE / "pyproject.toml").read_text())
 
     def test_wrong_geometry_is_reported_and_logged_once(self):
@@ -573,6 +587,9 @@ class ErrorsTest(ServerTest):
             (lambda: self.client.detect_from_cloud([view]), "views is .*, must be a graspd.CloudView"),
             (lambda: self.client.detect_from_depth(view, request_id=3), "request_id is 3, must be a text"),
             (lambda: graspd.Options(model=3), "Options.model is 3, must be a text"),
+            (lambda: graspd.DepthView(view.depth, {"fx": 1}, camera_from_task=CAMERAS[0]), "k is .*, must be a 3 × 3 matrix or"),
+            (lambda: self.client.detect_from_depth(replace(view, camera_from_task="c.json")), "camera_from_task: a pose is 'c.json'"),
+            (lambda: self.client.detect(graspd.Volume(scene.volume(*CAMERAS), pose=((0, 0, 0), (0, 0, 0, 1)))), "Volume.pose: a pose is"),
             (lambda: graspd.Options(explain="no"), "Options.explain is 'no', must be True or False"),
             (lambda: graspd.CollisionCheck(hidden="yes"), "CollisionCheck.hidden is 'yes', must be True or False"),
         ]:
@@ -583,6 +600,8 @@ class ErrorsTest(ServerTest):
             (lambda: graspd.CollisionCheck(clearance=-1), "CollisionCheck.clearance is -1, must not be negative"),
             (lambda: graspd.CloudView(np.ones((5, 3)), None), "camera_position is None, must be x, y, z"),
             (lambda: graspd.Picture("<svg/>").save("p.png"), "p.png: the picture is SVG"),
+            (lambda: graspd.Camera(scene.K, size=320), "size is 320, must be the width and the height"),
+            (lambda: graspd.Camera(scene.K, depth_scale="mm"), "depth_scale is 'mm', must be the unit"),
         ]:
             with self.subTest(message), self.assertRaisesRegex(ValueError, message):
                 make()
@@ -1018,9 +1037,11 @@ class CameraTest(ServerTest):
         k, d = [540, 0, 320, 0, 541, 240, 0, 0, 1], [-0.28, 0.09, 0, 0, 0]
         named = dict(zip(["k1", "k2", "p1", "p2"], d))
         sizes = [{"w": 848, "h": 480}, {"image_size": [848, 480]}, {"resolution": {"width": 848, "height": 480}}]
+        sizes += [{"rows": 480, "cols": 848}, {"image_shape": [480, 848, 3]}, {"frame_size": [848, 480]}, {"width_px": 848, "height_px": 480}]
         sizes += [{"width": "848", "height": "480"}, {"image_Width": 848, "image_Height": 480}, {"image": {"width": 848, "height": 480}}]
         names = "d dist distCoeffs dist_coefs distortion distortion_coeff Distortion_Coefficients coeffs kc".split()
         lenses = [{name: [d]} for name in names] + [named, {"distortion": named}, {"coeffs": named}, {"d": list(map(str, d))}]
+        lenses += [{"lens_distortion": d}, {"RadialDistortion": d[:2], "TangentialDistortion": [0, 0]}]
         units = [{"depth_scale": "0.0005"}, {"depthScale": 0.0005}, {"factor_depth": [[2000]]}, {"DepthMapFactor": 2000}]
         for part in [*sizes, *lenses, *units]:
             for document in [fx | part, {"K": k} | part, part | {"intrinsics": fx}]:
@@ -1039,7 +1060,10 @@ class CameraTest(ServerTest):
             (fx | {"model": 2, "coeffs": d}, "inverse_brown_conrady"),
             (fx | {"d": "<sequence>"}, "`d` is '<sequence>', must be the numbers of the distortion"),
             (fx | {"distortion": {"a": 1}}, "`distortion` is .*, must be the numbers"),
-            (fx | {"depth_scale": 0}, "`depth_scale` is 0, must be above 0"),
+            (fx | {"depth_scale": 0}, "`depth_scale` is 0, must be the unit of the depths"),
+            (fx | {"rad_dist": [0.1, 0.2]}, r"`rad_dist` is \[0.1, 0.2\], which may be the distortion"),
+            ({"K": str(k)}, "`K` is the text"),
+            ({}, "no intrinsics found: the file has no keys"),
             (fx | {"k1": 1, "k2": 1, "k3": 1, "k4": 1}, "name its `distortion_model`"),
             ({"focal": 540}, "no intrinsics found; keys in the file: focal$"),
         ]:
@@ -1085,11 +1109,17 @@ class CameraTest(ServerTest):
         info = self.INFO | {"d": [0.1] * 5, "p": [100.0, 0, 80, 0, 0, 100, 60, 0, 0, 0, 1, 0]}
         rectified = graspd.Camera.from_info(info, rectified=True)
         self.assertEqual((rectified.k[0, 0], tuple(rectified.distortion)), (100.0, ()))
+        without = graspd.Camera.from_info(self.INFO | {"d": [0.1] * 5}, rectified=True)
+        self.assertEqual((without.k[0, 0], tuple(without.distortion)), (scene.K[0, 0], ()))
 
     def test_contradictions_are_refused(self):
         camera = graspd.Camera.from_info(self.INFO)
         with self.assertRaisesRegex(ValueError, r"of 160 × 120 pixels, the image has 80 × 60; .* 67.5, 67.5, 39.75, 29.75"):
             graspd.DepthView(np.ones((60, 80)), camera)
+        with self.assertRaisesRegex(ValueError, "width and height are exchanged"):
+            graspd.DepthView(np.ones((160, 120)), camera)
+        with self.assertRaisesRegex(ValueError, "has a binning of 2 × 2; if the image is not binned"):
+            graspd.DepthView(np.ones((120, 160)), graspd.Camera.from_info(self.INFO | {"binning_x": 2, "binning_y": 2}))
         with self.assertRaisesRegex(ValueError, "has 160 × 100; if the image was cropped"):
             graspd.DepthView(np.ones((100, 160)), camera)
         for wrong, message in [
@@ -1140,6 +1170,9 @@ class PoseTest(unittest.TestCase):
                 warnings.simplefilter("ignore")
                 pose = graspd.Pose.from_matrix(matrix)
             self.assertLess((Rotation.from_quat(pose.quaternion) * rotation.inv()).magnitude(), 2e-3)
+        with self.assertWarnsRegex(UserWarning, "few decimals"):
+            sent = wire.pose_message(graspd.Pose(quaternion=(0, 0, 0.991, 0)))
+        self.assertEqual(sent.orientation.z, 1)
         coarse = np.eye(4)
         coarse[0, 0] = 1.002
         with self.assertWarnsRegex(UserWarning, "few decimals"):
@@ -1147,15 +1180,16 @@ class PoseTest(unittest.TestCase):
 
     def test_invalid_matrices_are_rejected(self):
         pose = Rotation.from_euler("xyz", [0.1, 0.2, 0.3])
-        for break_matrix in [
-            lambda matrix: 2 * matrix,
-            lambda matrix: matrix * np.nan,
-            lambda matrix: matrix[[1, 0, 2, 3]],
-            lambda matrix: matrix + np.eye(4)[:, [1, 2, 0, 3]],
+        for break_matrix, reason in [
+            (lambda matrix: 2 * matrix, ""),
+            (lambda matrix: matrix * np.nan, ""),
+            (lambda matrix: matrix[[1, 0, 2, 3]], ".*it mirrors"),
+            (lambda matrix: matrix + np.eye(4)[:, [1, 2, 0, 3]], ""),
+            (lambda matrix: matrix.T + np.outer(np.eye(4)[3], [1, 2, 3, 0]), ".*row by row"),
         ]:
             matrix = np.eye(4)
             matrix[:3, :3] = pose.as_matrix()
-            with self.assertRaisesRegex(ValueError, "a rotation and a translation"):
+            with self.assertRaisesRegex(ValueError, "a rotation and a translation" + reason):
                 graspd.Pose.from_matrix(break_matrix(matrix))
 
 

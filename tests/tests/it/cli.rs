@@ -827,6 +827,41 @@ fn files_of_other_tools_are_read_and_contradictions_refused() {
         ),
     );
     refused(detect("mm.png", &fisheye, &pose, &[]), "double_sphere");
+
+    let lens = file(
+        "lens.json",
+        format!(
+            r#"{{"K": [{fx}, 0, {cx}, 0, {fx}, {cy}, 0, 0, 1], "D": [0.1, 0, 0, 0, 0], "mm_per_unit": 0.5,
+                 "P": [{fx}, 0, {cx}, 0, 0, {fx}, {cy}, 0, 0, 0, 1, 0]}}"#
+        ),
+    );
+    let noted = detect("mm.png", &lens, &pose, &[]);
+    for note in [
+        "lens.json: images of this camera are rectified with plumb_bob (0.1, 0, 0, 0, 0)",
+        "add --rectified",
+        "lens.json: `mm_per_unit` is 0.5, which is not used",
+    ] {
+        assert!(text(&noted.stderr).contains(note), "{note}: {noted:?}");
+    }
+    assert_eq!(qualities(detect("mm.png", &lens, &pose, &["--rectified"])), expected);
+    refused(detect("mm.png", "300,300,160", &pose, &[]), "it has 3 numbers; must be a file, the numbers FX,FY,CX,CY");
+    refused(detect("mm.png", &k, "0,0", &[]), "it has 2 numbers; must be a file, or the numbers X,Y,Z or");
+    refused(detect("mm.png", &k, "0,-250,620", &[]), "of its pose, or of the workspace, looks like millimetres");
+    refused(detect("mm.png", &k, &pose, &["--depth-scale", "-1"]), "must be above 0");
+    refused(detect("mm.png", "-135,135,80,60", &pose, &[]), "views[0].camera.k is");
+    refused(detect("mm.png", &k, &pose, &["--labels", &path("depth.jpg")]), "changes the values; save PNG or .npy");
+    write_png(&path("mask.png"), metres.iter().map(|_| 255));
+    let mask = path("mask.png");
+    let labels = "--objects 1,2: not in --labels; labels there: 255";
+    refused(detect("mm.png", &k, &pose, &["--labels", &mask, "--objects", "1,2"]), labels);
+    let whole = npyz::WriteOptions::new().default_dtype().shape(&shape);
+    let mut whole = whole.writer(File::create(path("f32.npy")).unwrap()).begin_nd().unwrap();
+    whole.extend(metres.iter().map(|metres| metres * 1e3)).unwrap();
+    whole.finish().unwrap();
+    refused(detect("f32.npy", &k, &pose, &[]), "look like millimetres: ");
+    refused(detect("f32.npy", &k, &pose, &[]), "(here: --depth-scale 0.001)");
+    let given = detect("f32.npy", &k, &pose, &["--depth-scale", "0.1"]);
+    refused(given, "farther than depth cameras measure: check the depth unit (here: --depth-scale is 0.1)");
 }
 
 #[tokio::test]

@@ -692,7 +692,7 @@ async fn the_table_is_found_in_the_first_view() {
     let nowhere = FindTable { gravity: Some([0.0; 3]) };
     refused(&views[..1], nowhere, "workspace.gravity is (0, 0, 0), must be finite and of a length above 0").await;
     let nothing = DepthView { depth: Depth::Metres(vec![0.0; 160 * 120]), ..views[0].clone() };
-    refused(&[nothing], any, "views[0].data: only 0 % of the image has a depth").await;
+    refused(&[nothing], any, "views[0].data: no pixel has a depth of at most 2 m").await;
 }
 
 #[tokio::test]

@@ -64,6 +64,22 @@ async fn web_pages_and_unknown_encodings_are_refused() {
 }
 
 #[tokio::test]
+async fn a_compressed_body_that_is_cut_short_is_refused() {
+    let server = Server::run(&[TestModel::new("mirror")], &["--rest", "127.0.0.1:0"]);
+    // `{}` in the zlib format.
+    let whole = b"\x78\x9c\xab\xae\x05\x00\x01\x75\x00\xf9";
+    for (length, reason) in [(whole.len(), "inputs"), (whole.len() - 2, "it is cut short"), (4, "it is cut short")] {
+        let mut stream = TcpStream::connect(server.rest().unwrap()).await.unwrap();
+        let head =
+            format!("Host: graspd\r\nConnection: close\r\nContent-Encoding: deflate\r\nContent-Length: {length}");
+        stream.write_all(format!("POST {INFER} HTTP/1.1\r\n{head}\r\n\r\n").as_bytes()).await.unwrap();
+        stream.write_all(&whole[..length]).await.unwrap();
+        let (status, body) = response(stream).await;
+        assert!(status == 400 && body.contains(reason), "{status} {body}");
+    }
+}
+
+#[tokio::test]
 async fn unknown_paths_and_methods_have_an_error_as_a_body() {
     let server = Server::run(&[TestModel::new("mirror")], &["--rest", "127.0.0.1:0"]);
     for (path, status, reason) in [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterable, AsyncIterator, Iterable
+from collections.abc import AsyncIterable, AsyncIterator, Callable, Iterable
 from contextlib import suppress
 from typing import Any
 
@@ -16,7 +16,7 @@ from graspd import grasp_pb2 as pb
 from graspd import methods, wire
 from graspd.connection import ChannelOptions, Connection, positive
 from graspd.detection import Detection, FoundTable, Grasp, Model, Scores
-from graspd.errors import DeadlineExceeded, Error, Unavailable, from_status
+from graspd.errors import DeadlineExceeded, Error, Unavailable
 from graspd.geometry import PoseLike
 from graspd.methods import Answer, Method, Request, Response
 from graspd.options import Candidate, Options
@@ -104,7 +104,7 @@ class Client(Connection[grpc.aio.Channel]):
             async for reply in replies:
                 yield detecting.answer(reply)
         except grpc.RpcError as status:
-            raise from_status(status) from None
+            raise self._failure(status) from None
         finally:
             replies.cancel()
         detecting.end()
@@ -113,7 +113,7 @@ class Client(Connection[grpc.aio.Channel]):
         """Opens a tracked volume for a moving camera. For a scene that moves: with `half_life` the weight of a measurement
         halves after `half_life` further measurements, and with each one that contradicts it; 10 suits most scenes.
         None: all views have the same weight."""
-        return Tracking(self._stream(methods.TRACK), workspace, half_life)
+        return Tracking(self._stream(methods.TRACK), workspace, half_life, self._failure)
 
     async def score(
         self,
@@ -193,7 +193,7 @@ class Client(Connection[grpc.aio.Channel]):
             try:
                 return method.answer(await call(request, timeout=limit, metadata=self._metadata))
             except grpc.RpcError as status:
-                error = from_status(status)
+                error = self._failure(status)
             attempts += 1
             pause = self._retry.after(attempts, error)
             if pause is None:
@@ -215,8 +215,10 @@ class Tracking:
         stream: grpc.aio.StreamStreamCall[pb.TrackGraspsRequest, pb.DetectGraspsStreamResponse],
         workspace: Workspace,
         half_life: float | None,
+        failure: Callable[[grpc.RpcError], Error],
     ) -> None:
         self._adding = Adding(workspace, half_life)
+        self._failure = failure
         self._stream = stream
 
     async def __aenter__(self) -> Tracking:
@@ -246,5 +248,5 @@ class Tracking:
                 await self._stream.write(request)
             reply = await self._stream.read()
         except grpc.RpcError as status:
-            raise from_status(status) from None
+            raise self._failure(status) from None
         return self._adding.answer(reply if isinstance(reply, pb.DetectGraspsStreamResponse) else None)

@@ -8,6 +8,7 @@ wrong without a word. `grasp` reads files by the same rules.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
@@ -15,6 +16,8 @@ from typing import Any, TypeVar
 from graspd.document import listed, number, numbers, plain, short
 
 Read = TypeVar("Read")
+
+NUMBER = r"(?<![\w.])[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?(?![\w.])"
 
 logger = logging.getLogger("graspd")
 
@@ -35,11 +38,23 @@ NAMES: dict[str, tuple[str, ...]] = {
     "fy": ("fy", "fly"),
     "cx": ("cx", "ppx", "xoffset"),
     "cy": ("cy", "ppy", "yoffset"),
-    "width": ("width", "imagewidth", "imgwidth", "imwidth", "w"),
-    "height": ("height", "imageheight", "imgheight", "imheight", "h"),
-    "size": ("imagesize", "imgsize", "imsize", "resolution", "imageresolution", "size"),
+    "width": (
+        "width", "imagewidth", "imgwidth", "imwidth", "w", "widthpx", "framewidth", "sensorwidth", "cols", "columns", "ncols",
+        "numcols", "imagecols", "resx", "xres", "resolutionx",
+    ),
+    "height": (
+        "height", "imageheight", "imgheight", "imheight", "h", "heightpx", "frameheight", "sensorheight", "rows", "nrows",
+        "numrows", "imagerows", "resy", "yres", "resolutiony",
+    ),
+    "size": (
+        "imagesize", "imgsize", "imsize", "framesize", "size", "resolution", "imageresolution", "imgres", "res",
+        "sensorresolution", "depthresolution",
+    ),
+    "shape": ("shape", "imageshape", "imgshape", "frameshape"),
     "distortion model": ("distortionmodel", "distortiontype", "distmodel", "disttype"),
-    "distortion": ("d", "coeffs", "coefficients"),
+    "distortion": ("d", "coeffs", "coefficients", "coeff", "coefs", "coef", "lensdistortion", "cameradistortion"),
+    "radial": ("radialdistortion", "radial"),
+    "tangential": ("tangentialdistortion", "tangential"),
     "camera model": ("model", "cameramodel", "lensmodel"),
     "fisheye": ("fisheye", "isfisheye"),
     "unit": ("scale",),
@@ -55,9 +70,19 @@ def role_of(key: Any) -> str | None:
         return ROLES[name]
     if name.startswith("dist") and not name.startswith("distance") or name.startswith("kc"):
         return "distortion"
-    if "depth" in name and "factor" in name or name == "pngdepthscale":
+    if "dist" in name and "distance" not in name or "radial" in name or "tangential" in name:
+        return "doubtful"
+    if "depth" in name and "factor" in name or name == "pngdepthscale" or "unitspermet" in name:
         return "units per metre"
-    return "unit" if "depth" in name and ("scal" in name or "unit" in name) else None
+    if "depth" in name and ("scal" in name or "unit" in name):
+        return "unit"
+    return "unit-like" if is_unit_like(name) else None
+
+
+def is_unit_like(name: str) -> bool:
+    """Whether a key may be a unit of depths under a name that is not known."""
+    of_depth = "depth" in name and (name.endswith(("tom", "tomm", "2m", "2mm")) or "step" in name or "lsb" in name)
+    return of_depth or "perunit" in name or name in ("unit", "units", "zscale", "zunit", "zfactor", "scalefactor")
 
 
 @dataclass(frozen=True)
@@ -70,6 +95,7 @@ class Found:
     distortion: tuple[float, ...]
     distortion_model: str
     depth_scale: float | None
+    binning: tuple[int, int] = (1, 1)
 
 
 @dataclass(frozen=True)
@@ -83,9 +109,10 @@ class Said:
     """Steps to the object of the camera: even for it and those around it, odd for what else these contain."""
 
 
-def find(document: Any) -> Found:
-    """The camera of a document, which may also be bare numbers."""
-    found = list(walk(document, "", ()))
+def find(document: Any, rectified: bool = False) -> Found:
+    """The camera of a document, which may also be bare numbers. `rectified`: that of its rectified images, which have the
+    projection matrix, if there is one, and no distortion."""
+    found = list(walk(document, "", (), rectified))
     if any(camera != found[0][1] for _, camera in found):
         depths = [(path, camera) for path, camera in found if any(plain(key).startswith("depth") for key in path.split("."))]
         names = listed([path for path, _ in found])
@@ -100,24 +127,26 @@ def find(document: Any) -> Found:
     bare = numbers(only) or []
     if len(bare) < 4:
         keys = f"; keys in the file: {listed(list(document))}" if isinstance(document, Mapping) else ""
+        keys = ": the file has no keys" if document == {} else keys
         raise ValueError(f"no intrinsics found{keys}")
-    return camera_of(checked(matrix_of(bare)), ())
+    return camera_of(checked(matrix_of(bare)), (), rectified)
 
 
-def walk(value: Any, path: str, around: tuple[Said, ...]) -> Iterable[tuple[str, Found]]:
+def walk(value: Any, path: str, around: tuple[Said, ...], rectified: bool) -> Iterable[tuple[str, Found]]:
     if isinstance(value, list):
         for index, inner in enumerate(value):
             if has_camera(inner):
-                yield from walk(inner, f"{path}[{index}]", around)
+                yield from walk(inner, f"{path}[{index}]", around, rectified)
     if not isinstance(value, Mapping):
         return
     said = (*collect(value, 0), *(replace(outer, distance=outer.distance + 2) for outer in around))
-    k = intrinsics_of(value)
+    projection = projection_of(value) if rectified else None
+    k = intrinsics_of(value) if projection is None else checked(projection)
     if k is not None:
-        yield path or "the file itself", windowed(camera_of(k, said), value)
+        yield path or "the file itself", windowed(camera_of(k, said, rectified), value)
     for key, inner in value.items():
         if has_camera(inner):
-            yield from walk(inner, f"{path}.{key}" if path else str(key), said)
+            yield from walk(inner, f"{path}.{key}" if path else str(key), said, rectified)
 
 
 def has_camera(value: Any) -> bool:
@@ -129,8 +158,13 @@ def has_camera(value: Any) -> bool:
 def names_camera(key: Any, value: Any) -> bool:
     role = role_of(key)
     if role in ("matrix", "projection"):
-        return len(numbers(value) or ()) >= 4
+        return is_quoted(value) or len(numbers(value) or ()) >= 4
     return role == "fx" and number(value) is not None
+
+
+def is_quoted(value: Any) -> bool:
+    """Whether a text has the numbers of a matrix."""
+    return isinstance(value, str) and re.match(r"\s*[-\[\d]", value) is not None and len(re.findall(NUMBER, value)) >= 4
 
 
 def collect(value: Mapping[str, Any], distance: int) -> Iterable[Said]:
@@ -143,6 +177,9 @@ def collect(value: Mapping[str, Any], distance: int) -> Iterable[Said]:
         # A quaternion has w alone, and a region of interest its own size.
         if role in EDGES and len(plain(key)) == 1 and not {"w", "h"} <= names:
             continue
+        # Matrices and boards have rows and columns too.
+        if role in EDGES and plain(key).endswith(("rows", "cols", "columns")) and ("data" in names or distance % 2 == 1):
+            continue
         if isinstance(inner, Mapping):
             if key == "roi" or has_camera(inner) or role in ("matrix", "projection"):
                 continue
@@ -154,7 +191,7 @@ def collect(value: Mapping[str, Any], distance: int) -> Iterable[Said]:
                 yield from collect(inner, distance | 1)
             else:
                 yield Said(role, key, inner, distance)
-        elif role == "distortion" and isinstance(inner, str) and plain(inner) in POLYNOMIAL + FISHEYE:
+        elif role in ("distortion", "doubtful") and isinstance(inner, str) and plain(inner) in POLYNOMIAL + FISHEYE:
             yield Said("distortion model", key, inner, distance)
         elif role is not None:
             yield Said(role, key, inner, distance)
@@ -166,7 +203,7 @@ def lens(key: str, value: Mapping[str, Any], distance: int) -> Iterable[Said]:
     own |= {"parameters": "distortion", "values": "distortion", "params": "distortion"}
     roles = [(own.get(plain(inner), role_of(inner)), inner) for inner in value]
     yield from (Said(role, inner, value[inner], distance) for role, inner in roles if role is not None)
-    if not any(role in ("distortion", *COEFFICIENTS) for role, _ in roles):
+    if not any(role in ("distortion", "radial", "tangential", *COEFFICIENTS) for role, _ in roles):
         yield Said("distortion", key, value, distance)
 
 
@@ -185,18 +222,31 @@ def nearest(said: Iterable[Said], role: str, read: Callable[[Said], Read | None]
     return None if found is None else found[1]
 
 
-def camera_of(k: tuple[float, ...], said: Iterable[Said]) -> Found:
+def camera_of(k: tuple[float, ...], said: Iterable[Said], rectified: bool) -> Found:
     said = tuple(said)
     edges = (nearest(said, "width", edge), nearest(said, "height", edge))
-    size = nearest(said, "size", size_of) or edges
+    size = nearest(said, "size", size_of) or nearest(said, "shape", size_of) or edges
     if any(one is not None and one != other for one, other in zip(edges, size)):
         raise ValueError(f"two sizes of the images: {edges} and {size}")
-    coefficients, model = lens_of(said)
+    coefficients, model = ((), "plumb_bob") if rectified else lens_of(said)
     scales = [nearest(said, role, unit) for role in ("unit", "units per metre")]
     scale = next((scale for scale in scales if scale is not None), None)
     if None not in scales and scales[0] != scales[1]:
         raise ValueError(f"two units of the depths: {scales[0]} m and {scales[1]} m")
+    if scale is None:
+        for one in filter(is_unused_unit, said):
+            logger.warning(
+                "`%s` is %s, which is not used; if it is the unit of the depths, give that in metres as depth_scale of the Camera",
+                one.key,
+                short(one.value),
+            )
     return Found(k, None if size == (None, None) else size, coefficients, model, scale)
+
+
+def is_unused_unit(said: Said) -> bool:
+    is_pair = len(numbers(said.value) or ()) > 1
+    is_unit = said.role == "unit-like" or plain(said.key) == "depthresolution"
+    return is_unit and said.distance % 2 == 0 and not is_pair and number(said.value) not in (1.0, 1e-3)
 
 
 def whole(value: float | None) -> int | None:
@@ -205,6 +255,9 @@ def whole(value: float | None) -> int | None:
 
 def edge(said: Said) -> int | None:
     pixels = whole(number(said.value))
+    if plain(said.key).startswith("sensor") and (pixels is None or pixels < 100):
+        # Millimetres of a chip.
+        return None
     # ROS has 0 where the size is unknown.
     if pixels is None and said.distance % 2 == 0 and number(said.value) != 0:
         raise ValueError(f"`{said.key}` is {short(said.value)}, must be a number of pixels")
@@ -214,10 +267,12 @@ def edge(said: Said) -> int | None:
 def size_of(said: Said) -> tuple[int | None, int | None] | None:
     value = said.value.lower().replace("×", "x").split("x") if isinstance(said.value, str) else said.value
     edges = [whole(edge) for edge in numbers(value) or ()]
-    if len(edges) == 2 and None not in edges:
+    if said.role == "shape" and len(edges) in (2, 3) and None not in edges:
+        return edges[1], edges[0]
+    if said.role == "size" and len(edges) == 2 and None not in edges:
         return edges[0], edges[1]
-    # The edge of a workspace, or what another object says of itself.
-    if plain(said.key) == "size" or said.distance % 2 == 1:
+    # The edge of a workspace, the shape of a thing, a unit, or what another object says of itself.
+    if plain(said.key) in ("size", "shape", "res", "depthresolution") or said.distance % 2 == 1:
         return None
     raise ValueError(f"`{said.key}` is {short(said.value)}, must be the width and the height in pixels")
 
@@ -230,7 +285,7 @@ def lens_of(said: tuple[Said, ...]) -> tuple[tuple[float, ...], str]:
         found = [] if is_none else numbers(said.value)
         if found is None:
             raise ValueError(
-                f"`{said.key}` is {short(said.value)}, must be the numbers of the distortion; remove it if the image is rectified"
+                f"`{said.key}` is {short(said.value)}, must be the numbers of the distortion; for rectified images give rectified=True"
             )
         return tuple(found)
 
@@ -242,6 +297,14 @@ def lens_of(said: tuple[Said, ...]) -> tuple[tuple[float, ...], str]:
 
     listed = nearest(said, "distortion", coefficients)
     named = {name: nearest(said, name, coefficient) for name in COEFFICIENTS}
+    for role, names in [("radial", ("k1", "k2", "k3")), ("tangential", ("p1", "p2"))]:
+        part = nearest(said, role, part_of)
+        for name, value in zip(names, part or ()):
+            if named[name] not in (None, value):
+                raise ValueError("the distortion is in the file twice, with different numbers")
+            named[name] = value
+    for one in said:
+        check_doubtful(one)
     models = (nearest(said, role, model_of) for role in ("distortion model", "fisheye", "camera model"))
     model = next((model for model in models if model is not None), None)
     if all(value is None for value in named.values()):
@@ -255,6 +318,38 @@ def lens_of(said: tuple[Said, ...]) -> tuple[tuple[float, ...], str]:
     if listed is not None and (*listed, *[0.0] * (8 - len(listed)))[: len(of_names)] != of_names:
         raise ValueError("the distortion is in the file twice, with different numbers")
     return (listed or of_names, model or "plumb_bob")
+
+
+def part_of(said: Said) -> tuple[float, ...] | None:
+    """The radial or the tangential part of a distortion, as MATLAB has it."""
+    found = numbers(said.value)
+    most, parts = (3, "k1, k2 and k3") if said.role == "radial" else (2, "p1 and p2")
+    if found is not None and 2 <= len(found) <= most:
+        return tuple(found)
+    if found is None or any(found):
+        raise ValueError(f"`{said.key}` is {short(said.value)}, must be {parts} of the distortion")
+    return None
+
+
+def check_doubtful(said: Said) -> None:
+    """Refuses what may be a distortion under another name."""
+    found = all_numbers(said.value) if said.role == "doubtful" else []
+    # A single number may be a distance.
+    if any(found) and (len(found) > 1 or "distort" in plain(said.key)):
+        raise ValueError(
+            f"`{said.key}` is {short(said.value)}, which may be the distortion of the lens: name it `distortion_coefficients`, "
+            "and its model `distortion_model`; for rectified images give rectified=True"
+        )
+
+
+def all_numbers(value: Any) -> list[float]:
+    """The numbers in lists and objects of any depth."""
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    if isinstance(value, list):
+        return [number for inner in value for number in all_numbers(inner)]
+    found = number(value)
+    return [] if found is None else [found]
 
 
 def model_of(said: Said) -> str | None:
@@ -271,7 +366,9 @@ def unit(said: Said) -> float | None:
     """The unit of integer depths, metres."""
     value = number(said.value)
     if value is None:
-        texts = {"m": 1.0, "metres": 1.0, "meters": 1.0, "mm": 1e-3, "millimetres": 1e-3, "millimeters": 1e-3}
+        prefixes = {"": 1.0, "centi": 1e-2, "milli": 1e-3, "micro": 1e-6}
+        texts = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
+        texts |= {p + unit: scale for p, scale in prefixes.items() for unit in ("metre", "metres", "meter", "meters")}
         scale = texts.get(plain(said.value)) if isinstance(said.value, str) else None
     elif plain(said.key) == "scale" and 0.02 <= value < 50:
         # Scales an image or a scene.
@@ -285,7 +382,9 @@ def unit(said: Said) -> float | None:
         return scale
     if said.distance % 2 == 1:
         return None
-    raise ValueError(f"`{said.key}` is {short(said.value)}, must be above 0: the unit of the depths, metres")
+    raise ValueError(
+        f"`{said.key}` is {short(said.value)}, must be the unit of the depths: a number of metres above 0, or m, cm, mm or um"
+    )
 
 
 def intrinsics_of(value: Mapping[str, Any]) -> tuple[float, ...] | None:
@@ -299,6 +398,8 @@ def intrinsics_of(value: Mapping[str, Any]) -> tuple[float, ...] | None:
             found.append((key, named_matrix(key, of_key)))
         elif of_key is None and isinstance(inner, list) and not any(isinstance(part, Mapping) for part in inner):
             raise ValueError(f"`{key}` is {short(inner)}, must be numbers")
+        elif is_quoted(inner):
+            raise ValueError(f"`{key}` is the text {short(inner)}, must be numbers without quotes")
     plains = {plain(key): key for key in reversed(list(value))}
     keys = [next((plains[name] for name in NAMES[role] if name in plains), None) for role in INTRINSICS]
     if None not in keys:
@@ -308,15 +409,21 @@ def intrinsics_of(value: Mapping[str, Any]) -> tuple[float, ...] | None:
                 raise ValueError(f"`{name}` is {short(value[name or ''])}, must be a number")
         found.append((str(keys[0]), matrix_of([part or 0.0 for part in parts])))
     if not found:
-        for key, inner in value.items():
-            if role_of(key) == "projection" and len(numbers(inner) or ()) == 12:
-                found.append((key, named_matrix(key, numbers(inner) or [])))
-    if not found:
-        return None
+        projection = projection_of(value)
+        return None if projection is None else checked(projection)
     for key, other in found:
         if any(abs(one - two) > 1e-3 for one, two in zip(found[0][1], other)):
             raise ValueError(f"`{found[0][0]}` and `{key}` are different intrinsics")
     return checked(found[0][1])
+
+
+def projection_of(value: Mapping[str, Any]) -> tuple[float, ...] | None:
+    """The matrix of the projection matrix of an object."""
+    for key, inner in value.items():
+        found = numbers(inner) if role_of(key) == "projection" else None
+        if found is not None and len(found) == 12:
+            return named_matrix(key, found)
+    return None
 
 
 def named_matrix(key: str, found: list[float]) -> tuple[float, ...]:
@@ -366,4 +473,5 @@ def windowed(camera: Found, info: Mapping[str, Any]) -> Found:
     cx, cy = ((centre - first + 0.5) / bins - 0.5 for centre, first, bins in zip((cx, cy), offset, binning))
     k = (fx / binning[0], 0.0, cx, 0.0, fy / binning[1], cy, 0.0, 0.0, 1.0)
     sizes = [None if edge is None else (crop or edge) // bins for edge, crop, bins in zip(camera.size or (None, None), cropped, binning)]
-    return replace(camera, k=k, size=(sizes[0], sizes[1]) if any(sizes) else None)
+    size = (sizes[0], sizes[1]) if any(sizes) else None
+    return replace(camera, k=k, size=size, binning=(binning[0], binning[1]))

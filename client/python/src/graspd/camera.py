@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
+from numbers import Real
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.calibration import FISHEYE, POLYNOMIAL, find, whole
-from graspd.document import number, numbers, plain, read
+from graspd.document import number, numbers, plain, read, short
 
 COUNTS = (4, 5, 8, 12)
 """Numbers of the coefficients of `plumb_bob`, `rational_polynomial` and its form with thin prisms, in OpenCV's order."""
@@ -21,7 +22,8 @@ COUNTS = (4, 5, 8, 12)
 @dataclass(frozen=True, eq=False)
 class Camera:
     """The intrinsics of a camera, the size of its images and the distortion of its lens: `DepthView.k` in place of a matrix.
-    Images of another size are refused, and distorted ones are rectified before they are sent."""
+    Images of another size are refused. If there is a distortion, images are rectified before they are sent: for images that
+    are rectified already, give `rectified` to `read` or `from_info`."""
 
     k: NDArray[np.floating[Any]]
     """The 3 × 3 intrinsic matrix, pixels, or a 3 × 4 projection matrix without a translation."""
@@ -34,6 +36,8 @@ class Camera:
     """``plumb_bob``, ``rational_polynomial``, or ``equidistant`` for OpenCV's fisheye."""
     depth_scale: float | None = None
     """Unit of integer depths, metres; None: 0.001."""
+    binning: tuple[int, int] = (1, 1)
+    """How many pixels of the sensor one of the image combines, along x and y. `k` and `size` are those of the image."""
 
     def __post_init__(self) -> None:
         intrinsic_matrix(self.k)
@@ -43,10 +47,12 @@ class Camera:
             raise ValueError(f"distortion is {self.distortion!r}, must be finite numbers")
         object.__setattr__(self, "distortion", tuple(coefficients))
         if self.size is not None:
-            if len(self.size) != 2 or not all(edge is None or whole(number(edge)) for edge in self.size):
+            edges: Any = self.size
+            if np.shape(edges) != (2,) or not all(edge is None or whole(number(edge)) for edge in self.size):
                 raise ValueError(f"size is {self.size!r}, must be the width and the height in pixels")
             object.__setattr__(self, "size", tuple(edge if edge is None else int(edge) for edge in self.size))
-        if self.depth_scale is not None and not 0 < self.depth_scale <= 1:
+        is_number = isinstance(self.depth_scale, Real) and not isinstance(self.depth_scale, bool)
+        if self.depth_scale is not None and not (is_number and 0 < self.depth_scale <= 1):
             raise ValueError(f"depth_scale is {self.depth_scale!r}, must be the unit of integer depths in metres: 0.001")
         if not self._is_distorted():
             return
@@ -62,12 +68,12 @@ class Camera:
     @classmethod
     def from_info(cls, info: Any, *, rectified: bool = False) -> Camera:
         """From a ``CameraInfo`` of ROS 1 or 2: a message, or a dictionary with its fields or those of a file that `read`
-        reads. `rectified`: for the images of
-        ``image_rect`` topics, which have the matrix `p` and no distortion. A part of the sensor (`roi`) and combined pixels
-        (`binning`) are taken into account."""
+        reads. `rectified`: for images that are rectified already, as those of ``image_rect`` topics: their matrix is `p`
+        (of a dictionary without it, `k`), and the distortion is not applied. Without it they would be rectified twice. A
+        part of the sensor (`roi`) and combined pixels (`binning`) are taken into account."""
 
-        if isinstance(info, Mapping) and not rectified:
-            return cls._found(info)
+        if isinstance(info, Mapping):
+            return cls._found(info, rectified)
 
         def field(*names: str) -> Any:
             of = info.get if isinstance(info, Mapping) else lambda name: getattr(info, name, None)
@@ -95,6 +101,7 @@ class Camera:
             size=(width // int(binning[0]), height // int(binning[1])) if width and height else None,
             distortion=() if rectified or distortion is None else tuple(float(value) for value in distortion),
             distortion_model=str(field("distortion_model") or "plumb_bob"),
+            binning=(int(binning[0]), int(binning[1])),
         )
 
     @classmethod
@@ -103,19 +110,20 @@ class Camera:
         others: JSON, YAML (needs the package PyYAML), a matrix as text, .npy or .npz. `rectified`: as for `from_info`."""
         document = read(Path(path))
         try:
-            return cls.from_info(document, rectified=True) if rectified else cls._found(document)
+            return cls._found(document, rectified)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
 
     @classmethod
-    def _found(cls, document: Any) -> Camera:
-        found = find(document)
+    def _found(cls, document: Any, rectified: bool) -> Camera:
+        found = find(document, rectified)
         return cls(
             np.reshape(found.k, (3, 3)),
             size=found.size,
             distortion=found.distortion,
             distortion_model=found.distortion_model,
             depth_scale=found.depth_scale,
+            binning=found.binning,
         )
 
     def check_size(self, width: int, height: int) -> None:
@@ -126,8 +134,14 @@ class Camera:
         if not differing:
             return
         scale = image[differing[0]] / (own[differing[0]] or 1)
+        is_binned = [edge is None or edge * bins == of_image for edge, bins, of_image in zip(own, self.binning, image)]
+        if self.binning != (1, 1) and all(is_binned):
+            x, y = self.binning
+            advice = f"the file has a binning of {x} × {y}; if the image is not binned, set binning_x and binning_y to 1"
+        elif own == (height, width):
+            advice = "width and height are exchanged: correct them, or give the image as the camera sees it, not rotated"
         # Rounded sizes of a scaled image differ by a pixel.
-        if all(edge is None or abs(scale * edge - of_image) <= 1 for edge, of_image in zip(own, image)):
+        elif all(edge is None or abs(scale * edge - of_image) <= 1 for edge, of_image in zip(own, image)):
             k = (intrinsic_matrix(self.k) * scale).round(4)
             advice = f"if the image was scaled, fx, fy, cx, cy are {k[0, 0]:g}, {k[1, 1]:g}, {k[0, 2]:g}, {k[1, 2]:g}"
         else:
@@ -181,7 +195,10 @@ def number_of(roi: Any, name: str) -> int:
 
 def intrinsic_matrix(k: Any) -> NDArray[np.float64]:
     """The 3 × 3 matrix of a 3 × 3 or a 3 × 4 matrix, or of a camera."""
-    matrix: NDArray[np.float64] = np.asarray(k.k if isinstance(k, Camera) else k, np.float64)
+    try:
+        matrix: NDArray[np.float64] = np.asarray(k.k if isinstance(k, Camera) else k, np.float64)
+    except (TypeError, ValueError):
+        raise TypeError(f"k is {short(k)}, must be a 3 × 3 matrix or a graspd.Camera, as Camera.read returns it") from None
     if matrix.size == 12:
         matrix = matrix.reshape(3, 4)
         if matrix[:, 3].any():

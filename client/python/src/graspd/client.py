@@ -15,7 +15,7 @@ from graspd import grasp_pb2 as pb
 from graspd import methods, wire
 from graspd.connection import ChannelOptions, Connection, positive
 from graspd.detection import Detection, FoundTable, Grasp, Model, Scores
-from graspd.errors import DeadlineExceeded, Error, Unavailable, from_status
+from graspd.errors import DeadlineExceeded, Error, Unavailable
 from graspd.geometry import PoseLike
 from graspd.methods import Answer, Method, Request, Response
 from graspd.options import Candidate, Options
@@ -101,7 +101,7 @@ class Client(Connection[grpc.Channel]):
             for reply in replies:
                 yield detecting.answer(reply)
         except grpc.RpcError as status:
-            raise from_status(status) from None
+            raise self._failure(status) from None
         finally:
             replies.cancel()
         detecting.end()
@@ -110,7 +110,7 @@ class Client(Connection[grpc.Channel]):
         """Opens a tracked volume for a moving camera. For a scene that moves: with `half_life` the weight of a measurement
         halves after `half_life` further measurements, and with each one that contradicts it; 10 suits most scenes.
         None: all views have the same weight."""
-        return Tracking(lambda requests: self._stream(methods.TRACK, requests), workspace, half_life)
+        return Tracking(lambda requests: self._stream(methods.TRACK, requests), workspace, half_life, self._failure)
 
     def score(
         self,
@@ -183,7 +183,7 @@ class Client(Connection[grpc.Channel]):
             try:
                 return method.answer(call(request, limit, self._metadata))
             except grpc.RpcError as status:
-                error = from_status(status)
+                error = self._failure(status)
             attempts += 1
             pause = self._retry.after(attempts, error)
             if pause is None:
@@ -203,8 +203,10 @@ class Tracking:
         stream: Callable[[Iterator[pb.TrackGraspsRequest]], Replies[pb.DetectGraspsStreamResponse]],
         workspace: Workspace,
         half_life: float | None,
+        failure: Callable[[grpc.RpcError], Error],
     ) -> None:
         self._adding = Adding(workspace, half_life)
+        self._failure = failure
         self._requests: SimpleQueue[pb.TrackGraspsRequest | None] = SimpleQueue()
         self._replies = stream(iter(self._requests.get, None))
 
@@ -239,5 +241,5 @@ class Tracking:
         try:
             reply = next(self._replies, None)
         except grpc.RpcError as status:
-            raise from_status(status) from None
+            raise self._failure(status) from None
         return self._adding.answer(reply)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import re
 from functools import cached_property
+from ipaddress import ip_address, ip_network
 from os import PathLike
 from pathlib import Path
 from typing import Generic, TypeAlias, TypeVar
 
 import grpc
 
+from graspd.errors import Error, from_status
 from graspd.retry import Retry
 
 Channel = TypeVar("Channel")
@@ -79,6 +82,9 @@ class Connection(Generic[Channel]):
             raise ValueError("the client is closed; make a new one")
         return self._channel
 
+    def _failure(self, status: grpc.RpcError) -> Error:
+        return from_status(status, proxied(self._destination[0]))
+
     def _open(self, target: str, credentials: grpc.ChannelCredentials | None, options: ChannelOptions) -> Channel:
         raise NotImplementedError
 
@@ -137,9 +143,37 @@ def replicas(target: str) -> ChannelOptions:
 
 def without_proxy(target: str) -> ChannelOptions:
     """The options for a server on this machine: gRPC would send its calls to the proxy of `http_proxy` too."""
-    host = target.removeprefix("dns:").removeprefix("ipv4:").removeprefix("ipv6:").lstrip("/")
-    is_here = host.startswith(("localhost:", "127.", "[::1]"))
-    return (("grpc.enable_http_proxy", 0),) if is_here else ()
+    return (("grpc.enable_http_proxy", 0),) if is_here(target) else ()
+
+
+def is_here(target: str) -> bool:
+    return host_of(target).startswith(("localhost:", "127.", "0.0.0.0:", "[::1]", "[::]"))
+
+
+def host_of(target: str) -> str:
+    """The host of a target with its port."""
+    return target.lower().removeprefix("dns:").removeprefix("ipv4:").removeprefix("ipv6:").lstrip("/")
+
+
+def proxied(target: str) -> str:
+    """Advice if gRPC sends calls to a proxy; it reads these variables in this order, in lower case only."""
+    variable = next((name for name in ("grpc_proxy", "https_proxy", "http_proxy") if os.environ.get(name)), None)
+    host = host_of(target).rpartition(":")[0].strip("[]")
+    excluded = os.environ.get("no_grpc_proxy") or os.environ.get("no_proxy") or ""
+    if variable is None or target.startswith("unix:") or is_here(target) or any(covers(part, host) for part in excluded.split(",")):
+        return ""
+    # Without a user and a password.
+    proxy = os.environ[variable].rpartition("@")[2]
+    return f"the call went to the proxy {proxy} of the variable {variable}: if the server is reachable without it, set no_proxy={host}"
+
+
+def covers(part: str, host: str) -> bool:
+    """Whether an entry of `no_proxy` covers a host: the end of its name, or a network."""
+    part = part.strip().lower()
+    try:
+        return ip_address(host) in ip_network(part)
+    except ValueError:
+        return bool(part) and host.endswith(part)
 
 
 def bearer(token: str) -> str:

@@ -84,6 +84,9 @@ def parse(text: str) -> Any:
 def rows(text: str) -> list[list[float]] | None:
     """Rows of numbers, separated by spaces, commas or semicolons; lines with # are comments."""
     lines = [line.split("#")[0].strip() for line in text.splitlines()]
+    # Without an empty cell the others would move.
+    if any(re.search(r"^[,;]|[,;]\s*[,;]", line.rstrip(" ,;")) for line in lines):
+        return None
     try:
         return [[float(word) for word in re.split(r"[ \t,;]+", line) if word] for line in lines if line]
     except ValueError:

@@ -86,11 +86,12 @@ ADVICE = {
 }
 
 
-def from_status(status: RpcError) -> Error:
-    """The error of a failed call."""
+def from_status(status: RpcError, proxy: str = "") -> Error:
+    """The error of a failed call. `proxy` is advice for failures of a connection through a proxy; empty: without one."""
     message = status.details() or ""
     if status.code() is StatusCode.UNAVAILABLE:
-        message = "; ".join([message, *(advice for part, advice in ADVICE.items() if part in message)])
+        advice = [proxy] if proxy else [advice for part, advice in ADVICE.items() if part in message]
+        message = "; ".join([message, *advice])
     error = make(status.code(), message)
     violations, pause, request = BadRequest(), RetryInfo(), RequestInfo()
     trailers: Any = status.trailing_metadata() or ()

@@ -10,6 +10,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.document import short
+
 Vector: TypeAlias = Sequence[float] | NDArray[np.floating[Any]]
 """x, y, z."""
 
@@ -33,20 +35,25 @@ class Pose:
     def from_matrix(cls, matrix: NDArray[np.floating[Any]]) -> Pose:
         """From the 4 × 4 matrix that maps points (x, y, z, 1). A rotation with few decimals is orthonormalised; raises
         `ValueError` if it is further from a rigid transform."""
-        matrix = np.asarray(matrix, np.float64)
+        given = matrix
+        try:
+            matrix = np.asarray(given, np.float64)
+        except (TypeError, ValueError):
+            raise TypeError(f"a pose is {short(given)}, must be a graspd.Pose or a 4 × 4 matrix") from None
         if matrix.shape != (4, 4):
             raise ValueError(f"a pose must be a 4 × 4 matrix, got shape {matrix.shape}")
         rotation = matrix[:3, :3]
         deviation = float(np.linalg.norm(rotation @ rotation.T - np.eye(3)))
         # Written so that NaN fails.
         is_rotation = deviation < CORRECTED and np.linalg.det(rotation) > 0
-        if not (is_rotation and np.isfinite(matrix).all() and np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6)):
+        if not (is_rotation and np.isfinite(matrix).all() and is_last_row(matrix[3])):
+            mirrors = ", its determinant is negative: it mirrors" if np.linalg.det(rotation) < 0 else ""
+            by_columns = ", send the matrix row by row" if is_last_row(matrix[:, 3]) and not is_last_row(matrix[3]) else ""
             raise ValueError(
                 f"a pose must be a rotation and a translation (R·Rᵀ deviates from the identity by {deviation:.3f}, at most "
-                f"{CORRECTED} is corrected; the last row must be 0 0 0 1), got\n{matrix}"
+                f"{CORRECTED} is corrected{mirrors}; the last row must be 0 0 0 1{by_columns}), got\n{matrix}"
             )
-        if deviation > EXACT:
-            warnings.warn(f"the rotation of a pose has few decimals; it was orthonormalised ({deviation:.4f} off)", stacklevel=2)
+        warn_of(deviation)
         # The quaternion is the eigenvector of the largest eigenvalue of a symmetric matrix, whose lower half this is
         # (Bar-Itzhack 2000). The method is stable at every angle.
         (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
@@ -60,6 +67,16 @@ class Pose:
         px, py, pz = matrix[:3, 3].tolist()
         return cls((px, py, pz), (x, y, z, w))
 
+    def normalised(self) -> Pose:
+        """With a quaternion of length 1, if its length is close to it: the server refuses one with few decimals."""
+        norm = float(np.linalg.norm(self.quaternion))
+        # Written so that NaN is sent, and refused there.
+        if not 1e-6 < abs(norm - 1) <= CORRECTED:
+            return self
+        warn_of(abs(norm - 1))
+        x, y, z, w = (value / norm for value in self.quaternion)
+        return Pose(self.position, (x, y, z, w))
+
     def matrix(self) -> NDArray[np.float64]:
         """The 4 × 4 matrix that maps points (x, y, z, 1) of b into a."""
         x, y, z, w = self.quaternion
@@ -71,6 +88,15 @@ class Pose:
         ]
         matrix[:3, 3] = self.position
         return matrix
+
+
+def is_last_row(row: NDArray[np.floating[Any]]) -> bool:
+    return bool(np.allclose(row, [0, 0, 0, 1], atol=1e-6))
+
+
+def warn_of(deviation: float) -> None:
+    if deviation > EXACT:
+        warnings.warn(f"the rotation of a pose has few decimals; it was orthonormalised ({deviation:.4f} off)", stacklevel=3)
 
 
 PoseLike: TypeAlias = Pose | NDArray[np.floating[Any]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, TypeAlias, TypeVar
 
@@ -17,6 +17,7 @@ from graspd import errors
 from graspd import grasp_pb2 as pb
 from graspd.camera import Camera, intrinsic_matrix
 from graspd.detection import Detection, Dropped, FoundTable, GeometryWarning, Grasp, Latency, Model, Score, Scores
+from graspd.document import listed as shown
 from graspd.document import short
 from graspd.geometry import Pose, PoseLike, Vector
 from graspd.options import Box, Candidate, CollisionCheck, Cone, Convention, Gripper, Options, Retreat
@@ -78,9 +79,11 @@ def detect_request(volume: Volume | NDArray[Any], options: Options | None, reque
 def depth_request(
     views: DepthView | Iterable[DepthView], workspace: Workspace, options: Options | None, request_id: str
 ) -> pb.DetectGraspsFromDepthRequest:
+    listed = each(views, DepthView)
+    note_absent(listed, options)
     return pb.DetectGraspsFromDepthRequest(
         request_id=checked("request_id", request_id, str),
-        views=map(depth_message, each(views, DepthView)),
+        views=map(depth_message, listed),
         workspace=workspace_message(workspace),
         options=given(options_message, options),
     )
@@ -89,9 +92,11 @@ def depth_request(
 def cloud_request(
     views: CloudView | Iterable[CloudView], workspace: Workspace, options: Options | None, request_id: str
 ) -> pb.DetectGraspsFromCloudRequest:
+    listed = each(views, CloudView)
+    note_absent(listed, options)
     return pb.DetectGraspsFromCloudRequest(
         request_id=checked("request_id", request_id, str),
-        views=map(cloud_message, each(views, CloudView)),
+        views=map(cloud_message, listed),
         workspace=workspace_message(workspace),
         options=given(options_message, options),
     )
@@ -131,7 +136,7 @@ def candidate_message(candidate: PoseLike | Candidate | Grasp) -> pb.Candidate:
         candidate = Candidate(candidate.pose, candidate.width)
     elif not isinstance(candidate, Candidate):
         candidate = Candidate(candidate)
-    return pb.Candidate(pose=pose_message(candidate.pose), width=candidate.width)
+    return pb.Candidate(pose=pose_message(candidate.pose, "Candidate.pose"), width=candidate.width)
 
 
 def track_request(
@@ -176,7 +181,7 @@ def volume_message(volume: Volume | NDArray[Any]) -> pb.Volume:
         dtype=DTYPES[values.dtype],
         resolution=resolution,
         voxel_size=WORKSPACE_SIZE / resolution if volume.voxel_size is None else volume.voxel_size,
-        pose=pose_message(volume.pose),
+        pose=pose_message(volume.pose, "Volume.pose"),
         frame_id=volume.frame_id,
         stamp=given(stamp_message, volume.stamp),
     )
@@ -202,6 +207,19 @@ def encoded(values: NDArray[Any], dtype: DTypeLike | None) -> NDArray[Any]:
     # Values greater than 0 stay greater than 0, because 0 means unobserved.
     steps: NDArray[Any] = np.maximum(np.rint(values * 255), values > 0).astype(np.uint8)
     return steps
+
+
+def note_absent(views: Sequence[DepthView | CloudView], options: Options | None) -> None:
+    """Logs once that no label of the views is one of the wanted objects, as of a mask of 0 and 255."""
+    labels = [np.asarray(view.labels) for view in views if view.labels is not None]
+    wanted = [] if not isinstance(options, Options) else list(options.objects)
+    if not (labels and wanted) or any(np.isin(one, wanted).any() for one in labels):
+        return
+    there = sorted({label.item() for one in labels for label in np.unique(one)} - {0})
+    text = f"Options.objects is {wanted}, not in the labels of the views; labels there: {shown(there) or 'none but 0'}"
+    if text not in logged:
+        logged.add(text)
+        logger.warning("%s", text)
 
 
 def depth_message(view: DepthView) -> pb.DepthView:
@@ -238,8 +256,8 @@ def depth_message(view: DepthView) -> pb.DepthView:
         unit=unit,
         labels=given(labels_message, labels),
         camera=pb.Camera(width=width, height=height, k=intrinsic_matrix(view.k).ravel().tolist()),
-        camera_from_task=pose_message(view.camera_from_task),
-        frame_from_camera=pose_message(view.frame_from_camera),
+        camera_from_task=pose_message(view.camera_from_task, "camera_from_task"),
+        frame_from_camera=pose_message(view.frame_from_camera, "frame_from_camera"),
     )
 
 
@@ -268,14 +286,14 @@ def cloud_message(view: CloudView) -> pb.CloudView:
         labels=given(labels_message, view.labels),
         points=points.astype("<f4", copy=False).tobytes(),
         camera_position=vector_message(view.camera_position),
-        frame_from_cloud=pose_message(view.frame_from_cloud),
+        frame_from_cloud=pose_message(view.frame_from_cloud, "frame_from_cloud"),
     )
 
 
 def workspace_message(workspace: Workspace) -> pb.Workspace:
     checked("workspace", workspace, Workspace)
     return pb.Workspace(
-        pose=pose_message(workspace.pose),
+        pose=pose_message(workspace.pose, "Workspace.pose"),
         size=workspace.size,
         frame_id=workspace.frame_id,
         stamp=given(stamp_message, workspace.stamp),
@@ -308,7 +326,7 @@ def options_message(options: Options) -> pb.Options:
         convention=given(convention_message, options.convention),
         pregrasp_distance=options.pregrasp_distance,
         retreat=given(retreat_message, options.retreat),
-        region_pose=pose_message(options.region_pose),
+        region_pose=pose_message(options.region_pose, "Options.region_pose"),
         objects=options.objects,
         max_grasps_per_object=options.max_grasps_per_object,
         margin=options.margin,
@@ -347,7 +365,7 @@ def convention_message(convention: Convention) -> pb.Convention:
     return pb.Convention(
         origin=f"ORIGIN_{convention.origin.upper()}",
         closing_axis=f"CLOSING_AXIS_{convention.closing_axis.upper()}",
-        parent_from_grasp=pose_message(convention.parent_from_grasp),
+        parent_from_grasp=pose_message(convention.parent_from_grasp, "Convention.parent_from_grasp"),
     )
 
 
@@ -356,11 +374,13 @@ def retreat_message(retreat: Retreat) -> pb.Retreat:
     return pb.Retreat(distance=retreat.distance, direction=direction)
 
 
-def pose_message(pose: PoseLike | None) -> pb.Pose | None:
+def pose_message(pose: PoseLike | None, name: str = "pose") -> pb.Pose | None:
     if pose is None:
         return None
-    if not isinstance(pose, Pose):
-        pose = Pose.from_matrix(pose)
+    try:
+        pose = pose.normalised() if isinstance(pose, Pose) else Pose.from_matrix(pose)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{name}: {error}") from None
     x, y, z, w = pose.quaternion
     return pb.Pose(position=vector_message(pose.position), orientation=pb.Quaternion(x=x, y=y, z=z, w=w))
 

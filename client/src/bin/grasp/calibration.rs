@@ -10,11 +10,12 @@ mod values;
 use anyhow::{Context, bail, ensure};
 use serde_json::{Map, Value};
 
-use self::names::{NAMES, Role, role};
+use self::names::{NAMES, Role, is_of_grid, role};
 use self::values::{of_said, short};
 use crate::camera::{Camera, matrix, of_numbers, windowed};
 use crate::distortion;
 use crate::document::{keys, listed, number, numbers, plain};
+use crate::notes::note;
 
 /// Something that a document says.
 #[derive(Clone)]
@@ -26,10 +27,11 @@ struct Said<'a> {
     distance: usize,
 }
 
-/// The camera of a document, which may also be bare numbers.
-pub(crate) fn camera(document: &Value) -> anyhow::Result<Camera> {
+/// The camera of a document, which may also be bare numbers. `rectified`: that of its rectified images, which have the
+/// projection matrix, if there is one, and no distortion.
+pub(crate) fn camera(document: &Value, rectified: bool) -> anyhow::Result<Camera> {
     let mut found = Vec::new();
-    walk(document, String::new(), &[], &mut found)?;
+    Walk { rectified, found: &mut found }.walk(document, String::new(), &[])?;
     let is_other = |camera: &Camera| found.first().is_some_and(|(_, first)| first != camera);
     if found.iter().any(|(_, camera)| is_other(camera)) {
         let is_depth = |path: &str| path.split('.').any(|key| plain(key).starts_with("depth"));
@@ -37,7 +39,7 @@ pub(crate) fn camera(document: &Value) -> anyhow::Result<Camera> {
         let [(path, camera)] = &found.iter().filter(|(path, _)| is_depth(path)).collect::<Vec<_>>()[..] else {
             bail!("several cameras in the file: {names}; give a file with the depth camera alone")
         };
-        eprintln!("grasp: the intrinsics are those of `{path}`, one of {names}");
+        note(format_args!("the intrinsics are those of `{path}`, one of {names}"));
         return Ok(camera.clone());
     }
     if let Some((_, camera)) = found.pop() {
@@ -50,33 +52,45 @@ pub(crate) fn camera(document: &Value) -> anyhow::Result<Camera> {
     Ok(Camera::from(checked(of_numbers(&bare)?)?))
 }
 
-fn walk<'a>(
-    value: &'a Value,
-    path: String,
-    around: &[Said<'a>],
-    found: &mut Vec<(String, Camera)>,
-) -> anyhow::Result<()> {
-    if let Value::Array(values) = value {
-        let mut items = values.iter().enumerate().filter(|(_, value)| has_camera(value));
-        return items.try_for_each(|(i, value)| walk(value, format!("{path}[{i}]"), around, found));
+/// Collects the cameras of a document with their paths.
+struct Walk<'f> {
+    rectified: bool,
+    found: &'f mut Vec<(String, Camera)>,
+}
+
+impl Walk<'_> {
+    fn walk<'a>(&mut self, value: &'a Value, path: String, around: &[Said<'a>]) -> anyhow::Result<()> {
+        if let Value::Array(values) = value {
+            let mut items = values.iter().enumerate().filter(|(_, value)| has_camera(value));
+            return items.try_for_each(|(i, value)| self.walk(value, format!("{path}[{i}]"), around));
+        }
+        let Value::Object(map) = value else { return Ok(()) };
+        let mut said = Vec::new();
+        collect(map, 0, &mut said);
+        said.extend(around.iter().map(|outer| Said { distance: outer.distance + 2, ..outer.clone() }));
+        if let Some(k) = self.matrix_of(map)? {
+            let name = if path.is_empty() { "the file itself".to_owned() } else { path.clone() };
+            self.found.push((name, windowed(of_said(k, &said, self.rectified)?, map)));
+        }
+        for (key, inner) in map.iter().filter(|(_, inner)| has_camera(inner)) {
+            self.walk(inner, if path.is_empty() { key.clone() } else { format!("{path}.{key}") }, &said)?;
+        }
+        Ok(())
     }
-    let Value::Object(map) = value else { return Ok(()) };
-    let mut said = Vec::new();
-    collect(map, 0, &mut said);
-    said.extend(around.iter().map(|outer| Said { distance: outer.distance + 2, ..outer.clone() }));
-    if let Some(k) = matrix_of(map)? {
-        let name = if path.is_empty() { "the file itself".to_owned() } else { path.clone() };
-        found.push((name, windowed(of_said(k, &said)?, map)));
+
+    fn matrix_of(&self, map: &Map<String, Value>) -> anyhow::Result<Option<[f64; 9]>> {
+        match projection_of(map).filter(|_| self.rectified) {
+            Some(projection) => Ok(Some(checked(projection?)?)),
+            None => matrix_of(map),
+        }
     }
-    for (key, inner) in map.iter().filter(|(_, inner)| has_camera(inner)) {
-        walk(inner, if path.is_empty() { key.clone() } else { format!("{path}.{key}") }, &said, found)?;
-    }
-    Ok(())
 }
 
 fn has_camera(value: &Value) -> bool {
     let is_camera = |(key, value): (&String, &Value)| match role(key) {
-        Some(Role::Matrix | Role::Projection) => numbers(value).is_some_and(|numbers| numbers.len() >= 4),
+        Some(Role::Matrix | Role::Projection) => {
+            is_quoted(value) || numbers(value).is_some_and(|numbers| numbers.len() >= 4)
+        }
         Some(Role::Intrinsic(0)) => number(value).is_some(),
         _ => false,
     };
@@ -85,6 +99,14 @@ fn has_camera(value: &Value) -> bool {
         Value::Array(values) => values.iter().any(has_camera),
         _ => false,
     }
+}
+
+/// Whether a text has the numbers of a matrix.
+fn is_quoted(value: &Value) -> bool {
+    let text = value.as_str().unwrap_or_default().trim_start();
+    let words = text.split(|c: char| !(c.is_ascii_digit() || ".+-eE".contains(c)));
+    text.starts_with(|c: char| c.is_ascii_digit() || "[-".contains(c))
+        && words.filter(|word| word.parse::<f64>().is_ok()).count() >= 4
 }
 
 /// What an object says, and what the objects in it say that are no cameras themselves.
@@ -96,13 +118,14 @@ fn collect<'a>(map: &'a Map<String, Value>, distance: usize, said: &mut Vec<Said
             (_, Value::Null) => (),
             // A quaternion has w alone, and a region of interest its own size.
             (Some(Role::Edge(_)), _) if plain(key).len() == 1 && !(has("w") && has("h")) => (),
+            (Some(Role::Edge(_)), _) if is_of_grid(key) && (has("data") || distance % 2 == 1) => (),
             (_, Value::Object(_)) if key == "roi" || has_camera(value) => (),
             (Some(Role::Coefficients), Value::Object(inner)) if numbers(value).is_none() => {
                 lens(key, value, inner, distance, said);
             }
             (Some(Role::Size), Value::Object(inner)) => collect(inner, distance, said),
             (Some(Role::Matrix | Role::Projection | Role::Intrinsic(_)), _) => (),
-            (Some(Role::Coefficients), Value::String(text)) if distortion::is_model(text) => {
+            (Some(Role::Coefficients | Role::Doubtful), Value::String(text)) if distortion::is_model(text) => {
                 said.push(Said { role: Role::DistortionModel, key, value, distance });
             }
             (Some(role), _) => said.push(Said { role, key, value, distance }),
@@ -123,7 +146,8 @@ fn lens<'a>(key: &'a str, value: &'a Value, map: &'a Map<String, Value>, distanc
         };
         said.extend(role.map(|role| Said { role, key, value, distance }));
     }
-    let is_coefficient = |said: &Said| matches!(said.role, Role::Coefficients | Role::Coefficient(_));
+    let is_coefficient =
+        |said: &Said| matches!(said.role, Role::Coefficients | Role::Coefficient(_) | Role::Radial | Role::Tangential);
     if !said[before..].iter().any(is_coefficient) {
         said.push(Said { role: Role::Coefficients, key, value, distance });
     }
@@ -140,6 +164,7 @@ fn matrix_of(map: &Map<String, Value>) -> anyhow::Result<Option<[f64; 9]>> {
                 found.push((key, of_numbers(&numbers).with_context(|| format!("`{key}`"))?));
             }
             None if is_plain => bail!("`{key}` is {}, must be numbers", short(value)),
+            None if is_quoted(value) => bail!("`{key}` is the text {}, must be numbers without quotes", short(value)),
             _ => (),
         }
     }
@@ -153,18 +178,20 @@ fn matrix_of(map: &Map<String, Value>) -> anyhow::Result<Option<[f64; 9]>> {
         };
         found.push((fx.0, matrix(read(fx)?, read(fy)?, read(cx)?, read(cy)?)));
     }
-    if found.is_empty()
-        && let Some((key, numbers)) = of_role(Role::Projection).find_map(|(key, value)| Some((key, numbers(value)?)))
-        && numbers.len() == 12
-    {
-        found.push((key, of_numbers(&numbers).with_context(|| format!("`{key}`"))?));
-    }
-    let Some(&(first, k)) = found.first() else { return Ok(None) };
+    let Some(&(first, k)) = found.first() else { return projection_of(map).transpose()?.map(checked).transpose() };
     for (key, other) in &found {
         let is_same = k.iter().zip(other).all(|(a, b)| (a - b).abs() <= 1e-3);
         ensure!(is_same || k.iter().any(|c| c.is_nan()), "`{first}` and `{key}` are different intrinsics");
     }
     checked(k).map(Some)
+}
+
+/// The matrix of the projection matrix of an object.
+fn projection_of(map: &Map<String, Value>) -> Option<anyhow::Result<[f64; 9]>> {
+    let numbers_of = |(key, value): (&String, &Value)| (role(key) == Some(Role::Projection)).then(|| numbers(value))?;
+    let numbers = |(key, value)| Some((key, numbers_of((key, value)).filter(|numbers| numbers.len() == 12)?));
+    let (key, numbers) = map.iter().find_map(numbers)?;
+    Some(of_numbers(&numbers).with_context(|| format!("`{key}`")))
 }
 
 fn checked(k: [f64; 9]) -> anyhow::Result<[f64; 9]> {
@@ -183,7 +210,7 @@ mod tests {
     const FX: &str = r#""fx": 540, "fy": 541, "cx": 320, "cy": 240"#;
 
     fn read(text: &str) -> anyhow::Result<Camera> {
-        camera(&parse(text)?)
+        camera(&parse(text)?, false)
     }
 
     #[test]
@@ -229,13 +256,22 @@ mod tests {
             format!(r#"{{"image_Width": 848, "image_Height": 480, {FX}}}"#),
             format!(r#"{{"width": 848, "height": 480, "intrinsics": {{{FX}}}}}"#),
             format!(r#"{{"image": {{"width": 848, "height": 480}}, "K": {K:?}}}"#),
+            format!(r#"{{"rows": 480, "cols": 848, {FX}}}"#),
+            format!(r#"{{"nCols": 848, "nRows": 480, {FX}}}"#),
+            format!(r#"{{"image_shape": [480, 848, 3], {FX}}}"#),
+            format!(r#"{{"shape": [480, 848], {FX}}}"#),
+            format!(r#"{{"frame_size": [848, 480], {FX}}}"#),
+            format!(r#"{{"res": "848x480", {FX}}}"#),
+            format!(r#"{{"width_px": 848, "height_px": 480, {FX}}}"#),
+            format!(r#"{{"sensor_width": 848, "sensor_height": 480, {FX}}}"#),
         ];
         for text in texts {
             assert_eq!(read(&text).unwrap().size, [Some(848), Some(480)], "{text}");
         }
         assert_eq!(read(&format!(r#"{{"width": 848, {FX}}}"#)).unwrap().size, [Some(848), None]);
         // The region of interest, the quaternion of a pose and the width of a hand are no sizes.
-        let other = r#""pose": {"x": 0, "y": 0, "z": 0, "w": 1}, "gripper": {"width": 0.08}, "roi": {"width": 0}"#;
+        let other = r#""pose": {"x": 0, "y": 0, "z": 0, "w": 1}, "gripper": {"width": 0.08}, "roi": {"width": 0},
+            "board": {"rows": 6, "cols": 9}, "r": {"rows": 3, "cols": 3, "data": []}, "sensor_width": 5.76"#;
         assert_eq!(read(&format!("{{{other}, {FX}}}")).unwrap().size, [None, None]);
     }
 
@@ -253,6 +289,9 @@ mod tests {
             format!(r#"{{"intrinsics": {{{FX}}}, "distortion": {d}}}"#),
             format!(r#"{{{FX}, "d": ["-0.28", "0.09", "0", "0", "0"]}}"#),
             format!(r#"{{{FX}, "model": "distortion.brown_conrady", "coeffs": {d}}}"#),
+            format!(r#"{{{FX}, "lens_distortion": {d}}}"#),
+            format!(r#"{{{FX}, "RadialDistortion": [-0.28, 0.09], "TangentialDistortion": [0, 0]}}"#),
+            format!(r#"{{{FX}, "distortion": {{"radial": [-0.28, 0.09, 0]}}, "rad_dist": [0, 0], "min_dist": 0.2}}"#),
             format!(
                 "%YAML:1.0\n---\ncameraMatrix: !!opencv-matrix\n   data: {K:?}\ndistCoeffs: !!opencv-matrix\n   data: {d}\n"
             ),
@@ -272,6 +311,18 @@ mod tests {
     }
 
     #[test]
+    fn rectified_images_have_the_projection_matrix_and_no_distortion() {
+        let p = "[530, 0, 310, 0, 0, 531, 230, 0, 0, 0, 1, 0]";
+        let lens = r#""D": [0.1, 0.2, 0, 0, 0], "distortion_model": "double_sphere""#;
+        let read = |text: &str| camera(&parse(text).unwrap(), true);
+        let rectified = read(&format!(r#"{{"K": {K:?}, {lens}, "P": {p}}}"#)).unwrap();
+        assert_eq!((rectified.k[0], rectified.distortion), (530.0, None));
+        let without = read(&format!(r#"{{"K": {K:?}, {lens}}}"#)).unwrap();
+        assert_eq!((without.k, without.distortion), (K, None));
+        assert!(read(&format!(r#"{{"K": {K:?}, "P": {:?}}}"#, [0; 12])).is_err());
+    }
+
+    #[test]
     fn the_depth_scale_is_read_wherever_it_is() {
         let keys = [
             (r#""depth_scale": 0.0005"#, 0.0005),
@@ -282,6 +333,8 @@ mod tests {
             (r#""depthScale": 0.0005"#, 0.0005),
             (r#""depth_unit": 0.0005"#, 0.0005),
             (r#""depth_units": "mm""#, 0.001),
+            (r#""depth_unit": "cm""#, 0.01),
+            (r#""units_per_meter": 2000"#, 0.0005),
             (r#""factor_depth": [[2000]]"#, 0.0005),
             (r#""depth_factor": 2000"#, 0.0005),
             (r#""DepthMapFactor": 2000"#, 0.0005),
@@ -315,14 +368,19 @@ mod tests {
             (format!(r#"{{{FX}, "k1": 1, "k2": 1, "k3": 1, "k4": 1}}"#), "name its `distortion_model`"),
             (format!(r#"{{{FX}, "model": 2, "coeffs": [0.1, 0, 0, 0, 0]}}"#), "`inverse_brown_conrady` with 5"),
             (format!(r#"{{{FX}, "d": [0.1, 0.2]}}"#), "with 2 coefficients is not supported"),
-            (format!(r#"{{{FX}, "depth_scale": 0}}"#), "`depth_scale` is 0, must be above 0"),
-            (format!(r#"{{{FX}, "depth_unit": "inch"}}"#), r#"`depth_unit` is "inch", must be above 0"#),
+            (format!(r#"{{{FX}, "rad_dist": [0.1, 0.2]}}"#), "`rad_dist` is [0.1,0.2], which may be the distortion"),
+            (format!(r#"{{{FX}, "undistortion": {{"a": 1}}}}"#), "`undistortion` is"),
+            (format!(r#"{{{FX}, "radial": [1, 2, 3, 4]}}"#), "`radial` is [1,2,3,4], must be k1, k2 and k3"),
+            (format!(r#"{{{FX}, "depth_scale": 0}}"#), "`depth_scale` is 0, must be the unit of the depths"),
+            (format!(r#"{{{FX}, "depth_unit": "inch"}}"#), r#"`depth_unit` is "inch", must be the unit of the depths"#),
             (format!(r#"{{{FX}, "k": [1, 0, 3, 0, 1, 3, 0, 0, 1]}}"#), "`k` and `fx` are different intrinsics"),
             (format!(r#"{{"K": {K:?}, "dist": [0.1, 0, 0, 0], "D": [0, 0, 0, 0]}}"#), "but `dist` is [0.1,0,0,0]"),
             ("k: [0, 0, 0, 0, 0, 0, 0, 0, 0]".to_owned(), "the camera is not calibrated"),
             ("k: [540, 0, 320, 0, .nan, 240, 0, 0, 1]".to_owned(), "a number is nan or infinite"),
             (r#"{"k": [540, 0, 320, 0, NaN, 240, 0, 0, 1]}"#.to_owned(), "must be finite"),
             (r#"{"k": [540, 0, 320]}"#.to_owned(), "`k`: 3 numbers; an intrinsic matrix has nine"),
+            (r#"{"k": "[540, 0, 320, 0, 541, 240, 0, 0, 1]"}"#.to_owned(), "`k` is the text \"[540, 0, 320,"),
+            ("{}".to_owned(), "no intrinsics found: the file has no keys"),
             (r#"{"focal": 540, "centre": 320}"#.to_owned(), "no intrinsics found; keys in the file: centre, focal"),
             ("k: [1, 2".to_owned(), "neither JSON nor YAML"),
             (String::new(), "the file is empty"),

@@ -9,10 +9,11 @@ use serde_json::{Map, Value};
 use crate::calibration;
 use crate::distortion::Distortion;
 use crate::document::{document, number};
-use crate::files::in_file;
+use crate::files::{Purpose, in_file};
 use crate::image::{self, Scale};
 use crate::labels::Labels;
-use crate::numbers::Numbers;
+use crate::notes::note;
+use crate::numbers::{Numbers, mistyped};
 
 /// What a file says about a camera.
 #[derive(Clone, Debug, PartialEq)]
@@ -25,24 +26,38 @@ pub(crate) struct Camera {
     pub distortion: Option<Distortion>,
     /// Unit of integer depths, metres.
     pub depth_scale: Option<f64>,
+    /// How many pixels of the sensor one of the image combines, along x and y.
+    pub binning: [u32; 2],
 }
 
 impl From<[f64; 9]> for Camera {
     fn from(k: [f64; 9]) -> Self {
-        Self { k, size: [None; 2], distortion: None, depth_scale: None }
+        Self { k, size: [None; 2], distortion: None, depth_scale: None, binning: [1; 2] }
     }
 }
 
 impl Camera {
-    /// FX,FY,CX,CY, nine numbers, or a file.
-    pub fn read(text: &str) -> anyhow::Result<Self> {
+    /// FX,FY,CX,CY, nine numbers, or a file. `rectified`: the images are rectified already.
+    pub fn read(text: &str, rectified: bool) -> anyhow::Result<Self> {
         if let Ok(Numbers([fx, fy, cx, cy])) = text.parse::<Numbers<4>>() {
             return Ok(matrix(fx, fy, cx, cy).into());
         }
         if let Ok(Numbers(k)) = text.parse::<Numbers<9>>() {
             return Ok(k.into());
         }
-        in_file(Path::new(text), |path| calibration::camera(&document(path)?))
+        if let Some(reason) = mistyped(text) {
+            bail!("--intrinsics {text}: {reason}; must be a file, the numbers FX,FY,CX,CY, or the nine of the matrix");
+        }
+        in_file(Path::new(text), |path| {
+            let camera = calibration::camera(&document(path, Purpose::Intrinsics)?, rectified)?;
+            if let Some(lens) = &camera.distortion {
+                note(format_args!(
+                    "images of this camera are rectified with {lens}; if they are rectified already, as those of \
+                     image_rect, add --rectified"
+                ));
+            }
+            Ok(camera)
+        })
     }
 
     /// Reads a depth image of this camera, rectified, with the labels of its pixels.
@@ -75,13 +90,20 @@ impl Camera {
         let scale = image[axis] / own[axis].unwrap_or(image[axis]);
         // Rounded sizes of a scaled image differ by a pixel.
         let is_scaled = (0..2).all(|axis| own[axis].is_none_or(|edge| (scale * edge - image[axis]).abs() <= 1.0));
-        let advice = if is_scaled {
+        let binned = |axis: usize| own[axis].is_none_or(|edge| edge * f64::from(self.binning[axis]) == image[axis]);
+        let [w, h] = own.map(|edge| edge.map_or("?".to_owned(), |edge| edge.to_string()));
+        let advice = if self.binning != [1; 2] && (0..2).all(binned) {
+            let [x, y] = self.binning;
+            format!("the file has a binning of {x} × {y}; if the image is not binned, set binning_x and binning_y to 1")
+        } else if own == [Some(image[1]), Some(image[0])] {
+            "width and height are exchanged: correct them in the file, or give the image as the camera sees it, not rotated"
+                .to_owned()
+        } else if is_scaled {
             let [fx, _, cx, _, fy, cy, ..] = self.k.map(|number| (number * scale * 1e4).round() / 1e4);
             format!("if the image was scaled, its intrinsics are {fx},{fy},{cx},{cy}")
         } else {
             "if the image was cropped, subtract the left and upper margin from cx and cy".to_owned()
         };
-        let [w, h] = own.map(|edge| edge.map_or("?".to_owned(), |edge| edge.to_string()));
         bail!("the intrinsics are of images of {w} × {h} pixels, the image has {width} × {height}; {advice}")
     }
 }
@@ -129,7 +151,7 @@ pub(crate) fn windowed(camera: Camera, map: &Map<String, Value>) -> Camera {
         let edge = camera.size[axis].map(f64::from)?;
         Some((if cropped[axis] > 0.0 { cropped[axis] } else { edge } / binning[axis]) as u32)
     });
-    Camera { k, size, ..camera }
+    Camera { k, size, binning: binning.map(|bins| bins as u32), ..camera }
 }
 
 #[cfg(test)]
@@ -142,8 +164,8 @@ mod tests {
 
     #[test]
     fn intrinsics_are_numbers_or_files() {
-        assert_eq!(Camera::read("540, 541,320,240").unwrap().k, K);
-        assert_eq!(Camera::read("540,0,320,0,541,240,0,0,1").unwrap().k, K);
+        assert_eq!(Camera::read("540, 541,320,240", false).unwrap().k, K);
+        assert_eq!(Camera::read("540,0,320,0,541,240,0,0,1", false).unwrap().k, K);
         assert_eq!(file("540,541,320,240"), None);
         assert_eq!(file("k,1.json"), Some(PathBuf::from("k,1.json")));
     }
@@ -165,9 +187,10 @@ mod tests {
             writer.finish().unwrap();
         }
         drop(npz);
-        let camera = Camera::read(&path("all.npz")).unwrap();
+        let camera = Camera::read(&path("all.npz"), false).unwrap();
         let distortion = Distortion::new(None, &lens).unwrap();
-        let expected = Camera { k: K, size: [Some(640), Some(480)], distortion, depth_scale: Some(0.0005) };
+        let expected =
+            Camera { k: K, size: [Some(640), Some(480)], distortion, depth_scale: Some(0.0005), binning: [1; 2] };
         assert_eq!(camera, expected);
     }
 
@@ -180,6 +203,11 @@ mod tests {
         let advice = "if the image was scaled, its intrinsics are 300,301,160,120";
         let expected = "the intrinsics are of images of 640 × 480 pixels, the image has 320 × 240; ";
         assert_eq!(error, format!("{expected}{advice}"));
+        let exchanged = camera.check_size(480, 640).unwrap_err().to_string();
+        assert!(exchanged.contains("width and height are exchanged: correct them in the file"), "{exchanged}");
+        let binned = Camera { size: [Some(320), Some(240)], binning: [2; 2], ..camera.clone() };
+        let error = binned.check_size(640, 480).unwrap_err().to_string();
+        assert!(error.contains("has a binning of 2 × 2; if the image is not binned, set binning_x"), "{error}");
         assert!(camera.check_size(640, 400).unwrap_err().to_string().contains("if the image was cropped"));
         let of_width = Camera { size: [Some(640), None], ..camera };
         assert!(of_width.check_size(640, 400).is_ok());

@@ -4,14 +4,15 @@ use std::fs;
 use std::io::{self, Read};
 use std::path::Path;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use npyz::{DType, DTypeError, Deserialize, TypeChar, TypeRead};
 use pcd_rs::{DynReader, Field, ValueKind, ViewPoint};
 use ply_rs_bw::parser::Parser;
 use ply_rs_bw::ply::{Property, PropertyAccess, PropertyAccessResult};
 
-use crate::document::{listed, words};
-use crate::files::{self, Format, Values};
+use crate::document::{cells, listed};
+use crate::files::{self, Format, Purpose, Values};
+use crate::notes::note;
 
 /// Names of the points' array in a .npz file with several arrays.
 const ARRAYS: [&str; 2] = ["points", "xyz"];
@@ -32,10 +33,20 @@ impl From<Vec<[f32; 3]>> for Points {
     }
 }
 
+/// Distance of points, metres, beyond which integers are not in millimetres.
+const FARTHEST: f64 = 100.0;
+
 /// Reads points, x y z in units of `scale` metres, from a .npy, .npz, .pcd, .ply or .xyz file. Without a scale,
 /// integers are in millimetres and floats in metres.
 pub(crate) fn read(path: &Path, scale: Option<f64>) -> anyhow::Result<Vec<[f32; 3]>> {
     let Points { xyz, are_integers } = unscaled(path)?;
+    let far = |point: &&[f32; 3]| point.iter().any(|&c| f64::from(c.abs()) * MILLIMETRE > FARTHEST);
+    ensure!(
+        !are_integers || scale.is_some() || xyz.iter().filter(far).count() * 2 <= xyz.len(),
+        "{}: the points are integers, and read as millimetres most are beyond {FARTHEST} m; give --cloud-scale, such as \
+         0.000001 for micrometres",
+        path.display()
+    );
     let scale = scale.unwrap_or(if are_integers { MILLIMETRE } else { 1.0 });
     if scale == 1.0 {
         return Ok(xyz);
@@ -44,7 +55,7 @@ pub(crate) fn read(path: &Path, scale: Option<f64>) -> anyhow::Result<Vec<[f32; 
 }
 
 fn unscaled(path: &Path) -> anyhow::Result<Points> {
-    files::in_file(path, |path| match Format::from_path(path)? {
+    files::in_file(path, |path| match Format::from_path(path, Purpose::Points)? {
         Format::Pcd => pcd(path),
         Format::Ply => ply(path),
         Format::Png | Format::Tiff | Format::Exr => bail!("this is an image; for a depth image give --intrinsics"),
@@ -57,22 +68,22 @@ fn unscaled(path: &Path) -> anyhow::Result<Points> {
     })
 }
 
-/// The coordinates of each line: the first three numbers, or those under x, y and z of a first line with names. A first
-/// line with the number of points, as in .pts files, is left out.
+/// The coordinates of each line: the first three numbers, or those under x, y and z of a first line with names. An empty
+/// cell is NaN. A first line with the number of points, as in .pts files, is left out.
 fn text(text: &str) -> anyhow::Result<Vec<[f32; 3]>> {
     let lines =
         text.trim_start_matches('\u{feff}').lines().map(|line| line.split('#').next().unwrap_or_default().trim());
     let mut lines = lines.enumerate().filter(|(_, line)| !line.is_empty()).peekable();
     let mut columns = [0, 1, 2];
-    let first: Vec<&str> = lines.peek().map(|(_, line)| words(line).collect()).unwrap_or_default();
-    let is_header = first.iter().any(|word| word.parse::<f32>().is_err());
+    let line = lines.peek().map(|(_, line)| *line).unwrap_or_default();
+    let first = cells(line);
+    let is_header = first.iter().any(|cell| coordinate(cell).is_none());
     if is_header {
+        // Units that follow the names.
+        let names: Vec<&str> = first.iter().copied().filter(|cell| !cell.starts_with(['[', '('])).collect();
         let column = |axis: &str| {
-            let is_axis = |word: &&str| word.trim_matches(['"', '/']).eq_ignore_ascii_case(axis);
-            first
-                .iter()
-                .position(is_axis)
-                .with_context(|| format!("the first line has no column `{axis}`: {}", first.join(" ")))
+            let found = names.iter().position(|cell| named(cell).eq_ignore_ascii_case(axis));
+            found.with_context(|| format!("the first line has no column `{axis}`: {line}"))
         };
         columns = [column("x")?, column("y")?, column("z")?];
     }
@@ -80,9 +91,8 @@ fn text(text: &str) -> anyhow::Result<Vec<[f32; 3]>> {
         lines.next();
     }
     let point = |(index, line): (usize, &str)| {
-        let row: Vec<&str> = words(line).collect();
-        let coordinate = |column: usize| row.get(column)?.parse::<f32>().ok();
-        let [x, y, z] = columns.map(coordinate);
+        let row = cells(line);
+        let [x, y, z] = columns.map(|column| row.get(column).and_then(|cell| coordinate(cell)));
         let ((x, y), z) =
             x.zip(y).zip(z).with_context(|| format!("line {} is `{line}`, must have x, y and z", index + 1))?;
         Ok([x, y, z])
@@ -90,8 +100,19 @@ fn text(text: &str) -> anyhow::Result<Vec<[f32; 3]>> {
     lines.map(point).collect()
 }
 
+/// The number of a cell, which may have a comma for the point.
+fn coordinate(cell: &str) -> Option<f32> {
+    if cell.is_empty() { Some(f32::NAN) } else { cell.replace(',', ".").parse().ok() }
+}
+
+/// The name of a column, without its unit: that of `points.x [m]` is `x`.
+fn named(cell: &str) -> &str {
+    let name = cell.split(['[', '(']).next().unwrap_or_default();
+    name.rsplit('.').next().unwrap_or_default().trim_matches(['"', '/', ' '])
+}
+
 fn arrays(path: &Path) -> anyhow::Result<Points> {
-    let array = files::array_of(path, &ARRAYS)?;
+    let array = files::array(path, &ARRAYS, Purpose::Points)?;
     if let DType::Record(fields) = array.dtype() {
         let is_integer = |field: &npyz::Field| match &field.dtype {
             DType::Plain(plain) => {
@@ -244,11 +265,10 @@ fn pcd(path: &Path) -> anyhow::Result<Points> {
     let are_integers = !matches!(kind, Some(ValueKind::F32 | ValueKind::F64));
     let ViewPoint { tx, ty, tz, qw, qx, qy, qz } = reader.meta().viewpoint;
     if [tx, ty, tz, qx, qy, qz] != [0.0; 6] {
-        eprintln!(
-            "grasp: {}: the VIEWPOINT {tx} {ty} {tz} {qw} {qx} {qy} {qz} of the file is not applied to its points; if they \
-             are in the frame of the camera, give it as --frame-from-cloud={tx},{ty},{tz},{qx},{qy},{qz},{qw}",
-            path.display()
-        );
+        note(format_args!(
+            "the VIEWPOINT {tx} {ty} {tz} {qw} {qx} {qy} {qz} of the file is not applied to its points; if they \
+             are in the frame of the camera, give it as --frame-from-cloud={tx},{ty},{tz},{qx},{qy},{qz},{qw}"
+        ));
     }
     Ok(Points { xyz: reader.map(point).collect::<anyhow::Result<_>>()?, are_integers })
 }
@@ -316,4 +336,31 @@ fn ply(path: &Path) -> anyhow::Result<Points> {
         bail!("no vertex has x, y and z as numbers");
     }
     Ok(Points { xyz, are_integers })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_of_text_keep_their_columns() {
+        let expected = [[0.1, 0.2, 0.7], [0.3, 0.4, 0.8]];
+        for lines in [
+            "x,y,z\n0.1,0.2,0.7\n0.3,0.4,0.8",
+            "Point ID,x,y,z\n0,0.1,0.2,0.7\n1,0.3,0.4,0.8",
+            "x [m],y [m],z [m],intensity\n0.1, 0.2, 0.7, 5\n0.3, 0.4, 0.8,",
+            "points.z (m),\"X\",Y\n0.7,0.1,0.2\n0.8,0.3,0.4",
+            "//X [m] Y [m] Z [m]\n0.1 0.2 0.7\n0.3\t0.4  0.8",
+            "0,1;0,2;0,7\n0,3;0,4;0,8",
+            "2\n0.1 0.2 0.7 255\n0.3 0.4 0.8 255",
+        ] {
+            assert_eq!(text(lines).unwrap(), expected, "{lines}");
+        }
+        for lines in [",0.2,0.7,0.5\n0.3,0.4,0.8,0.5", "x;y;z;i\n;0.2;0.7;0.5\n0.3;0.4;0.8;0.5"] {
+            let points = text(lines).unwrap();
+            assert!(points[0][0].is_nan() && points[0][1..] == [0.2, 0.7] && points[1] == expected[1], "{points:?}");
+        }
+        let error = text("0.1,0.2\n").unwrap_err().to_string();
+        assert_eq!(error, "line 1 is `0.1,0.2`, must have x, y and z");
+    }
 }

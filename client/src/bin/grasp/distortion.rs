@@ -1,5 +1,7 @@
 //! Distortion of lenses, with the models of OpenCV and ROS.
 
+use std::fmt::{self, Display, Formatter};
+
 use anyhow::{bail, ensure};
 
 use crate::document::plain;
@@ -26,6 +28,19 @@ pub(crate) enum Distortion {
     Polynomial([f64; 12]),
     /// `equidistant` (OpenCV's fisheye): k1, k2, k3, k4.
     Equidistant([f64; 4]),
+}
+
+impl Display for Distortion {
+    fn fmt(&self, f: &mut Formatter) -> fmt::Result {
+        let (model, coefficients) = match self {
+            Self::Equidistant(coefficients) => ("equidistant", &coefficients[..]),
+            Self::Polynomial(all) if all[5..] == [0.0; 7] => ("plumb_bob", &all[..5]),
+            Self::Polynomial(all) if all[8..] == [0.0; 4] => ("rational_polynomial", &all[..8]),
+            Self::Polynomial(all) => ("thin_prism", &all[..]),
+        };
+        let numbers: Vec<String> = coefficients.iter().map(ToString::to_string).collect();
+        write!(f, "{model} ({})", numbers.join(", "))
+    }
 }
 
 impl Distortion {

@@ -6,11 +6,11 @@ use std::path::Path;
 use anyhow::{Context, bail};
 use serde_json::{Map, Value};
 
-use crate::files::{self, Values};
+use crate::files::{self, Purpose, Values};
 
 /// Reads a document. The arrays of a .npz file are an object with their names.
-pub(crate) fn document(path: &Path) -> anyhow::Result<Value> {
-    if let Some(arrays) = files::arrays(path)? {
+pub(crate) fn document(path: &Path, purpose: Purpose) -> anyhow::Result<Value> {
+    if let Some(arrays) = files::arrays(path, purpose)? {
         let nested = |(name, array): (String, files::Array)| {
             let shape: Vec<usize> = array.shape().iter().map(|&edge| edge as usize).collect();
             Ok((name, nested(&leaves(array)?, &shape)))
@@ -75,14 +75,25 @@ pub(crate) fn parse(text: &str) -> anyhow::Result<Value> {
 /// Rows of numbers, separated by spaces, commas or semicolons; lines with # are comments.
 fn rows(text: &str) -> Option<Value> {
     let lines = text.lines().map(|line| line.split('#').next().unwrap_or_default().trim());
-    let row = |line: &str| words(line).map(|word| Some(float(word.parse().ok()?))).collect::<Option<Value>>();
+    let row = |line: &str| {
+        // Without an empty cell the others would move.
+        let has_gap = cells(line.trim_end_matches([',', ';', ' '])).contains(&"");
+        words(line).map(|word| Some(float(word.parse().ok()?))).collect::<Option<Value>>().filter(|_| !has_gap)
+    };
     let rows: Vec<Value> = lines.filter(|line| !line.is_empty()).map(row).collect::<Option<_>>()?;
     (!rows.is_empty()).then(|| Value::from(rows))
 }
 
-/// The words of a row.
-pub(crate) fn words(line: &str) -> impl Iterator<Item = &str> {
+fn words(line: &str) -> impl Iterator<Item = &str> {
     line.split([' ', '\t', ',', ';']).filter(|word| !word.is_empty())
+}
+
+/// The cells of a row: between semicolons or commas, where a cell may be empty, or else between spaces.
+pub(crate) fn cells(line: &str) -> Vec<&str> {
+    match [';', ','].into_iter().find(|&separator| line.contains(separator)) {
+        Some(separator) => line.split(separator).map(str::trim).collect(),
+        None => line.split_whitespace().collect(),
+    }
 }
 
 /// All numbers of nested arrays, in order. Texts of numbers are numbers, and OpenCV and ROS put matrices into `data`.
@@ -114,6 +125,9 @@ pub(crate) fn plain(key: &str) -> String {
 /// The keys of a document, for errors.
 pub(crate) fn keys(value: &Value) -> String {
     let Some(map) = value.as_object() else { return String::new() };
+    if map.is_empty() {
+        return ": the file has no keys".to_owned();
+    }
     format!("; keys in the file: {}", listed(map.keys().map(String::as_str)))
 }
 

@@ -10,31 +10,68 @@ use npyz::npz::{NpzArchive, file_name_from_array_name};
 use npyz::{Deserialize, NpyFile, Order, TypeChar};
 
 use crate::document::listed;
+use crate::notes;
 
 /// An array of a file; its values have not been read yet.
 pub(crate) type Array = NpyFile<Box<dyn Read>>;
 
-/// First bytes of files that cannot be read, with what to do.
-const REFUSED: [(&[u8], &str); 18] = [
-    (b"\xff\xd8\xff", "a JPEG file; its compression changes depths: save PNG with 16 bits, TIFF or .npy"),
-    (b"GIF8", "a GIF file; save PNG with 16 bits, TIFF or .npy"),
-    (b"BM", "a BMP file; save PNG with 16 bits, TIFF or .npy"),
-    (b"P2", "a PGM file; save PNG with 16 bits, TIFF or .npy"),
-    (b"P5", "a PGM file; save PNG with 16 bits, TIFF or .npy"),
-    (b"Pf\n", "a PFM file; save TIFF, EXR or .npy"),
-    (b"PF\n", "a PFM file; save TIFF, EXR or .npy"),
-    (b"#?R", "a Radiance HDR file; save TIFF, EXR or .npy"),
-    (b"RIFF", "a RIFF file, such as WebP; save PNG with 16 bits, TIFF or .npy"),
-    (b"\x89HDF", "an HDF5 file; save the array as .npy"),
-    (b"MATLAB", "a MATLAB file; save the array as .npy"),
-    (b"SQLite", "an SQLite file, such as a ROS 2 bag; save a message as PNG, .npy or PCD"),
-    (b"#ROSBAG", "a ROS bag; save a message as PNG, .npy or PCD"),
-    (b"\x89MCAP", "an MCAP file; save a message as PNG, .npy or PCD"),
-    (b"\x1f\x8b", "a gzip file; unpack it with gunzip"),
-    (b"\x80\x03", "a pickle; save the array with numpy.save"),
-    (b"\x80\x04", "a pickle; save the array with numpy.save"),
-    (b"\x80\x05", "a pickle; save the array with numpy.save"),
+/// First bytes of files that cannot be read, their names, and what to do where that is not to save another format.
+const REFUSED: [(&[u8], &str, Option<&str>); 18] = [
+    (b"\xff\xd8\xff", "a JPEG file, whose compression changes the values", None),
+    (b"GIF8", "a GIF file", None),
+    (b"BM", "a BMP file", None),
+    (b"P2", "a PGM file", None),
+    (b"P5", "a PGM file", None),
+    (b"Pf\n", "a PFM file", None),
+    (b"PF\n", "a PFM file", None),
+    (b"#?R", "a Radiance HDR file", None),
+    (b"RIFF", "a RIFF file, such as WebP", None),
+    (b"\x89HDF", "an HDF5 file", None),
+    (b"MATLAB", "a MATLAB file", None),
+    (b"SQLite", "an SQLite file, such as a ROS 2 bag", Some("save a message as PNG, .npy or PCD")),
+    (b"#ROSBAG", "a ROS bag", Some("save a message as PNG, .npy or PCD")),
+    (b"\x89MCAP", "an MCAP file", Some("save a message as PNG, .npy or PCD")),
+    (b"\x1f\x8b", "a gzip file", Some("unpack it with gunzip")),
+    (b"\x80\x03", "a pickle", Some("save the array with numpy.save")),
+    (b"\x80\x04", "a pickle", Some("save the array with numpy.save")),
+    (b"\x80\x05", "a pickle", Some("save the array with numpy.save")),
 ];
+
+/// What a file is read for.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Purpose {
+    Volume,
+    Depth,
+    Labels,
+    Points,
+    Intrinsics,
+    Pose,
+}
+
+impl Purpose {
+    /// The formats in which an error advises to save it.
+    fn formats(self) -> &'static str {
+        match self {
+            Self::Volume => ".npy or .npz",
+            Self::Depth => "PNG with 16 bits, TIFF, EXR or .npy",
+            Self::Labels => "PNG or .npy",
+            Self::Points => "PCD, PLY or .npy",
+            Self::Intrinsics | Self::Pose => "JSON, YAML or .npy",
+        }
+    }
+
+    /// Name of its array in the files of data sets.
+    fn key(self) -> &'static str {
+        match self {
+            Self::Volume => "grid",
+            Self::Depth => "depth",
+            Self::Labels => "labels",
+            Self::Points => "points",
+            Self::Intrinsics => "K",
+            Self::Pose => "pose",
+        }
+    }
+}
 
 /// Format of a file, judged by its first bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -49,14 +86,17 @@ pub(crate) enum Format {
 }
 
 impl Format {
-    pub fn from_path(path: &Path) -> anyhow::Result<Self> {
+    pub fn from_path(path: &Path, purpose: Purpose) -> anyhow::Result<Self> {
         let mut first = Vec::new();
         File::open(path)?.take(12).read_to_end(&mut first)?;
         let starts = |magic: &[u8]| first.starts_with(magic);
         ensure!(!first.is_empty(), "the file is empty");
-        ensure!(first.get(4..8) != Some(b"ftyp"), "a HEIC, AVIF or MP4 file; save PNG with 16 bits, TIFF or .npy");
-        if let Some((_, reason)) = REFUSED.iter().find(|(magic, _)| starts(magic)) {
-            bail!("{reason}");
+        let formats = purpose.formats();
+        ensure!(first.get(4..8) != Some(b"ftyp"), "a HEIC, AVIF or MP4 file; save {formats}");
+        match REFUSED.iter().find(|(magic, ..)| starts(magic)) {
+            Some((_, name, Some(advice))) => bail!("{name}; {advice}"),
+            Some((_, name, None)) => bail!("{name}; save {formats}"),
+            None => (),
         }
         Ok(if starts(b"\x89PNG") {
             Self::Png
@@ -83,7 +123,8 @@ pub(crate) fn in_file<T>(path: &Path, read: impl FnOnce(&Path) -> anyhow::Result
         };
         error.chain().any(of_reading)
     };
-    let read = read(path).map_err(|error| if is_cut_short(&error) { anyhow!("the file is cut short") } else { error });
+    let read = notes::about(path, read)
+        .map_err(|error| if is_cut_short(&error) { anyhow!("the file is cut short") } else { error });
     read.with_context(|| path.display().to_string())
 }
 
@@ -120,12 +161,12 @@ fn member(archive: &mut NpzArchive<BufReader<File>>, name: &str) -> anyhow::Resu
 
 /// The arrays of a .npz file with their names, or that of a .npy file with an empty name; None for files of another
 /// kind. Images and pickled objects beside other arrays are left out.
-pub(crate) fn arrays(path: &Path) -> anyhow::Result<Option<Vec<(String, Array)>>> {
+pub(crate) fn arrays(path: &Path, purpose: Purpose) -> anyhow::Result<Option<Vec<(String, Array)>>> {
     /// More values than the poses of any request have.
     const MOST: u64 = 1 << 16;
     let mut archive = match open(path)? {
         None => return Ok(None),
-        Some(Arrays::Npy(array)) => return Ok(Some(vec![(String::new(), plain(array)?)])),
+        Some(Arrays::Npy(array)) => return Ok(Some(vec![(String::new(), plain(array, purpose)?)])),
         Some(Arrays::Npz(archive)) => archive,
     };
     let names: Vec<String> = archive.array_names().map(str::to_owned).collect();
@@ -139,16 +180,11 @@ pub(crate) fn arrays(path: &Path) -> anyhow::Result<Option<Vec<(String, Array)>>
     Ok(Some(arrays))
 }
 
-/// The array of a .npy file; for a .npz file its only array, or the array of this name.
-pub(crate) fn array(path: &Path, name: &str) -> anyhow::Result<Array> {
-    array_of(path, &[name])
-}
-
-/// As [`array`], with the first of several names.
-pub(crate) fn array_of(path: &Path, wanted: &[&str]) -> anyhow::Result<Array> {
+/// The array of a .npy file; for a .npz file its only array, or that of the first of these names.
+pub(crate) fn array(path: &Path, wanted: &[&str], purpose: Purpose) -> anyhow::Result<Array> {
     let mut archive = match open(path)? {
         None => bail!("not a file of a known format: PNG, TIFF, EXR, PCD, PLY, .npy or .npz, whatever its name"),
-        Some(Arrays::Npy(array)) => return plain(array),
+        Some(Arrays::Npy(array)) => return plain(array, purpose),
         Some(Arrays::Npz(archive)) => archive,
     };
     let names: Vec<String> = archive.array_names().map(str::to_owned).collect();
@@ -160,14 +196,16 @@ pub(crate) fn array_of(path: &Path, wanted: &[&str]) -> anyhow::Result<Array> {
             format!("no array `{}`; arrays in the file: {found}", wanted.join("` or `"))
         })?,
     };
-    plain(member(&mut archive, name)?)
+    plain(member(&mut archive, name)?, purpose)
 }
 
 /// Refuses a pickled Python object: reading it would execute what is in the file.
-fn plain(array: Array) -> anyhow::Result<Array> {
-    if is_object(&array) {
-        bail!("a pickled Python object, such as a dictionary; save the array alone: numpy.save(FILE, data[\"depth\"])");
-    }
+fn plain(array: Array, purpose: Purpose) -> anyhow::Result<Array> {
+    let key = purpose.key();
+    ensure!(
+        !is_object(&array),
+        "a pickled Python object, such as a dictionary; save the array alone: numpy.save(FILE, data[\"{key}\"])"
+    );
     Ok(array)
 }
 

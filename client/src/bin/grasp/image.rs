@@ -8,7 +8,7 @@ use grasp_client::Depth;
 use tiff::decoder::{Decoder, DecodingResult};
 
 use crate::document::listed;
-use crate::files::{self, Format, Values};
+use crate::files::{self, Format, Purpose, Values};
 
 /// The unit of integer depths of most cameras, metres.
 const MILLIMETRE: f64 = 1e-3;
@@ -21,7 +21,10 @@ pub(crate) fn parse_scale(text: &str) -> Result<f64, String> {
         return Err("must be above 0: the size of one unit of the file, metres".to_owned());
     }
     if scale > 1.0 {
-        return Err(format!("is the size of one unit of the file, metres; did you mean {}?", scale.recip()));
+        return Err(format!(
+            "must be at most 1: the size of one unit of the file, metres; did you mean {}?",
+            scale.recip()
+        ));
     }
     Ok(scale)
 }
@@ -58,7 +61,7 @@ enum Stored {
 /// Reads a depth image from a .png, .tiff, .exr or .npy file. Returns the depth, the width and the height.
 pub(crate) fn read(path: &Path, scale: Scale) -> anyhow::Result<(Depth, u32, u32)> {
     files::in_file(path, |path| {
-        let (stored, width, height) = match Format::from_path(path)? {
+        let (stored, width, height) = match Format::from_path(path, Purpose::Depth)? {
             Format::Png => png(BufReader::new(File::open(path)?))?,
             Format::Tiff => tiff(path)?,
             Format::Exr => exr(path)?,
@@ -89,7 +92,7 @@ fn depth(stored: Stored, scale: Scale) -> anyhow::Result<Depth> {
 }
 
 fn npy(path: &Path) -> anyhow::Result<(Stored, u32, u32)> {
-    let array = files::array(path, "depth")?;
+    let array = files::array(path, &["depth"], Purpose::Depth)?;
     let (&[height, width] | &[height, width, 1]) = array.shape() else {
         bail!(
             "shape {:?}: a depth image must be height × width; for a volume or a point cloud leave out --intrinsics",
@@ -185,12 +188,24 @@ pub(crate) fn decode_png(file: impl BufRead + Seek) -> anyhow::Result<(Depth, u3
     Ok((depth(stored, Scale::default())?, width, height))
 }
 
+/// What the pixels of a PNG have.
+pub(crate) fn channels(color_type: png::ColorType) -> &'static str {
+    match color_type {
+        png::ColorType::Grayscale => "grey values",
+        png::ColorType::GrayscaleAlpha => "grey values and opacity",
+        png::ColorType::Rgb => "colours (RGB)",
+        png::ColorType::Rgba => "colours and opacity (RGBA)",
+        png::ColorType::Indexed => "indexed colours",
+    }
+}
+
 fn png(file: impl BufRead + Seek) -> anyhow::Result<(Stored, u32, u32)> {
     let mut reader = png::Decoder::new(file).read_info().context("not a valid PNG file")?;
     let png::Info { width, height, bit_depth, color_type, .. } = *reader.info();
     ensure!(
         (color_type, bit_depth) == (png::ColorType::Grayscale, png::BitDepth::Sixteen),
-        "the PNG has {color_type:?} with {} bits; a depth image must have one channel of grey values with 16 bits",
+        "the PNG has {} of {} bits; a depth image must have one channel of grey values of 16 bits",
+        channels(color_type),
         bit_depth as u8
     );
     let mut bytes = vec![0; reader.output_buffer_size().context("the image is too large")?];

@@ -4,7 +4,8 @@ use std::path::Path;
 
 use anyhow::{Context, bail, ensure};
 
-use crate::files::{self, Format, Values};
+use crate::files::{self, Format, Purpose, Values};
+use crate::image::channels;
 
 /// Labels of pixels or points, with the shape of their array: height and width, or a count.
 pub(crate) struct Labels {
@@ -27,7 +28,7 @@ impl Labels {
 /// Reads the labels of objects from a PNG with 8- or 16-bit grey values, or a .npy file with integers, booleans, or
 /// floats that are whole numbers.
 pub(crate) fn read(path: &Path) -> anyhow::Result<Labels> {
-    files::in_file(path, |path| match Format::from_path(path)? {
+    files::in_file(path, |path| match Format::from_path(path, Purpose::Labels)? {
         Format::Png => png(path),
         Format::Other => npy(path),
         format => bail!("a file of the format {format:?}; labels must be PNG or .npy"),
@@ -35,7 +36,7 @@ pub(crate) fn read(path: &Path) -> anyhow::Result<Labels> {
 }
 
 fn npy(path: &Path) -> anyhow::Result<Labels> {
-    let array = files::array_of(path, &["labels", "label", "mask", "masks", "segmentation"])?;
+    let array = files::array(path, &["labels", "label", "mask", "masks", "segmentation"], Purpose::Labels)?;
     let mut shape = array.shape().to_vec();
     if let [_, _, 1] = shape[..] {
         shape.pop();
@@ -56,7 +57,8 @@ fn png(path: &Path) -> anyhow::Result<Labels> {
     let png::Info { width, height, bit_depth, color_type, .. } = *reader.info();
     ensure!(
         color_type == png::ColorType::Grayscale || color_type == png::ColorType::Indexed,
-        "PNG is {color_type:?}; labels must be grey values or indices"
+        "the PNG has {}; labels must be grey values or indices",
+        channels(color_type)
     );
     let mut bytes = vec![0; reader.output_buffer_size().context("the image is too large")?];
     reader.next_frame(&mut bytes)?;

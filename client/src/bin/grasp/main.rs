@@ -14,6 +14,7 @@ mod image;
 mod labels;
 mod live;
 mod messages;
+mod notes;
 mod numbers;
 mod overlay;
 mod pose;
@@ -51,7 +52,7 @@ use crate::demo::Demo;
 use crate::detect_args::DetectArgs;
 use crate::pose::Poses;
 use crate::replay::Replay;
-use crate::scene::SceneArgs;
+use crate::scene::{Scene, SceneArgs};
 use crate::table::Table;
 use crate::view::ViewArgs;
 use crate::watch::Watch;
@@ -268,38 +269,70 @@ impl AccessArgs {
 
 #[tokio::main(flavor = "current_thread")]
 async fn main() -> ExitCode {
-    match run(Cli::from_args()).await {
+    let cli = Cli::from_args();
+    let unit = cli.command.unit();
+    match run(cli).await {
         Ok(code) => code,
         Err(error) => {
-            eprintln!("grasp: {}", described(&error));
+            eprintln!("grasp: {}", described(&error, unit));
             ExitCode::FAILURE
         }
     }
 }
 
-/// Parts of errors whose remedy is a flag of this program.
-const FLAGS: [(&str, &str); 6] = [
-    ("values look like millimetres", "--depth-scale 0.001"),
-    ("points look like millimetres", "--cloud-scale 0.001"),
-    ("values look like metres", "--depth-scale 1"),
-    ("check the depth unit", "--depth-scale, such as 0.0001 for tenths of a millimetre"),
-    (
-        "check workspace.pose, the camera poses and the depth unit",
-        "--depth-scale, such as 0.0001 for tenths of a millimetre",
-    ),
-    ("send the header `authorization", "--token-file FILE"),
+/// The flag with the unit of the observation, and its value if it is given.
+#[derive(Clone, Copy)]
+struct UnitFlag {
+    flag: &'static str,
+    given: Option<f64>,
+}
+
+impl Command {
+    fn unit(&self) -> UnitFlag {
+        let scene = match self {
+            Self::Detect(Detect { scene, .. })
+            | Self::Score(Score { scene, .. })
+            | Self::View(View { scene, .. })
+            | Self::Bench(Bench { scene, .. }) => scene,
+            Self::Watch(watch) => watch.scene(),
+            Self::Table(table) => return table.unit(),
+            _ => return UnitFlag { flag: "--depth-scale", given: None },
+        };
+        scene.unit()
+    }
+}
+
+/// Parts of errors whose remedy is the flag of the unit, and values for it.
+const UNITS: [(&str, &str); 4] = [
+    ("values look like millimetres", "0.001"),
+    ("points look like millimetres", "0.001"),
+    ("values look like metres", "1"),
+    ("the depth unit", "with another unit, such as 0.0001 for tenths of a millimetre"),
 ];
 
 /// An error with its causes, each once, and the flag that helps.
-fn described(error: &anyhow::Error) -> String {
+fn described(error: &anyhow::Error, UnitFlag { flag, given }: UnitFlag) -> String {
     let mut text = String::new();
     for cause in error.chain().map(ToString::to_string) {
         if !text.contains(&cause) {
             text = if text.is_empty() { cause } else { format!("{text}: {cause}") };
         }
     }
-    let flag = FLAGS.iter().find(|(part, _)| text.contains(part));
-    text + &flag.map_or_else(String::new, |(_, flag)| format!(" (here: {flag})"))
+    if text.contains("send the header `authorization") {
+        return text + " (here: --token-file FILE)";
+    }
+    match (UNITS.iter().find(|(part, _)| text.contains(part)), given) {
+        (Some(_), Some(given)) => format!("{text} (here: {flag} is {given})"),
+        (Some((_, value)), None) => format!("{text} (here: {flag} {value})"),
+        (None, _) => text,
+    }
+}
+
+/// Reads the files, before the server is called.
+fn read(scene: &SceneArgs, detect: &DetectArgs) -> anyhow::Result<(Scene, DetectOptions)> {
+    let (scene, detect) = (scene.read()?, detect.read()?);
+    scene.check_objects(&detect.objects)?;
+    Ok((scene, detect))
 }
 
 fn options(scene: &SceneArgs, detect: DetectOptions) -> Options {
@@ -314,8 +347,7 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
     match command {
         Command::Demo(demo) => demo.run(server, access.read()?, json).await?,
         Command::Detect(Detect { scene: args, detect, csv, moveit, isaac }) => {
-            // Files are read first, so that an invalid file is reported without a server.
-            let (scene, detect) = (args.read()?, detect.read()?);
+            let (scene, detect) = read(&args, &detect)?;
             let opening = detect.gripper.as_ref().map_or(grasp::MAX_OPENING, |gripper| gripper.max_opening);
             let detection = scene.detect(&connect().await?, options(&args, detect)).await?;
             print(&detection)?;
@@ -329,13 +361,14 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
         }
         Command::Watch(watch) => watch.run(connect, json).await?,
         Command::Score(Score { scene: args, detect, grasps }) => {
-            let (scene, detect, grasps) = (args.read()?, detect.read()?, grasps.candidates()?);
+            let ((scene, detect), grasps) = (read(&args, &detect)?, grasps.candidates()?);
             let scores = scene.score(&connect().await?, &grasps, options(&args, detect)).await?;
             show::print(&if json { show::scores_json(&scores) } else { show::scores(&scores) })?;
         }
         Command::View(View { scene: args, detect, view }) => {
+            let (scene, detect) = read(&args, &detect)?;
             // The drawing needs the finger base frame, so --origin and --closing do not apply.
-            let (scene, detect) = (args.read()?, DetectOptions { convention: None, ..detect.read()? });
+            let detect = DetectOptions { convention: None, ..detect };
             view.check(&scene)?;
             let detection = scene.detect(&connect().await?, options(&args, detect.clone())).await?;
             let path = view.write(&scene, &detect, &detection)?;
@@ -347,8 +380,8 @@ async fn run(Cli { server, access, json, command }: Cli) -> anyhow::Result<ExitC
             })?;
         }
         Command::Bench(Bench { scene: args, detect, callers, rate, seconds }) => {
-            let scene = Arc::new(args.read()?);
-            let options = options(&args, detect.read()?);
+            let (scene, detect) = read(&args, &detect)?;
+            let (scene, options) = (Arc::new(scene), options(&args, detect));
             // No retries: refusals are part of the result.
             let access = Access { retry: Retry::NONE, ..access.read()? };
             let client = Client::connect_with(server, access).await?;

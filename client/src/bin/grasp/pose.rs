@@ -12,8 +12,8 @@ use serde_json::Value;
 
 use self::found::{all, pose, unit};
 use crate::document::document;
-use crate::files::in_file;
-use crate::numbers::{Numbers, counted};
+use crate::files::{Purpose, in_file};
+use crate::numbers::{Numbers, counted, mistyped};
 
 /// Poses as given on the command line: the numbers of one pose, or a file.
 #[derive(Clone, Debug)]
@@ -25,7 +25,7 @@ pub(crate) enum Poses {
 impl FromStr for Poses {
     type Err = String;
 
-    /// X,Y,Z or X,Y,Z,QX,QY,QZ,QW; anything else is a file.
+    /// X,Y,Z or X,Y,Z,QX,QY,QZ,QW; anything else is a file, unless it can only be numbers.
     fn from_str(text: &str) -> Result<Self, String> {
         let pose = |position: [f64; 3], [x, y, z, w]: [f64; 4]| {
             let rotation = unit(Quaternion::new(w, x, y, z))?;
@@ -35,6 +35,8 @@ impl FromStr for Poses {
             pose(position, [0.0, 0.0, 0.0, 1.0])
         } else if let Ok(Numbers([x, y, z, qx, qy, qz, qw])) = text.parse::<Numbers<7>>() {
             pose([x, y, z], [qx, qy, qz, qw])
+        } else if let Some(reason) = mistyped(text) {
+            Err(format!("{reason}; must be a file, or the numbers X,Y,Z or X,Y,Z,QX,QY,QZ,QW"))
         } else {
             Ok(Self::File(PathBuf::from(text)))
         }
@@ -103,11 +105,11 @@ fn each(path: &Path, count: usize, input: &str) -> anyhow::Result<Vec<Isometry3<
 }
 
 fn poses(path: &Path) -> anyhow::Result<Vec<Isometry3<f64>>> {
-    all(&document(path)?)
+    all(&document(path, Purpose::Pose)?)
 }
 
 fn candidates(path: &Path) -> anyhow::Result<Vec<Candidate>> {
-    let value = document(path)?;
+    let value = document(path, Purpose::Pose)?;
     let candidate = |value: &Value| {
         let width = value.get("width").filter(|width| !width.is_null());
         let width = width.map(|width| width.as_f64().with_context(|| format!("`width` is {width}, must be a number")));
@@ -139,6 +141,8 @@ mod tests {
         assert!(refused("1,2,3,0,0,0,0").contains("the norm of the quaternion is 0"));
         assert!(refused("1,2,3,0,0,2,0").contains("the norm of the quaternion is 2; it must be 1 ± 0.01"));
         assert!(refused("1,2,3,0,0,nan,0").contains("NaN"));
+        assert!(refused("1,2").starts_with("it has 2 numbers; must be a file, or the numbers X,Y,Z or"));
+        assert!(refused("1,2,o").starts_with("`o` is not a number"));
         let error = Poses::Numbers(pose).each(2, "image").unwrap_err().to_string();
         assert!(error.contains("1 pose for 2 images"), "{error}");
     }
@@ -202,6 +206,8 @@ mod tests {
             (r#"{"position": [NaN, 0, 0], "orientation": [0, 0, 0, 1]}"#.to_owned(), "the position is [NaN, 0.0, 0.0]"),
             ("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1]]".to_owned(), "send the matrix row by row"),
             ("[[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]".to_owned(), "it mirrors"),
+            (r#"{"position": [1, 2, 3], "orientation": [0, 0, 1]}"#.to_owned(), "`orientation` has three numbers"),
+            ("{}".to_owned(), "or be a 4×4 matrix: the file has no keys"),
             ("[1, 2, 3, 4, 5]".to_owned(), "no pose: each is a 4×4 or 3×4 matrix, or a row"),
         ];
         for (text, part) in texts {

@@ -1,3 +1,4 @@
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use anyhow::{Context, bail, ensure};
@@ -11,11 +12,12 @@ use grasp_perception::{Cloud, View, overview, seen_from};
 use nalgebra::{Isometry3, Point3, Vector3};
 
 use crate::camera::{self, Camera};
+use crate::document::listed;
 use crate::image::{self, Scale};
 use crate::labels::{self, Labels};
 use crate::numbers::{Numbers, counted};
 use crate::pose::Poses;
-use crate::{cloud, volume};
+use crate::{UnitFlag, cloud, volume};
 
 /// The observation: a volume, depth images with camera poses, or point clouds with camera positions.
 #[derive(Args, Clone)]
@@ -35,12 +37,17 @@ pub(crate) struct SceneArgs {
 
     /// Intrinsics of the cameras: JSON, YAML or text of ROS (CameraInfo), OpenCV, Open3D, librealsense, kalibr or BOP,
     /// a matrix in a .npy or .npz, or the numbers FX,FY,CX,CY. Images of a lens with distortion are rectified.
-    #[arg(long, value_name = "FILE|NUMBERS", conflicts_with = "camera_position")]
+    #[arg(long, value_name = "FILE|NUMBERS", conflicts_with = "camera_position", allow_hyphen_values = true)]
     intrinsics: Option<String>,
+
+    /// The images are rectified already, as those of image_rect: their matrix is `p` of a CameraInfo, or `k` if the file
+    /// has none, and its distortion is not applied.
+    #[arg(long, requires = "intrinsics", conflicts_with = "camera_position")]
+    rectified: bool,
 
     /// Unit of the depths, metres: 0.0001 for tenths of a millimetre. Default: that of the file of the intrinsics, or
     /// else 0.001 for integers and 1 for floats.
-    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, requires = "intrinsics", conflicts_with = "camera_position")]
+    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, requires = "intrinsics", conflicts_with = "camera_position", allow_hyphen_values = true)]
     depth_scale: Option<f64>,
 
     /// Send depth images as PNG files: fewer bytes on a slow network. They must be in millimetres.
@@ -86,7 +93,7 @@ pub(crate) struct SceneArgs {
     camera_position: Vec<Numbers<3>>,
 
     /// Unit of the points, metres: 0.001 for millimetres. Default: 0.001 for integers and 1 for floats.
-    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, requires = "camera_position", conflicts_with = "intrinsics")]
+    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, requires = "camera_position", conflicts_with = "intrinsics", allow_hyphen_values = true)]
     cloud_scale: Option<f64>,
 
     /// T_frame_cloud of each point cloud, formats as for --camera-from-task. Default: identity.
@@ -147,6 +154,11 @@ impl SceneArgs {
         files.iter().cloned().chain(labels).chain(intrinsics).chain(poses.filter_map(Poses::file).cloned())
     }
 
+    pub fn unit(&self) -> UnitFlag {
+        let flag = if self.camera_position.is_empty() { "--depth-scale" } else { "--cloud-scale" };
+        UnitFlag { flag, given: self.cloud_scale.or(self.depth_scale) }
+    }
+
     pub fn frame_id(&self) -> String {
         self.frame_id.clone()
     }
@@ -193,7 +205,7 @@ impl SceneArgs {
     }
 
     fn images(&self, intrinsics: &str) -> anyhow::Result<Vec<DepthView>> {
-        let camera = Camera::read(intrinsics)?;
+        let camera = Camera::read(intrinsics, self.rectified)?;
         let scale = Scale { given: self.depth_scale, of_camera: camera.depth_scale };
         let of_camera = Poses::Numbers(Isometry3::identity());
         let (poses, direction): (_, fn(Isometry3<f64>) -> Extrinsics) =
@@ -253,6 +265,25 @@ impl SceneArgs {
 }
 
 impl Scene {
+    /// Checks that the labels of the files have one of these objects, if there are labels.
+    pub fn check_objects(&self, objects: &[u32]) -> anyhow::Result<()> {
+        let labels: Vec<&Vec<u16>> = match self {
+            Self::Volume(_) => return Ok(()),
+            Self::Depth(views, _) => views.iter().filter_map(|view| view.labels.as_ref()).collect(),
+            Self::Clouds(views, _) => views.iter().filter_map(|view| view.labels.as_ref()).collect(),
+        };
+        let found: BTreeSet<u32> = labels.iter().flat_map(|labels| labels.iter().map(|&label| label.into())).collect();
+        let is_found = objects.iter().any(|label| found.contains(label));
+        let names: Vec<String> = found.iter().filter(|&&label| label != 0).map(ToString::to_string).collect();
+        ensure!(
+            labels.is_empty() || objects.is_empty() || is_found,
+            "--objects {}: not in --labels; labels there: {}",
+            objects.iter().map(ToString::to_string).collect::<Vec<_>>().join(","),
+            if names.is_empty() { "none but 0".to_owned() } else { listed(names.iter().map(String::as_str)) }
+        );
+        Ok(())
+    }
+
     /// The first depth image and the pose of the workspace, to draw over an image of that camera.
     pub fn first_view(&self, detection: &Detection) -> anyhow::Result<(View, Isometry3<f64>)> {
         let Self::Depth(views, workspace) = self else { bail!("--color needs depth images") };

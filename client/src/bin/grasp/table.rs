@@ -16,7 +16,7 @@ use crate::files::in_file;
 use crate::image::{self, Scale};
 use crate::numbers::{Numbers, short};
 use crate::overlay::Overlay;
-use crate::{cloud, show};
+use crate::{UnitFlag, cloud, show};
 
 #[derive(Args)]
 pub(crate) struct Table {
@@ -25,8 +25,12 @@ pub(crate) struct Table {
     file: PathBuf,
 
     /// Intrinsics of the camera, formats as for `grasp detect`.
-    #[arg(long, value_name = "FILE|NUMBERS", required_unless_present = "camera_position")]
+    #[arg(long, value_name = "FILE|NUMBERS", required_unless_present = "camera_position", allow_hyphen_values = true)]
     intrinsics: Option<String>,
+
+    /// The image is rectified already, as for `grasp detect`.
+    #[arg(long, conflicts_with = "camera_position")]
+    rectified: bool,
 
     /// Camera position of the point cloud in the frame of its points, metres: 0,0,0 for points in the camera frame.
     #[arg(long, value_name = "X,Y,Z", conflicts_with = "intrinsics", allow_hyphen_values = true)]
@@ -34,11 +38,11 @@ pub(crate) struct Table {
 
     /// Unit of the depths, metres. Default: that of the file of the intrinsics, or else 0.001 for integers and 1 for
     /// floats.
-    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, conflicts_with = "camera_position")]
+    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, conflicts_with = "camera_position", allow_hyphen_values = true)]
     depth_scale: Option<f64>,
 
     /// Unit of the points, metres: 0.001 for millimetres. Default: 0.001 for integers and 1 for floats.
-    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, conflicts_with = "intrinsics")]
+    #[arg(long, value_name = "METRES", value_parser = image::parse_scale, conflicts_with = "intrinsics", allow_hyphen_values = true)]
     cloud_scale: Option<f64>,
 
     /// Direction of gravity in the camera frame (z forward, x right, y down), or in the frame of the points: the
@@ -61,6 +65,11 @@ pub(crate) struct Table {
 }
 
 impl Table {
+    pub fn unit(&self) -> UnitFlag {
+        let flag = if self.camera_position.is_some() { "--cloud-scale" } else { "--depth-scale" };
+        UnitFlag { flag, given: self.cloud_scale.or(self.depth_scale) }
+    }
+
     pub fn run(&self, as_json: bool) -> anyhow::Result<()> {
         let gravity = self.gravity.map(|Numbers(gravity)| {
             Unit::try_new(Vector3::from(gravity), 1e-9).context("--gravity is 0,0,0; it must be a direction")
@@ -100,7 +109,7 @@ impl Table {
             let found = in_file(&self.file, |_| Ok(workspace.find_table_in_cloud(&cloud, height, edge)?))?;
             return Ok((found, seen));
         }
-        let camera = Camera::read(self.intrinsics.as_deref().unwrap_or_default())?;
+        let camera = Camera::read(self.intrinsics.as_deref().unwrap_or_default(), self.rectified)?;
         let scale = Scale { given: self.depth_scale, of_camera: camera.depth_scale };
         let view = camera.view(&self.file, scale, None, Extrinsics::FrameFromCamera(Isometry3::identity()))?;
         let mut frame: Frame = in_file(&self.file, |_| Ok(grasp_proto::frame(&(&view).into())?))?;

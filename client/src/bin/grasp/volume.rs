@@ -6,17 +6,17 @@ use nalgebra::Isometry3;
 use npyz::TypeChar;
 use npyz::half::f16;
 
-use crate::files::{self, Array, Format};
+use crate::files::{self, Array, Format, Purpose};
 
 /// Name of the volumes' array in VGN's data.
 const ARRAY: &str = "grid";
 
 /// Reads a volume from a .npy or .npz file, with its corner at `pose`.
 pub(crate) fn read(path: &Path, voxel_size: Option<f64>, pose: Isometry3<f64>) -> anyhow::Result<Volume> {
-    files::in_file(path, |path| match Format::from_path(path)? {
+    files::in_file(path, |path| match Format::from_path(path, Purpose::Volume)? {
         Format::Png | Format::Tiff | Format::Exr => bail!("this is an image; for a depth image give --intrinsics"),
         Format::Pcd | Format::Ply => bail!("this is a point cloud; give --camera-position"),
-        Format::Other => volume(files::array(path, ARRAY)?, voxel_size, pose),
+        Format::Other => volume(files::array(path, &[ARRAY], Purpose::Volume)?, voxel_size, pose),
     })
 }
 

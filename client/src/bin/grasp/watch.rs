@@ -36,6 +36,10 @@ pub(crate) struct Watch {
 }
 
 impl Watch {
+    pub fn scene(&self) -> &SceneArgs {
+        &self.scene
+    }
+
     /// Ctrl-C ends a live view and closes its connections; without one it ends the process.
     pub async fn run(&self, connect: impl AsyncFnOnce() -> anyhow::Result<Client>, json: bool) -> anyhow::Result<()> {
         let detect = self.detect.read()?;
@@ -98,6 +102,7 @@ impl Watch {
 
     async fn answer(&self, client: &Client, detect: &DetectOptions) -> anyhow::Result<(Scene, Detection)> {
         let scene = self.scene.read()?;
+        scene.check_objects(&detect.objects)?;
         let detection = scene.detect(client, options(&self.scene, detect.clone())).await?;
         Ok((scene, detection))
     }

@@ -116,7 +116,11 @@ impl Content {
         let output = match self {
             Self::Plain(output) => Ok(output),
             Self::Gzip(decoder) => decoder.finish(),
-            Self::Deflate(decoder) => decoder.finish(),
+            Self::Deflate(mut decoder) => match decoder.write(&[0]) {
+                // It takes no byte after the end of its stream; `finish` accepts a stream that is cut short.
+                Ok(0) => decoder.finish(),
+                _ => Err(io::Error::other("it is cut short")),
+            },
         };
         let output = output.map_err(|error| Status::invalid_argument(format!("the body is not valid: {error}")))?;
         Ok(output.bytes.into())

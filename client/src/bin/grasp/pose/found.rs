@@ -5,6 +5,7 @@ use nalgebra::{Isometry3, Matrix3, Matrix4, Quaternion, Rotation3, Translation3,
 use serde_json::Value;
 
 use crate::document::{keys, listed, number, numbers, plain};
+use crate::notes::note;
 
 /// Largest deviation of a rotation from an orthonormal matrix, and of the norm of a quaternion from 1, that is
 /// corrected: room for numbers with few decimals.
@@ -12,6 +13,9 @@ const CORRECTED: f64 = 1e-2;
 
 /// Deviations that are not reported.
 const EXACT: f64 = 1e-3;
+
+/// Names of an orientation. `grasp detect --json` writes `orientation_xyzw`.
+const ORIENTATIONS: [&str; 7] = ["orientation", "orientationxyzw", "rotation", "quaternion", "rot", "r", "q"];
 
 /// The poses of a document: of a list of objects, of an object or of bare numbers.
 pub(super) fn all(value: &Value) -> anyhow::Result<Vec<Isometry3<f64>>> {
@@ -44,6 +48,9 @@ fn of_object(value: &Value) -> anyhow::Result<Vec<Isometry3<f64>>> {
     let mut found = Vec::new();
     find(value, "", &mut found)?;
     let Some((_, poses)) = found.first() else {
+        if let Some(key) = short_orientation(value) {
+            bail!("`{key}` has three numbers, must have the four of a quaternion x, y, z, w, or the nine of a matrix");
+        }
         bail!(
             "a pose must have `position` (x, y, z) and `orientation` (quaternion x, y, z, w, or a 3×3 matrix), or be a \
              4×4 matrix{}",
@@ -83,6 +90,25 @@ fn find(value: &Value, path: &str, found: &mut Vec<(String, Vec<Isometry3<f64>>)
     Ok(())
 }
 
+/// The key of an orientation with three numbers, such as angles, beside a position.
+fn short_orientation(value: &Value) -> Option<&str> {
+    let inner = match value {
+        Value::Object(map) => {
+            let has_position = map.keys().any(|key| ["position", "translation", "t"].contains(&&*plain(key)));
+            let is_short = |(key, value): &(&String, &Value)| {
+                ORIENTATIONS.contains(&&*plain(key)) && numbers(value).is_some_and(|numbers| numbers.len() == 3)
+            };
+            if let Some((key, _)) = map.iter().find(is_short).filter(|_| has_position) {
+                return Some(key);
+            }
+            map.values().collect::<Vec<_>>()
+        }
+        Value::Array(values) => values.iter().collect(),
+        _ => return None,
+    };
+    inner.into_iter().find_map(short_orientation)
+}
+
 /// Whether numbers beside others are those of a pose: a matrix with its last row, or a name that says so.
 fn may_be_pose(name: &str, value: &Value) -> bool {
     let numbers = numbers(value).unwrap_or_default();
@@ -112,9 +138,7 @@ fn of_parts(value: &Value) -> Option<anyhow::Result<Isometry3<f64>>> {
     const QUATERNIONS: [&[&str]; 2] = [&["x", "y", "z", "w"], &["qx", "qy", "qz", "qw"]];
     let position = part(&["position", "translation", "trans", "t"], &[&["x", "y", "z"]]).map(|(_, numbers)| numbers);
     let position = position.or_else(|| direct(value, &["x", "y", "z"]))?;
-    // `grasp detect --json` writes `orientation_xyzw`.
-    let names = ["orientation", "orientationxyzw", "rotation", "quaternion", "rot", "r", "q"];
-    let (key, turn) = part(&names, &QUATERNIONS).or_else(|| Some(("qw", direct(value, QUATERNIONS[1])?)))?;
+    let (key, turn) = part(&ORIENTATIONS, &QUATERNIONS).or_else(|| Some(("qw", direct(value, QUATERNIONS[1])?)))?;
     let &[x, y, z] = &position[..] else { return None };
     let at = Translation3::new(x, y, z);
     let rotation = match turn[..] {
@@ -210,6 +234,6 @@ pub(super) fn unit(quaternion: Quaternion<f64>) -> Result<UnitQuaternion<f64>, S
 
 fn corrected(deviation: f64) {
     if deviation > EXACT {
-        eprintln!("warning: the rotation of a pose has few decimals; it was orthonormalised ({deviation:.4} off)");
+        note(format_args!("the rotation of a pose has few decimals; it was orthonormalised ({deviation:.4} off)"));
     }
 }
