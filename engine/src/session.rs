@@ -190,7 +190,8 @@ fn infer(network: &mut NetworkPlanner, defaults: DecodeParams, jobs: Vec<Job>, m
             Task::Scores(params, candidates, reply) => {
                 let decode = params.decode_params(defaults, scene.region);
                 let poses: Vec<_> = candidates.iter().map(|candidate| candidate.pose).collect();
-                let qualities = span.in_scope(|| caught(|| Ok(output.score(index, &scene.volume, &poses, &decode)?)));
+                let plan = PlanParams { decode, table: params.table };
+                let qualities = span.in_scope(|| caught(|| Ok(output.score(index, &scene.volume, &poses, &plan)?)));
                 let scores = || Ok(Scores::new(&candidates, qualities?, &scene, &params, decode.threshold));
                 send_result(reply, span, submitted, &mut batch, started, output.evaluation(), scores);
             }

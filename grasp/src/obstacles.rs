@@ -16,7 +16,7 @@ pub struct Clearance {
     pub table: Option<f64>,
     /// Smallest distance between the hand and the obstacles, metres.
     pub margin: f64,
-    /// Whether voxels that lie behind a surface in a view and were measured by none are obstacles, too.
+    /// Whether voxels that lie behind a surface in a view and were not measured by any view are obstacles, too.
     pub hidden: bool,
 }
 

@@ -125,7 +125,7 @@ impl Volume {
         })
     }
 
-    /// The volume with its hidden voxels: those that lie behind a surface in a view and were measured by none.
+    /// The volume with its hidden voxels: those that lie behind a surface in a view and were not measured by any view.
     pub(crate) fn with_hidden(self, hidden: Vec<bool>) -> Self {
         Self { hidden: Some(hidden), ..self }
     }
@@ -196,8 +196,8 @@ impl Volume {
         &self.values
     }
 
-    /// For each voxel, whether it lies behind a surface in a view and was measured by none. `None` if the volume was
-    /// not fused from views.
+    /// For each voxel, whether it lies behind a surface in a view and was not measured by any view. `None` if the volume
+    /// was not fused from views.
     #[must_use]
     pub fn hidden(&self) -> Option<&[bool]> {
         self.hidden.as_deref()

@@ -1,11 +1,12 @@
 use std::f64::consts::PI;
 use std::path::Path;
 
-use grasp::{DecodeParams, Decoded, FINGER_DEPTH, Grasp, Patch, Selection, Volume};
+use grasp::{DecodeParams, Decoded, FINGER_DEPTH, Grasp, Hand, Patch, Selection, Volume};
 use grasp_models::{Classifier, LoadError, Metadata, Options, RuntimeError};
 use grasp_perception::Scene;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
+use crate::outline::Outlines;
 use crate::{HandFit, PlanError, PlanParams};
 
 /// Smallest quality of a network's grasp that is evaluated.
@@ -31,7 +32,7 @@ const REFINED: usize = 6;
 const MOVES: usize = 2;
 
 /// Scores grasp poses and moves them: from the volume around the hand it predicts whether an execution of the grasp lifts
-/// an object.
+/// an object. Holds whose pads do not lie flat are less probable than in the simulation that it was trained in.
 ///
 /// A network scores voxels. The evaluator scores poses, so it also finds a better pose near a network's grasp.
 pub struct Evaluator {
@@ -82,15 +83,16 @@ impl Evaluator {
         dropped.suppressed += grasps.len().saturating_sub(PROPOSALS);
         grasps.truncate(PROPOSALS);
         let selection = Selection::new(&scene.volume, &params.decode);
-        let (volume, depth) = (&scene.volume, depth(&params.decode));
-        self.evaluate(&mut grasps, volume, depth)?;
+        let volume = &scene.volume;
+        let outlines = outlines(volume, params);
+        self.evaluate(&mut grasps, volume, &outlines)?;
         let reaches = |grasp: &Grasp, quality: f32| grasp.quality >= quality && selection.accepts(&grasp.pose);
         for (enough, (points, most)) in [SURE, params.decode.threshold].into_iter().zip(FITS) {
             if grasps.iter().any(|grasp| reaches(grasp, enough)) {
                 break;
             }
             let mut fitted = HandFit::for_evaluator(points, scene, params, is_wanted)?.spread(most, volume.pose());
-            self.evaluate(&mut fitted, volume, depth)?;
+            self.evaluate(&mut fitted, volume, &outlines)?;
             grasps.extend(fitted);
         }
         sort(&mut grasps);
@@ -100,8 +102,9 @@ impl Evaluator {
             if !is_wanted() {
                 return Err(PlanError::Cancelled);
             }
-            let mut moved: Vec<Grasp> = moving.iter().flat_map(|&index| variations(&grasps[index], depth)).collect();
-            self.evaluate(&mut moved, volume, depth)?;
+            let mut moved: Vec<Grasp> =
+                moving.iter().flat_map(|&index| variations(&grasps[index], hand(params).depth)).collect();
+            self.evaluate(&mut moved, volume, &outlines)?;
             let of_grasp = moved.chunks_exact(VARIATIONS);
             let better = moving.iter().zip(of_grasp).filter_map(|(&index, moved)| {
                 // A grasp that would be dropped is worse than every other one.
@@ -129,40 +132,44 @@ impl Evaluator {
         &mut self,
         poses: &[Isometry3<f64>],
         volume: &Volume,
-        params: &DecodeParams,
+        params: &PlanParams,
     ) -> Result<Vec<f32>, RuntimeError> {
-        self.probabilities(poses.len(), |index| poses[index], volume, depth(params))
+        self.probabilities(poses.len(), |index| poses[index], volume, &outlines(volume, params))
     }
 
     /// Replaces the quality of each grasp by the predicted probability of success.
-    fn evaluate(&mut self, grasps: &mut [Grasp], volume: &Volume, depth: f64) -> Result<(), RuntimeError> {
-        let qualities = self.probabilities(grasps.len(), |index| grasps[index].pose, volume, depth)?;
+    fn evaluate(&mut self, grasps: &mut [Grasp], volume: &Volume, outlines: &Outlines) -> Result<(), RuntimeError> {
+        let qualities = self.probabilities(grasps.len(), |index| grasps[index].pose, volume, outlines)?;
         for (grasp, quality) in grasps.iter_mut().zip(qualities) {
             grasp.quality = quality;
         }
         Ok(())
     }
 
-    /// The probabilities of `count` poses, for a hand whose fingers are `depth` metres long. The evaluator was trained
-    /// with fingers of [`FINGER_DEPTH`], so it gets the pose of such a hand with its fingertips in the same place.
+    /// The probabilities of `count` poses. The evaluator was trained with fingers of [`FINGER_DEPTH`], so it gets the pose
+    /// of such a hand with its fingertips in the same place.
     fn probabilities(
         &mut self,
         count: usize,
         pose: impl Fn(usize) -> Isometry3<f64>,
         volume: &Volume,
-        depth: f64,
+        outlines: &Outlines,
     ) -> Result<Vec<f32>, RuntimeError> {
-        let of_training_hand = Translation3::new(0.0, 0.0, depth - FINGER_DEPTH);
+        let of_training_hand = Translation3::new(0.0, 0.0, outlines.hand().depth - FINGER_DEPTH);
         let scores = self.classifier.score(count, |index, patch| {
             Patch::write(volume, &(pose(index) * of_training_hand), patch);
         })?;
-        Ok(scores.into_iter().map(|score| 1.0 / (1.0 + (-score).exp())).collect())
+        let probability = |(index, score): (usize, f32)| outlines.agreement(&pose(index)) / (1.0 + (-score).exp());
+        Ok(scores.into_iter().enumerate().map(probability).collect())
     }
 }
 
-/// Length of the fingers, metres.
-fn depth(params: &DecodeParams) -> f64 {
-    params.hand.map_or(FINGER_DEPTH, |hand| hand.depth)
+fn outlines(volume: &Volume, params: &PlanParams) -> Outlines {
+    Outlines::new(volume, params.table, hand(params))
+}
+
+fn hand(params: &PlanParams) -> Hand {
+    params.decode.hand.unwrap_or(Hand::GPD)
 }
 
 /// Sorts by quality, best first.

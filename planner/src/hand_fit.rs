@@ -127,7 +127,7 @@ impl HandFit {
 
 /// The observed surface in the frame of the volume's corner: that of its details, if it has them, because they show
 /// thinner objects.
-fn surface(volume: &Volume) -> Vec<SurfacePoint> {
+pub(crate) fn surface(volume: &Volume) -> Vec<SurfacePoint> {
     let Some(details) = volume.details() else { return volume.surface() };
     let in_volume = volume.pose().inverse() * details.pose();
     let moved =

@@ -7,6 +7,7 @@ mod hand_fit;
 mod model_files;
 mod model_spec;
 mod network;
+mod outline;
 mod shaf;
 
 use grasp::{Code, DecodeError, DecodeParams, Decoded, RequestError};

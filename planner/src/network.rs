@@ -1,7 +1,7 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use grasp::{DecodeParams, Decoded, Maps, Volume, decode, quality_at};
+use grasp::{Decoded, Maps, Volume, decode, quality_at};
 use grasp_models::{LoadError, Network, Options, Output, RuntimeError};
 use grasp_perception::Scene;
 use nalgebra::Isometry3;
@@ -101,10 +101,10 @@ impl Inference<'_> {
         index: usize,
         volume: &Volume,
         poses: &[Isometry3<f64>],
-        params: &DecodeParams,
+        params: &PlanParams,
     ) -> Result<Vec<f32>, PlanError> {
         match &mut self.evaluator {
-            None => Ok(quality_at(volume, &self.output.maps(index), poses, params)?),
+            None => Ok(quality_at(volume, &self.output.maps(index), poses, &params.decode)?),
             Some(evaluator) => {
                 let started = Instant::now();
                 let qualities = evaluator.score(poses, volume, params)?;

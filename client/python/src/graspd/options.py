@@ -105,8 +105,8 @@ class CollisionCheck:
     clearance: float | None = None
     """Smallest distance between the hand and the obstacles, metres; None: 0."""
     hidden: bool = False
-    """Also treat as an obstacle what lies behind a surface in a view and was measured by none. Other unobserved space counts as free. Needs
-    depth images or point clouds."""
+    """Also treat as an obstacle what lies behind a surface in a view and was not measured by any view. Other unobserved
+    space counts as free. Needs depth images or point clouds."""
 
     def __post_init__(self) -> None:
         check_numbers("CollisionCheck", {"table_height": self.table_height})
@@ -186,7 +186,7 @@ class Options:
     retreat: Retreat | None = None
     """Motion of the hand after it has closed; None: 0.1 m back along the approach."""
     region_pose: PoseLike | None = None
-    """Pose of the frame of `region` in the frame of the grasps, for a box of any direction; None: identity."""
+    """Pose of the frame of `region` in the frame of the grasps, for a box in any orientation; None: identity."""
     objects: Sequence[int] = ()
     """Only grasps on objects with these labels, for views with `labels`; the other objects remain obstacles. Empty:
     grasps on all surfaces."""

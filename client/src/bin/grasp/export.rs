@@ -6,7 +6,7 @@ use grasp_client::{Detection, Proposal};
 use nalgebra::Isometry3;
 use serde_json::json;
 
-use crate::numbers::short;
+use crate::numbers::rounded;
 
 /// One row per grasp; metres, quaternions x y z w.
 pub(crate) fn csv(detection: &Detection) -> String {
@@ -89,5 +89,5 @@ pub(crate) fn isaac(detection: &Detection, opening: f64) -> String {
 }
 
 fn parts(pose: &Isometry3<f64>) -> ([f64; 3], [f64; 4]) {
-    (pose.translation.vector.map(short).into(), pose.rotation.coords.map(short).into())
+    (pose.translation.vector.map(rounded).into(), pose.rotation.coords.map(rounded).into())
 }

@@ -34,7 +34,7 @@ pub(crate) fn mistyped(text: &str) -> Option<String> {
 }
 
 /// A coordinate to eight decimals: the digits beyond are noise of 32-bit floats.
-pub(crate) fn short(number: f64) -> f64 {
+pub(crate) fn rounded(number: f64) -> f64 {
     (number * 1e8).round() / 1e8
 }
 

@@ -10,7 +10,7 @@ use nalgebra::Isometry3;
 use serde_json::{Value, json};
 use tonic::Code;
 
-use crate::numbers::short;
+use crate::numbers::rounded;
 
 /// Prints a line. Returns false if stdout is a closed pipe, as after `| head`, which is not an error.
 pub(crate) fn print(text: &str) -> anyhow::Result<bool> {
@@ -84,8 +84,8 @@ pub(crate) fn detection_json(detection: &Detection) -> String {
     let grasps = detection.grasps.iter().map(|grasp| {
         json!({
             "quality": exact(grasp.quality),
-            "position": grasp.pose.translation.vector.map(short).as_slice(),
-            "orientation_xyzw": grasp.pose.rotation.coords.map(short).as_slice(),
+            "position": grasp.pose.translation.vector.map(rounded).as_slice(),
+            "orientation_xyzw": grasp.pose.rotation.coords.map(rounded).as_slice(),
             "width": grasp.width,
             "pregrasp": pose(&grasp.pregrasp),
             "retreat": pose(&grasp.retreat),
@@ -194,8 +194,8 @@ fn warning_code(warning: &GeometryWarning) -> String {
 
 fn pose(pose: &Isometry3<f64>) -> Value {
     json!({
-        "position": pose.translation.vector.map(short).as_slice(),
-        "orientation_xyzw": pose.rotation.coords.map(short).as_slice(),
+        "position": pose.translation.vector.map(rounded).as_slice(),
+        "orientation_xyzw": pose.rotation.coords.map(rounded).as_slice(),
     })
 }
 

@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use crate::camera::Camera;
 use crate::files::in_file;
 use crate::image::{self, Scale};
-use crate::numbers::{Numbers, short};
+use crate::numbers::{Numbers, rounded};
 use crate::overlay::Overlay;
 use crate::{UnitFlag, cloud, show};
 
@@ -119,7 +119,7 @@ impl Table {
 }
 
 fn pose_json(pose: &Isometry3<f64>) -> Value {
-    let (position, rotation) = (pose.translation.vector.map(short), pose.rotation.coords.map(short));
+    let (position, rotation) = (pose.translation.vector.map(rounded), pose.rotation.coords.map(rounded));
     json!({ "position": position.as_slice(), "orientation": rotation.as_slice() })
 }
 
