@@ -10,7 +10,7 @@ export CARGO_TARGET_DIR
 # Everything but grasp-train, which needs libtorch.
 WORKSPACE = --workspace --exclude grasp-train --locked
 TRAIN = --package grasp-train --locked
-# Compiles in half the time of a release; what computes is optimised as well.
+# Compiles sooner than a release; what computes is optimised as well.
 DEBUG = $(CARGO_TARGET_DIR)/debug
 RELEASE = $(CARGO_TARGET_DIR)/release
 

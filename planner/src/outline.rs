@@ -15,8 +15,8 @@ const CELL: f64 = 0.03;
 const STRIPS: usize = 5;
 const FEWEST: usize = 4;
 
-/// Angle between a pad and the outline up to which a grasp is as good as one that lies flat: the cone of friction 0.5, that
-/// of rubber on cardboard. Beyond it a simulated object turns between the pads until it lies flat, a real one often slips.
+/// Angle between a pad and the outline up to which a grasp is as good as one that lies flat: the cone of friction 0.5. In
+/// the simulation, with friction 1, an object turns between the pads until it lies flat.
 const FRICTION_CONE: f64 = 27.0 * PI / 180.0;
 
 /// Angle at which a grasp would be half as good, and the lowest factor: a sure grasp that is not flat comes after the

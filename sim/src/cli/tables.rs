@@ -448,7 +448,7 @@ impl Tables {
              \x20 over the seeds, if there are several.\n\
              - vgn, transformer: `vgn-packed` and `transformer-packed` on packed scenes, `vgn-pile` and `transformer-pile` on piles.\n\
              \x20 These transformers have 3.0 M parameters, the paper's has 87 M; our network of that size is not in these tables\n\
-             \x20 ([card](../models/large/transformer.md)). VGN-R: VGN's released weights. graspd: the evaluator with the grasps of\n\
+             \x20 ([card](../models/large/transformer.md)). VGN-R: VGN's released weights. vgn-refined: the evaluator with the grasps of\n\
              \x20 `vgn-packed`, in both scenarios.\n\
              - Times: {}, one thread of ONNX Runtime's CPU provider in fp32, one observation\n\
              \x20 at a time. The paper's times are for an RTX 3090.\n\
