@@ -70,6 +70,18 @@ impl Report {
         }
     }
 
+    /// Adds a later run of the same load.
+    pub fn append(&mut self, later: Self) {
+        self.elapsed += later.elapsed;
+        self.merge(later);
+        self.sort();
+    }
+
+    fn sort(&mut self) {
+        self.answered.sort_unstable();
+        self.refused.values_mut().for_each(|times| times.sort_unstable());
+    }
+
     fn merge(&mut self, other: Self) {
         self.answered.extend(other.answered);
         for (code, times) in other.refused {
@@ -99,8 +111,7 @@ where
         Arrivals::Rate(rate) => at_rate(rate, continues, &call).await,
     };
     report.elapsed = started.elapsed();
-    report.answered.sort_unstable();
-    report.refused.values_mut().for_each(|times| times.sort_unstable());
+    report.sort();
     report
 }
 

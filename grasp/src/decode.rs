@@ -1,7 +1,6 @@
 use nalgebra::{Isometry3, Translation3, Vector3};
 
-use crate::filter::{dilate, gaussian, is_window_maximum, reaches};
-use crate::maps::PROBABLE;
+use crate::filter::{gaussian, is_window_maximum, reaches};
 use crate::selection::{Decoded, Dropped, Selection};
 use crate::{Clearance, Constraints, DecodeError, FINGER_DEPTH, Grasp, Hand, Maps, Volume, VoxelOrigin};
 
@@ -97,11 +96,10 @@ pub fn decode(volume: &Volume, maps: &Maps, params: &DecodeParams) -> Result<Dec
     let n = volume.resolution();
     maps.check_quality(n)?;
 
-    let near_surface = near_surface(volume, params);
     let selection = Selection::new(volume, params);
     let above = |threshold| {
-        let smooth = gaussian(maps.quality, n, params.sigma, params.radius, threshold, *PROBABLE.end());
-        candidates(volume, maps, &smooth, &near_surface, &selection, threshold, params)
+        let smooth = gaussian(maps.quality, n, params.sigma, params.radius, threshold);
+        candidates(volume, maps, &smooth, &selection, threshold, params)
     };
     let decoded = above(params.threshold)?;
     match params.floor() {
@@ -123,7 +121,7 @@ pub fn quality_at(
 ) -> Result<Vec<f32>, DecodeError> {
     let n = volume.resolution();
     maps.check_quality(n)?;
-    let smooth = gaussian(maps.quality, n, params.sigma, params.radius, f32::MIN_POSITIVE, *PROBABLE.end());
+    let smooth = gaussian(maps.quality, n, params.sigma, params.radius, f32::MIN_POSITIVE);
     let quality = |pose: &Isometry3<f64>| {
         // The inverse of `grasp_at`.
         let pose = params.hand.map_or(*pose, |hand| pose * Translation3::new(0.0, 0.0, hand.depth - FINGER_DEPTH));
@@ -142,7 +140,6 @@ fn candidates(
     volume: &Volume,
     maps: &Maps,
     smooth: &[f32],
-    near_surface: &[bool],
     selection: &Selection,
     threshold: f32,
     params: &DecodeParams,
@@ -162,7 +159,7 @@ fn candidates(
         }
         reached += 1;
         let width = maps.width[index];
-        let count = if !near_surface[index] {
+        let count = if !is_near_free_space(volume, index, params, params.dilations) {
             &mut dropped.mask
         } else if !(width >= params.min_width && width <= params.max_width)
             || f64::from(width) * volume.voxel_size() > opening
@@ -188,13 +185,19 @@ fn candidates(
     Ok(Decoded { grasps: passed.into_iter().map(|(_, grasp)| grasp).collect(), dropped })
 }
 
-/// Mask of the voxels in front of surfaces, dilated, but not into objects.
-fn near_surface(volume: &Volume, params: &DecodeParams) -> Vec<bool> {
-    let values = volume.values();
-    let outside: Vec<bool> = values.iter().map(|&v| v > params.outside_above).collect();
-    let not_inside: Vec<bool> =
-        values.iter().map(|&v| !(v > params.inside_above && v < params.outside_above)).collect();
-    dilate(&outside, &not_inside, volume.resolution(), params.dilations)
+/// Whether a voxel is in front of a surface, or at most `steps` steps from one that is, without a step into an object.
+fn is_near_free_space(volume: &Volume, index: usize, params: &DecodeParams, steps: usize) -> bool {
+    let (value, n) = (volume.values()[index], volume.resolution());
+    let is_outside = value > params.outside_above;
+    let is_inside = value > params.inside_above && value < params.outside_above;
+    let is_next_to_one = || {
+        [1, n, n * n].into_iter().any(|stride| {
+            let at = index / stride % n;
+            let is_near = |to: usize| is_near_free_space(volume, to, params, steps - 1);
+            (at > 0 && is_near(index - stride)) || (at + 1 < n && is_near(index + stride))
+        })
+    };
+    is_outside || (steps > 0 && !is_inside && is_next_to_one())
 }
 
 impl Border {
@@ -324,6 +327,22 @@ mod tests {
             ..Dropped::default()
         };
         assert_eq!(decoded.dropped, expected);
+    }
+
+    #[test]
+    fn free_space_is_near_within_two_steps_that_do_not_enter_an_object() {
+        // Hidden voxels (0), one free voxel in the corner, and an object's voxel beside it.
+        let at = |x: usize, y: usize, z: usize| (x * N + y) * N + z;
+        let mut values = vec![0.0; N.pow(3)];
+        values[at(0, 0, 0)] = 1.0;
+        values[at(1, 0, 0)] = 0.3;
+        let volume = Volume::new(N, 0.0075, Isometry3::identity(), values).unwrap();
+        for index in 0..N.pow(3) {
+            let [x, y, z] = [index / (N * N), index / N % N, index % N];
+            // (2, 0, 0) is two steps away, but only through the object.
+            let expected = x + y + z <= 2 && ![1, 2].map(|x| at(x, 0, 0)).contains(&index);
+            assert_eq!(is_near_free_space(&volume, index, &DecodeParams::default(), 2), expected, "{x} {y} {z}");
+        }
     }
 
     #[test]

@@ -203,8 +203,10 @@ impl Backend {
             Provider::Cpu => return None,
             Provider::OpenVino => {
                 let hint = if self.precision == Precision::Fp32 { "f32" } else { "bf16" };
+                // Without pinning: OpenVINO binds the threads of every session, and of every process, to the same CPUs.
                 let config = format!(
-                    r#"{{"CPU":{{"INFERENCE_PRECISION_HINT":"{hint}","INFERENCE_NUM_THREADS":"{threads}","NUM_STREAMS":"1"}}}}"#
+                    r#"{{"CPU":{{"INFERENCE_PRECISION_HINT":"{hint}","INFERENCE_NUM_THREADS":"{threads}",
+                        "NUM_STREAMS":"1","ENABLE_CPU_PINNING":false}}}}"#
                 );
                 let provider = ep::OpenVINO::default().with_device_type("CPU").with_precision("ACCURACY");
                 provider.with_arbitrary_config("load_config", config).build()

@@ -1,5 +1,6 @@
 //! Models run on the requested provider and precision, which the list of models and the metrics report.
 
+use std::path::Path;
 use std::process::Command;
 
 use grasp::Volume;
@@ -45,6 +46,33 @@ async fn openvino_runs_when_requested() {
     let model = client.list_models().await.unwrap().remove(0);
     assert_eq!((&*model.provider, &*model.precision), ("openvino", "fp32"));
     assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 2);
+}
+
+/// By default OpenVINO binds the threads of every session to the same CPUs while it runs.
+#[tokio::test]
+#[cfg(all(target_os = "linux", target_arch = "x86_64"))]
+async fn sessions_of_openvino_are_not_bound_to_the_same_cpu() {
+    let server = Server::run(&[TestModel::new("blobs")], &["--provider", "openvino", "--workers", "2"]);
+    let client = server.client().await;
+    let cpus = |status: &Path| {
+        let status = std::fs::read_to_string(status).unwrap();
+        status.lines().find(|line| line.starts_with("Cpus_allowed_list")).map(str::to_owned)
+    };
+    let all = cpus(Path::new("/proc/self/status"));
+    for _ in 0..100 {
+        let detection = tokio::spawn({
+            let client = client.clone();
+            async move { client.detect(&volume(), Options::default()).await }
+        });
+        while !detection.is_finished() {
+            for thread in std::fs::read_dir(format!("/proc/{}/task", server.id())).unwrap() {
+                let status = thread.unwrap().path().join("status");
+                assert_eq!(cpus(&status), all, "{}", status.display());
+            }
+            tokio::task::yield_now().await;
+        }
+        detection.await.unwrap().unwrap();
+    }
 }
 
 /// Only processors with bf16 instructions exercise the check of the outputs.
