@@ -1,5 +1,6 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
+use foldhash::fast::RandomState;
 use nalgebra::{Isometry3, Point3};
 
 use crate::{Grasp, Hand};
@@ -9,8 +10,9 @@ use crate::{Grasp, Hand};
 pub struct ObjectMap {
     /// `T_map_frame`: maps points of the frame of the grasps into that of the cells.
     map_from_frame: Isometry3<f64>,
-    /// Label of the cells with observed points of an object.
-    cells: HashMap<[i32; 3], u16>,
+    /// Label of the cells with observed points of an object. A fast hash, because each of thousands of poses looks up
+    /// hundreds of cells.
+    cells: HashMap<[i32; 3], u16, RandomState>,
     /// The objects to grasp; `None` means all surfaces, also those of no object.
     wanted: Option<BTreeSet<u16>>,
 }

@@ -84,7 +84,7 @@ impl Patch {
     }
 
     /// Writes all slices but the heights. `free` is 1 in free space.
-    fn write_fields<T: Copy, N: Fn(T) -> f32, F: Fn(T) -> f32>(
+    fn write_fields<T: Copy + Default, N: Fn(T) -> f32, F: Fn(T) -> f32>(
         field: &Field<T, N>,
         free: &Field<T, F>,
         axes: &Axes,
@@ -186,11 +186,12 @@ struct Field<'a, T, V> {
     value: V,
 }
 
-impl<T: Copy, V: Fn(T) -> f32> Field<'_, T, V> {
+impl<T: Copy + Default, V: Fn(T) -> f32> Field<'_, T, V> {
     /// Writes the values along a line that starts at `start`, in voxels from the corner: each linearly between the eight
     /// nearest voxel centres, and 0 beyond them.
     ///
-    /// Positions are fixed-point numbers, because the compiler makes vector instructions of them.
+    /// Positions are fixed-point numbers, and the voxels are read before any value is computed, because the compiler makes
+    /// vector instructions of the loops without lookups.
     fn interpolate(&self, start: Vector3<f32>, step: Vector3<f32>, out: &mut [f32]) {
         const ONE: f32 = 65536.0;
         /// Farther from the corner, voxels, than every field reaches, and a longer step: so no position overflows, and those
@@ -205,22 +206,27 @@ impl<T: Copy, V: Fn(T) -> f32> Field<'_, T, V> {
         for k in 0..NZ {
             let at = start + step * k as i32;
             is_inside[k] = at.iter().fold(true, |inside, &c| inside & (c >= 0) & (c < end));
-            first[k] = ((at.x >> 16) * edge + (at.y >> 16)) * edge + (at.z >> 16);
+            let voxel = ((at.x >> 16) * edge + (at.y >> 16)) * edge + (at.z >> 16);
+            first[k] = if is_inside[k] { voxel } else { 0 };
             let weight = |c: i32| (c & 0xffff) as f32 / ONE;
             (weights[0][k], weights[1][k], weights[2][k]) = (weight(at.x), weight(at.y), weight(at.z));
         }
-        for (k, out) in out.iter_mut().take(NZ).enumerate() {
-            if !is_inside[k] {
-                *out = 0.0;
-                continue;
-            }
+        let mut corners = [[T::default(); NZ]; 8];
+        for k in 0..NZ {
             let near = &self.values[first[k] as usize..][..n + 2];
             let far = &self.values[first[k] as usize + n * n..][..n + 2];
-            let corners = |plane: &[T]| [plane[0], plane[1], plane[n], plane[n + 1]].map(&self.value);
-            let (near, far) = (corners(near), corners(far));
-            let plane: [f32; 4] = array::from_fn(|i| near[i] + weights[0][k] * (far[i] - near[i]));
+            for (side, plane) in [near, far].into_iter().enumerate() {
+                for (corner, voxel) in [plane[0], plane[1], plane[n], plane[n + 1]].into_iter().enumerate() {
+                    corners[4 * side + corner][k] = voxel;
+                }
+            }
+        }
+        for (k, out) in out.iter_mut().take(NZ).enumerate() {
+            let value = |corner: usize| (self.value)(corners[corner][k]);
+            let plane: [f32; 4] = array::from_fn(|i| value(i) + weights[0][k] * (value(i + 4) - value(i)));
             let line: [f32; 2] = array::from_fn(|i| plane[i] + weights[1][k] * (plane[i + 2] - plane[i]));
-            *out = line[0] + weights[2][k] * (line[1] - line[0]);
+            let value = line[0] + weights[2][k] * (line[1] - line[0]);
+            *out = if is_inside[k] { value } else { 0.0 };
         }
     }
 }

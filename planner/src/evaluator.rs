@@ -6,6 +6,7 @@ use grasp_models::{Classifier, LoadError, Metadata, Options, RuntimeError};
 use grasp_perception::Scene;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
+use crate::hand_fit::surface;
 use crate::outline::Outlines;
 use crate::{HandFit, PlanError, PlanParams};
 
@@ -84,14 +85,16 @@ impl Evaluator {
         grasps.truncate(PROPOSALS);
         let selection = Selection::new(&scene.volume, &params.decode);
         let volume = &scene.volume;
-        let outlines = outlines(volume, params);
+        let surface = surface(volume);
+        let outlines = Outlines::new(&surface, volume, params.table, hand(params));
         self.evaluate(&mut grasps, volume, &outlines)?;
         let reaches = |grasp: &Grasp, quality: f32| grasp.quality >= quality && selection.accepts(&grasp.pose);
         for (enough, (points, most)) in [SURE, params.decode.threshold].into_iter().zip(FITS) {
             if grasps.iter().any(|grasp| reaches(grasp, enough)) {
                 break;
             }
-            let mut fitted = HandFit::for_evaluator(points, scene, params, is_wanted)?.spread(most, volume.pose());
+            let fit = HandFit::for_evaluator(points, &surface, scene, params, is_wanted)?;
+            let mut fitted = fit.spread(most, volume.pose());
             self.evaluate(&mut fitted, volume, &outlines)?;
             grasps.extend(fitted);
         }
@@ -134,7 +137,8 @@ impl Evaluator {
         volume: &Volume,
         params: &PlanParams,
     ) -> Result<Vec<f32>, RuntimeError> {
-        self.probabilities(poses.len(), |index| poses[index], volume, &outlines(volume, params))
+        let outlines = Outlines::new(&surface(volume), volume, params.table, hand(params));
+        self.probabilities(poses.len(), |index| poses[index], volume, &outlines)
     }
 
     /// Replaces the quality of each grasp by the predicted probability of success.
@@ -151,7 +155,7 @@ impl Evaluator {
     fn probabilities(
         &mut self,
         count: usize,
-        pose: impl Fn(usize) -> Isometry3<f64>,
+        pose: impl Fn(usize) -> Isometry3<f64> + Sync,
         volume: &Volume,
         outlines: &Outlines,
     ) -> Result<Vec<f32>, RuntimeError> {
@@ -162,10 +166,6 @@ impl Evaluator {
         let probability = |(index, score): (usize, f32)| outlines.agreement(&pose(index)) / (1.0 + (-score).exp());
         Ok(scores.into_iter().enumerate().map(probability).collect())
     }
-}
-
-fn outlines(volume: &Volume, params: &PlanParams) -> Outlines {
-    Outlines::new(volume, params.table, hand(params))
 }
 
 fn hand(params: &PlanParams) -> Hand {

@@ -1,7 +1,5 @@
 //! Fits the hand to a point cloud. GPD and SHAF choose from the candidates.
 
-use std::borrow::Cow;
-
 use grasp::gpd::{Candidate, Cloud, Params, by_sample, is_on_an_object};
 use grasp::{DecodeParams, Decoded, Grasp, Hand, Selection, SurfacePoint, Volume};
 use grasp_perception::Scene;
@@ -65,22 +63,28 @@ impl HandFit {
 
     /// Fits the hand to the points of the scene as GPD does.
     pub(crate) fn new(scene: &Scene, params: &PlanParams, is_wanted: &dyn Fn() -> bool) -> Result<Self, PlanError> {
-        Self::with(Self::params, scene, params, is_wanted)
+        match &scene.points {
+            Some(points) => Self::with(Self::params, points, scene, params, is_wanted),
+            None => Self::with(Self::params, &surface(&scene.volume), scene, params, is_wanted),
+        }
     }
 
-    /// Fits the hand at `samples` points of the scene, for an evaluator.
+    /// Fits the hand at `samples` points of the scene, or else of the `surface` of its volume, for an evaluator.
     pub(crate) fn for_evaluator(
         samples: usize,
+        surface: &[SurfacePoint],
         scene: &Scene,
         params: &PlanParams,
         is_wanted: &dyn Fn() -> bool,
     ) -> Result<Self, PlanError> {
-        Self::with(|hand, table| Self::evaluator_params(samples, hand, table), scene, params, is_wanted)
+        let points = scene.points.as_deref().unwrap_or(surface);
+        Self::with(|hand, table| Self::evaluator_params(samples, hand, table), points, scene, params, is_wanted)
     }
 
-    /// Fits the hand to the points of the scene, with parameters for the hand and the height of the table.
+    /// Fits the hand to `points` of the scene, with parameters for the hand and the height of the table.
     fn with(
         fit: impl Fn(Hand, f64) -> Params,
+        points: &[SurfacePoint],
         scene: &Scene,
         params: &PlanParams,
         is_wanted: &dyn Fn() -> bool,
@@ -88,11 +92,7 @@ impl HandFit {
         let volume = &scene.volume;
         let size = volume.resolution() as f64 * volume.voxel_size();
         let table = params.table.unwrap_or(f64::NEG_INFINITY);
-        let points = match &scene.points {
-            Some(points) => Cow::Borrowed(points),
-            None => Cow::Owned(surface(volume)),
-        };
-        let of_objects = object_points(&points, size, table);
+        let of_objects = object_points(points, size, table);
         let other_points = points.len() - of_objects.len();
         let cloud = Cloud::new(of_objects);
         let fit = fit(params.decode.hand.unwrap_or(Hand::GPD), table);

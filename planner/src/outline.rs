@@ -3,10 +3,10 @@
 use std::collections::HashMap;
 use std::f64::consts::PI;
 
-use grasp::{Hand, Volume};
+use grasp::{Hand, SurfacePoint, Volume};
 use nalgebra::{Isometry3, Point3, Vector3};
 
-use crate::hand_fit::{object_points, surface};
+use crate::hand_fit::object_points;
 
 /// Edge of the cells of the search for points, metres.
 const CELL: f64 = 0.03;
@@ -33,11 +33,11 @@ pub(crate) struct Outlines {
 }
 
 impl Outlines {
-    /// The points of a volume, without those of a table at the height `table`, metres.
-    pub(crate) fn new(volume: &Volume, table: Option<f64>, hand: Hand) -> Self {
+    /// The `surface` of a volume, without that of a table at the height `table`, metres.
+    pub(crate) fn new(surface: &[SurfacePoint], volume: &Volume, table: Option<f64>, hand: Hand) -> Self {
         let size = volume.resolution() as f64 * volume.voxel_size();
         let mut cells: HashMap<_, Vec<_>> = HashMap::new();
-        for point in object_points(&surface(volume), size, table.unwrap_or(f64::NEG_INFINITY)) {
+        for point in object_points(surface, size, table.unwrap_or(f64::NEG_INFINITY)) {
             cells.entry(cell(&point.position)).or_default().push(point.position);
         }
         Self { cells, from_frame: volume.pose().inverse(), hand }
@@ -103,6 +103,7 @@ mod tests {
     use nalgebra::{Translation3, UnitQuaternion};
 
     use super::*;
+    use crate::hand_fit::surface;
 
     /// A bar along x, 40 mm wide, 60 mm above a wall, seen from above.
     fn bar() -> Volume {
@@ -121,7 +122,7 @@ mod tests {
     #[test]
     fn a_turned_hand_agrees_less() {
         let volume = bar();
-        let outlines = Outlines::new(&volume, None, Hand::PANDA);
+        let outlines = Outlines::new(&surface(&volume), &volume, None, Hand::PANDA);
         // The fingertips are 30 mm below the top of the bar, which is at z = 0.15.
         let at = |degrees: f64| {
             let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), degrees.to_radians());

@@ -21,6 +21,8 @@ pub struct Classifier {
     backend: Backend,
     /// Shape of an image.
     shape: &'static [usize],
+    /// Threads that write the images.
+    threads: usize,
     /// Name in error messages.
     name: String,
     calibration: Calibration,
@@ -78,7 +80,7 @@ impl Classifier {
         check(session.outputs(), OUTPUT, &[2..=usize::MAX]).map_err(wrong)?;
         let calibration = model.calibration.clone()?;
         let name = model.path.display().to_string();
-        let mut classifier = Self { session, backend, shape, name, calibration };
+        let mut classifier = Self { session, backend, shape, threads: model.threads, name, calibration };
         classifier.run(BATCH, vec![0.0; BATCH * classifier.size()])?;
         Ok(classifier)
     }
@@ -95,22 +97,20 @@ impl Classifier {
     }
 
     /// The scores of `count` images: the calibrated log-odds of success. Above 0, success is more likely. `write` writes the image
-    /// of an index, whose values have the classifier's shape and are in [0, 1].
+    /// of an index, whose values have the classifier's shape and are in [0, 1]. It is called on several threads.
     ///
     /// The first class is failure, all others are successes.
     ///
     /// # Errors
     /// [`RuntimeError::Run`] if ONNX Runtime fails.
-    pub fn score(&mut self, count: usize, mut write: impl FnMut(usize, &mut [f32])) -> Result<Vec<f32>, RuntimeError> {
+    pub fn score(&mut self, count: usize, write: impl Fn(usize, &mut [f32]) + Sync) -> Result<Vec<f32>, RuntimeError> {
         let mut scores = Vec::with_capacity(count);
         while scores.len() < count {
             let first = scores.len();
             let images = BATCH.min(count - first);
             let batch = if is_fixed(self.backend) { BATCH } else { images };
             let mut pixels = vec![0.0; batch * self.size()];
-            for (index, image) in pixels.chunks_exact_mut(self.size()).take(images).enumerate() {
-                write(first + index, image);
-            }
+            self.write(&mut pixels[..images * self.size()], &|index, image| write(first + index, image));
             let logits = self.run(batch, pixels).map_err(|error| run_error(&self.name, &error))?;
             let logits = logits.chunks_exact(logits.len() / batch).take(images);
             scores.extend(logits.map(|logits| self.calibration.apply(log_odds(logits))));
@@ -119,6 +119,25 @@ impl Classifier {
             }
         }
         Ok(scores)
+    }
+
+    /// Writes images, each thread a part of them.
+    fn write(&self, pixels: &mut [f32], write: &(impl Fn(usize, &mut [f32]) + Sync)) {
+        let size = self.size();
+        let part = (pixels.len() / size).div_ceil(self.threads).max(1);
+        let write_part = move |(number, pixels): (usize, &mut [f32])| {
+            for (index, image) in pixels.chunks_exact_mut(size).enumerate() {
+                write(number * part + index, image);
+            }
+        };
+        let mut parts = pixels.chunks_mut(part * size).enumerate();
+        let own = parts.next();
+        std::thread::scope(|scope| {
+            for part in parts {
+                scope.spawn(move || write_part(part));
+            }
+            own.into_iter().for_each(write_part);
+        });
     }
 
     /// The logits of a batch of concatenated images.

@@ -25,7 +25,7 @@ pub(super) struct ModelFile<'a> {
     optimized: Option<Vec<u8>>,
     /// The graph with its convolutions and matrix products in f16, converted when it is first needed.
     half: OnceCell<Result<Vec<u8>, BackendError>>,
-    threads: usize,
+    pub threads: usize,
     /// Whether the model is quantised to 8 bits.
     pub is_int8: bool,
     /// The external file with its weights, if any.

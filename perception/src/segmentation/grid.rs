@@ -80,7 +80,7 @@ impl Grid {
             let border = ((BORDER * edge as f64) as usize).max(1);
             border..edge.saturating_sub(border)
         });
-        let table = Hull(Vec::new());
+        let table = Hull::default();
         let grid = Self { width, step, points, on_table, pixel: step as f64 / camera.fx, table, inner };
         Self { table: grid.visible_table(), ..grid }
     }

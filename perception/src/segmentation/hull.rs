@@ -1,5 +1,13 @@
-/// The convex hull of points on the table, counterclockwise.
-pub(super) struct Hull(pub Vec<[f64; 2]>);
+/// The convex hull of points on the table: its edges, counterclockwise.
+#[derive(Default)]
+pub(super) struct Hull(Vec<Edge>);
+
+/// The line through an edge, with the hull on its left.
+struct Edge {
+    from: [f64; 2],
+    /// Of length 1.
+    direction: [f64; 2],
+}
 
 impl Hull {
     pub fn new(mut points: Vec<[f64; 2]>) -> Self {
@@ -18,16 +26,28 @@ impl Hull {
             hull
         };
         let (lower, upper) = (half(&mut points.iter()), half(&mut points.iter().rev()));
-        Self([lower, upper].concat())
+        let corners = [lower, upper].concat();
+        let next = corners.iter().cycle().skip(1);
+        Self(corners.iter().zip(next).map(|(&from, &to)| Edge::new(from, to)).collect())
     }
 
     /// Whether a point is in the hull, or at most `margin` outside.
     pub fn contains(&self, point: [f64; 2], margin: f64) -> bool {
-        let next = self.0.iter().cycle().skip(1);
-        self.0.iter().zip(next).all(|(a, b)| {
-            let length = (b[0] - a[0]).hypot(b[1] - a[1]);
-            left_of(*a, *b, point) >= -margin * length
-        })
+        self.0.iter().all(|edge| edge.distance(point) >= -margin)
+    }
+}
+
+impl Edge {
+    fn new(from: [f64; 2], to: [f64; 2]) -> Self {
+        let [x, y] = [to[0] - from[0], to[1] - from[1]];
+        let length = x.hypot(y).max(f64::MIN_POSITIVE);
+        Self { from, direction: [x / length, y / length] }
+    }
+
+    /// Distance of a point on the left of the line; negative on the right.
+    fn distance(&self, point: [f64; 2]) -> f64 {
+        let Self { from, direction: [x, y] } = self;
+        x * (point[1] - from[1]) - y * (point[0] - from[0])
     }
 }
 
