@@ -11,6 +11,9 @@ use crate::{Calibration, Entry};
 /// Batch size, which bounds the memory: 5.5 MB of input for GPD.
 const BATCH: usize = 32;
 
+/// Fewest images that are written on a thread of their own: starting it takes as long as writing one.
+const FEWEST: usize = 8;
+
 /// Largest allowed difference from the reference of the predicted probability of success, on average and at most.
 const MEAN_DIFFERENCE: f32 = 0.02;
 const LARGEST_DIFFERENCE: f32 = 0.2;
@@ -124,7 +127,7 @@ impl Classifier {
     /// Writes images, each thread a part of them.
     fn write(&self, pixels: &mut [f32], write: &(impl Fn(usize, &mut [f32]) + Sync)) {
         let size = self.size();
-        let part = (pixels.len() / size).div_ceil(self.threads).max(1);
+        let part = (pixels.len() / size).div_ceil(self.threads).max(FEWEST);
         let write_part = move |(number, pixels): (usize, &mut [f32])| {
             for (index, image) in pixels.chunks_exact_mut(size).enumerate() {
                 write(number * part + index, image);
