@@ -99,8 +99,9 @@ impl Classifier {
         self.backend
     }
 
-    /// The scores of `count` images: the calibrated log-odds of success. Above 0, success is more likely. `write` writes the image
-    /// of an index, whose values have the classifier's shape and are in [0, 1]. It is called on several threads.
+    /// The scores of `count` images: the calibrated log-odds of success. Above 0, success is more likely. `write`
+    /// writes the image of an index, whose values have the classifier's shape and are in [0, 1]. It is called on
+    /// several threads.
     ///
     /// The first class is failure, all others are successes.
     ///
