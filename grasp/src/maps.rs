@@ -4,7 +4,7 @@ use nalgebra::{Quaternion, UnitQuaternion};
 use thiserror::Error;
 
 /// Range of probabilities, with a tolerance for the rounding of low precisions.
-pub(crate) const PROBABLE: RangeInclusive<f32> = -1e-3..=1.001;
+const PROBABLE: RangeInclusive<f32> = -1e-3..=1.001;
 
 /// Output of a network over a volume of N³ voxels. Each array is indexed `[channel][x][y][z]`, z fastest.
 #[derive(Clone, Copy, Debug)]

@@ -55,10 +55,10 @@ async fn sessions_of_openvino_are_not_bound_to_the_same_cpu() {
     let server = Server::run(&[TestModel::new("blobs")], &["--provider", "openvino", "--workers", "2"]);
     let client = server.client().await;
     let cpus = |status: &Path| {
-        let status = std::fs::read_to_string(status).unwrap();
+        let status = std::fs::read_to_string(status).ok()?;
         status.lines().find(|line| line.starts_with("Cpus_allowed_list")).map(str::to_owned)
     };
-    let all = cpus(Path::new("/proc/self/status"));
+    let all = cpus(Path::new("/proc/self/status")).unwrap();
     for _ in 0..100 {
         let detection = tokio::spawn({
             let client = client.clone();
@@ -67,7 +67,8 @@ async fn sessions_of_openvino_are_not_bound_to_the_same_cpu() {
         while !detection.is_finished() {
             for thread in std::fs::read_dir(format!("/proc/{}/task", server.id())).unwrap() {
                 let status = thread.unwrap().path().join("status");
-                assert_eq!(cpus(&status), all, "{}", status.display());
+                // A thread may have ended meanwhile.
+                assert_eq!(cpus(&status).unwrap_or_else(|| all.clone()), all, "{}", status.display());
             }
             tokio::task::yield_now().await;
         }
