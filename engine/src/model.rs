@@ -44,8 +44,6 @@ pub struct Model {
 /// Settings that all models share.
 #[derive(Clone, Copy, Debug)]
 pub struct ModelSettings {
-    /// Sessions per model.
-    pub sessions: usize,
     /// How models are loaded.
     pub options: Options,
     /// Queue length, requests.
@@ -62,10 +60,11 @@ impl Model {
         observer: &dyn Observer,
         threads: &SessionThreads,
     ) -> anyhow::Result<Self> {
-        let ModelSettings { sessions, options, capacity, batching } = *settings;
+        let ModelSettings { options, capacity, batching } = *settings;
         let label = format!("{} {}", spec.name(), spec.version());
         let started = Instant::now();
-        let (planners, backend) = spec.load(&options, sessions)?;
+        let (planners, backend) = spec.load(&options)?;
+        let sessions = planners.len();
         let observer = observer.model(&label);
         // Created before the threads, so that an early return drops it, which closes the queue and ends started
         // threads.
@@ -105,7 +104,7 @@ impl Model {
             model.service_time.start_with(time.with_context(failed)?);
         }
         let Backend { provider, precision, cuda_graph } = backend;
-        let (threads, duration) = (options.threads, started.elapsed());
+        let (threads, duration) = (options.threads(backend), started.elapsed());
         info!(
             model = model.label,
             sha256 = model.spec.sha256(),

@@ -11,6 +11,9 @@ mod network;
 mod reference_check;
 mod search;
 
+use std::num::NonZeroUsize;
+use std::thread::available_parallelism;
+
 pub use backend::{Backend, BackendError, Choice, NameError, Precision, Provider};
 pub use batch_session::batch_sizes;
 pub use classifier::Classifier;
@@ -27,8 +30,10 @@ pub const OUTPUTS: [(&str, usize); 3] = [("quality", 1), ("rotation", 4), ("widt
 /// Options for running a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Options {
-    /// Number of threads of one inference.
-    pub threads: usize,
+    /// Number of sessions of a model; `None` selects the number that is fastest with the provider.
+    pub sessions: Option<usize>,
+    /// Number of threads of one inference; `None` selects the number that is fastest with the provider.
+    pub threads: Option<usize>,
     /// Execution provider; `None` selects the fastest available one whose outputs match the reference.
     pub provider: Option<Provider>,
     /// Precision; `None` selects the fastest.
@@ -42,7 +47,14 @@ pub struct Options {
 impl Default for Options {
     /// One thread of ONNX Runtime's CPU kernels, one volume at a time. The results are the same on every machine.
     fn default() -> Self {
-        Self { threads: 1, provider: Some(Provider::Cpu), precision: None, max_batch: 1, cuda_graphs: true }
+        Self {
+            sessions: Some(1),
+            threads: Some(1),
+            provider: Some(Provider::Cpu),
+            precision: None,
+            max_batch: 1,
+            cuda_graphs: true,
+        }
     }
 }
 
@@ -50,11 +62,54 @@ impl Options {
     /// The fastest available provider and precision.
     #[must_use]
     pub fn auto(threads: usize) -> Self {
-        Self { threads, provider: None, ..Self::default() }
+        Self { threads: Some(threads), provider: None, ..Self::default() }
     }
+
+    /// Number of sessions of a model on this backend.
+    ///
+    /// OpenVINO needs two to use all CPUs: while one waits for the slower of its threads, or for its next job, the other
+    /// one computes. With ONNX Runtime's own kernels the threads of an idle session would take CPU time from the others,
+    /// because they wait in a loop. A GPU computes one inference at a time.
+    #[must_use]
+    pub fn sessions(&self, backend: Backend) -> usize {
+        self.sessions.unwrap_or(if backend.provider == Provider::OpenVino { cpus().min(2) } else { 1 })
+    }
+
+    /// Number of threads of one inference on this backend: all CPUs for each session of OpenVINO, whose sessions share one
+    /// pool of threads; with other providers a part of them.
+    #[must_use]
+    pub fn threads(&self, backend: Backend) -> usize {
+        let sessions = if backend.provider == Provider::OpenVino { 1 } else { self.sessions(backend) };
+        self.threads.unwrap_or((cpus() / sessions).max(1))
+    }
+}
+
+/// The CPUs that are available to the process.
+fn cpus() -> usize {
+    available_parallelism().map_or(1, NonZeroUsize::get)
 }
 
 /// The error of a run of the model.
 fn run_error(model: &str, error: &ort::Error) -> RuntimeError {
     RuntimeError::Run { model: model.to_owned(), reason: error.to_string() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_openvino_has_several_sessions_by_default_and_each_has_all_cpus() {
+        let on = |provider| Backend { provider, ..Backend::REFERENCE };
+        let of = |sessions, threads, provider| {
+            let options = Options { sessions, threads, ..Options::default() };
+            (options.sessions(on(provider)), options.threads(on(provider)))
+        };
+        assert_eq!(of(None, None, Provider::OpenVino), (cpus().min(2), cpus()));
+        assert_eq!(of(None, None, Provider::Cpu), (1, cpus()));
+        assert_eq!(of(None, None, Provider::Cuda), (1, cpus()));
+        assert_eq!(of(Some(3), None, Provider::OpenVino), (3, cpus()));
+        assert_eq!(of(Some(2), None, Provider::Cpu), (2, (cpus() / 2).max(1)));
+        assert_eq!(of(Some(2), Some(5), Provider::Cpu), (2, 5));
+    }
 }

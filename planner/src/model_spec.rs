@@ -136,38 +136,42 @@ impl ModelSpec {
         }
     }
 
-    /// Loads the planner `count` times, once per thread, and returns the backend that runs it.
+    /// Loads the planner once per session, and returns the backend that runs it.
     ///
     /// # Errors
     /// [`LoadError`] if the file is invalid or cannot run with `options`.
-    pub fn load(&self, options: &Options, count: usize) -> Result<(Vec<Loaded>, Backend), LoadError> {
+    pub fn load(&self, options: &Options) -> Result<(Vec<Loaded>, Backend), LoadError> {
         let single = |planner: Box<dyn Planner + Send>| Loaded::Single(planner);
         // Only networks are exported for 8 bits.
         let precision = options.precision.filter(|&precision| precision != Precision::Int8);
         let of_classifiers = Options { precision, ..*options };
         Ok(match self {
             Self::Network(entry) => {
-                let networks = Network::load_several(entry, options, count)?;
+                let networks = Network::load_several(entry, options)?;
                 let backend = networks.first().map_or(Backend::REFERENCE, Network::backend);
                 let planner = |network| Loaded::Network(Box::new(NetworkPlanner::new(network, None)));
                 (networks.into_iter().map(planner).collect(), backend)
             }
             Self::Evaluated { network, evaluator } => {
-                let networks = Network::load_several(network, options, count)?;
+                let networks = Network::load_several(network, options)?;
                 let backend = networks.first().map_or(Backend::REFERENCE, Network::backend);
-                let evaluators = Classifier::load_several(evaluator, &Patch::SHAPE, &of_classifiers, count)?;
+                let of_evaluators = Options { sessions: Some(networks.len()), ..of_classifiers };
+                let evaluators = Classifier::load_several(evaluator, &Patch::SHAPE, &of_evaluators)?;
                 let planner = |(network, evaluator)| {
                     Loaded::Network(Box::new(NetworkPlanner::new(network, Some(Evaluator::new(evaluator)))))
                 };
                 (networks.into_iter().zip(evaluators).map(planner).collect(), backend)
             }
             Self::Gpd(entry) => {
-                let classifiers = Classifier::load_several(entry, &Image::SHAPE, &of_classifiers, count)?;
+                let classifiers = Classifier::load_several(entry, &Image::SHAPE, &of_classifiers)?;
                 let backend = classifiers.first().map_or(Backend::REFERENCE, Classifier::backend);
                 let planner = |classifier| single(Box::new(Gpd::new(classifier)));
                 (classifiers.into_iter().map(planner).collect(), backend)
             }
-            Self::Shaf => ((0..count).map(|_| single(Box::new(Shaf))).collect(), Backend::REFERENCE),
+            Self::Shaf => {
+                let sessions = 0..options.sessions(Backend::REFERENCE);
+                (sessions.map(|_| single(Box::new(Shaf))).collect(), Backend::REFERENCE)
+            }
         })
     }
 }

@@ -154,9 +154,9 @@ fn the_fastest_backend_of_gpd_agrees_with_the_reference() {
 #[test]
 fn classifiers_run_beside_int8_networks() {
     let entry = |folder: &Path, name: &str| Store::open(folder).unwrap().get(name, None).unwrap().clone();
-    let int8 = Options { precision: Some(Precision::Int8), ..Options::default() };
+    let int8 = Options { sessions: Some(2), precision: Some(Precision::Int8), ..Options::default() };
     let gpd = ModelSpec::Gpd(entry(&zoo("classifiers"), "gpd"));
-    let (planners, backend) = gpd.load(&int8, 2).unwrap();
+    let (planners, backend) = gpd.load(&int8).unwrap();
     assert_eq!((planners.len(), backend), (2, Backend::REFERENCE));
 
     let folder = tempfile::tempdir().unwrap();
@@ -166,7 +166,7 @@ fn classifiers_run_beside_int8_networks() {
     with_int8(&network, &ranges).unwrap().write(&folder.path().join("vgn-packed.onnx")).unwrap();
     let network = entry(folder.path(), "vgn-packed");
     let evaluated = ModelSpec::Evaluated { network, evaluator: entry(&zoo("evaluators"), "vgn-refined") };
-    let (planners, backend) = evaluated.load(&int8, 2).unwrap();
+    let (planners, backend) = evaluated.load(&int8).unwrap();
     assert_eq!((planners.len(), backend.precision), (2, Precision::Int8));
 }
 

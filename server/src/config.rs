@@ -3,10 +3,8 @@ mod flags;
 
 use std::ffi::OsStr;
 use std::net::SocketAddr;
-use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::thread::available_parallelism;
 use std::time::Duration;
 
 use clap::CommandFactory;
@@ -121,13 +119,12 @@ impl Config {
     }
 
     fn new(flags: Flags, store: Store, fingerprints: Fingerprints, tls: Option<Tls>) -> Self {
-        let cpus = available_parallelism().map_or(1, NonZeroUsize::get);
-        let sessions = usize::from(flags.workers);
         let Choice(provider) = flags.provider;
         let Choice(precision) = flags.precision;
         let batching = Batching { max: flags.max_batch.into(), delay: flags.batch_delay };
         let options = Options {
-            threads: flags.threads.map_or((cpus / sessions).max(1), usize::from),
+            sessions: flags.workers.map(usize::from),
+            threads: flags.threads.map(usize::from),
             provider,
             precision,
             max_batch: batching.max,
@@ -140,7 +137,7 @@ impl Config {
             max_bytes: flags.max_model_bytes,
             timeout: flags.reload_timeout,
             is_controlled: flags.allow_model_control,
-            models: ModelSettings { sessions, options, capacity: flags.queue.into(), batching },
+            models: ModelSettings { options, capacity: flags.queue.into(), batching },
         };
         Self {
             store,

@@ -256,7 +256,7 @@ impl Process<'_> {
         let hosts = config.http_hosts.clone();
         let http = tokio::spawn(crate::http::serve(listeners.http, hosts, pages, of_pages, state.clone()));
 
-        let ModelSettings { sessions, capacity, batching, .. } = config.folder.models;
+        let ModelSettings { options, capacity, batching } = config.folder.models;
         let calls = Calls::new(Arc::clone(metrics), recent, state.clone(), config.tokens.clone());
         // Requests that are converted and fused, one for each CPU; as many as in the queue of a model may wait.
         let conversions = FairSemaphore::new(processors(), capacity);
@@ -269,8 +269,8 @@ impl Process<'_> {
             recorder,
             streams: OpenStreams::default(),
             stall: config.limits.stall,
-            // A stream keeps the sessions busy, but never fills a queue.
-            read_ahead: (sessions * batching.max).min(capacity / 2).max(1),
+            // A stream keeps the sessions busy, of which a model has at most two by default, but never fills a queue.
+            read_ahead: (options.sessions.unwrap_or(2) * batching.max).min(capacity / 2).max(1),
             conversions,
         };
         let rest = listeners.rest.map(|listener| {

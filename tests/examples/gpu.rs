@@ -85,7 +85,7 @@ impl Bench {
         let largest = BATCHES.into_iter().max().unwrap_or(1);
         let (provider, precision) = (Some(self.provider), Some(precision));
         let started = Instant::now();
-        let running = Running { threads: 1, provider, precision, max_batch: largest, cuda_graphs };
+        let running = Running { provider, precision, max_batch: largest, cuda_graphs, ..Running::default() };
         let mut network = Network::load(model, &running)?;
         let loaded = started.elapsed();
         ensure!(network.backend().cuda_graph == cuda_graphs, "CUDA graphs were rejected, see the log");

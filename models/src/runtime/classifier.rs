@@ -41,7 +41,7 @@ impl Classifier {
         loading::load(path, &Self::options(options), |model, backend| Self::open_checked(model, backend, shape))
     }
 
-    /// Loads an entry of a store `count` times, once per thread. All copies use the same backend.
+    /// Loads an entry of a store once per session. All copies use the same backend.
     ///
     /// # Errors
     /// [`LoadError`] names the file and the problem, including a file that changed since the store read it.
@@ -49,11 +49,10 @@ impl Classifier {
         entry: &Entry,
         shape: &'static [usize],
         options: &Options,
-        count: usize,
     ) -> Result<Vec<Self>, LoadError> {
         let checked = |model: &ModelFile<'_>, backend| Self::open_checked(model, backend, shape);
         let others = |model: &ModelFile<'_>, backend| Self::open(model, backend, shape);
-        loading::load_several(entry, &Self::options(options), count, checked, others)
+        loading::load_several(entry, &Self::options(options), checked, others)
     }
 
     /// Without CUDA graphs, because batches have any size.
@@ -83,7 +82,8 @@ impl Classifier {
         check(session.outputs(), OUTPUT, &[2..=usize::MAX]).map_err(wrong)?;
         let calibration = model.calibration.clone()?;
         let name = model.path.display().to_string();
-        let mut classifier = Self { session, backend, shape, threads: model.threads, name, calibration };
+        let threads = model.options.threads(backend);
+        let mut classifier = Self { session, backend, shape, threads, name, calibration };
         classifier.run(BATCH, vec![0.0; BATCH * classifier.size()])?;
         Ok(classifier)
     }

@@ -27,11 +27,10 @@ pub(super) fn load<T>(
     load().map_err(|reason| LoadError { path: path.to_owned(), reason })
 }
 
-/// Loads an entry of a store `count` times. The first copy is checked; the others use its backend and are not.
+/// Loads an entry of a store once per session. The first copy is checked; the others use its backend and are not.
 pub(super) fn load_several<T>(
     entry: &Entry,
     options: &Options,
-    count: usize,
     open_checked: impl Fn(&ModelFile, Backend) -> Result<T, LoadReason>,
     open: impl Fn(&ModelFile, Backend) -> Result<T, LoadReason>,
 ) -> Result<Vec<T>, LoadError> {
@@ -40,8 +39,8 @@ pub(super) fn load_several<T>(
         let bytes = without_weight_inputs(entry.bytes()?)?;
         let model = ModelFile::new(&entry.path, &bytes, options);
         let (first, backend) = fastest(&model, options, open_checked)?;
-        let others = (1..count).map(|_| open(&model, backend));
-        std::iter::once(Ok(first)).chain(others).take(count).collect::<Result<_, LoadReason>>()
+        let others = (1..options.sessions(backend)).map(|_| open(&model, backend));
+        std::iter::once(Ok(first)).chain(others).collect::<Result<_, LoadReason>>()
     };
     load().map_err(|reason| LoadError { path: entry.path.clone(), reason })
 }

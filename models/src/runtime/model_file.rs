@@ -25,7 +25,7 @@ pub(super) struct ModelFile<'a> {
     optimized: Option<Vec<u8>>,
     /// The graph with its convolutions and matrix products in f16, converted when it is first needed.
     half: OnceCell<Result<Vec<u8>, BackendError>>,
-    pub threads: usize,
+    pub options: &'a Options,
     /// Whether the model is quantised to 8 bits.
     pub is_int8: bool,
     /// The external file with its weights, if any.
@@ -38,7 +38,7 @@ pub(super) struct ModelFile<'a> {
 
 impl<'a> ModelFile<'a> {
     /// Reads the properties. An invalid file has none; ONNX Runtime reports a better error when it loads the file.
-    pub fn new(path: &'a Path, bytes: &'a [u8], options: &Options) -> Self {
+    pub fn new(path: &'a Path, bytes: &'a [u8], options: &'a Options) -> Self {
         let model = ModelProto::from_bytes(bytes).unwrap_or_default();
         let optimized = optimized(&model, bytes);
         let calibration = Calibration::from_model(&model);
@@ -48,8 +48,8 @@ impl<'a> ModelFile<'a> {
         let batch = graph.input.iter().find(|input| is_batch(input.name())).and_then(|input| input.free(0));
         let batch = batch.map(str::to_owned);
         let external_weights = graph.initializer.iter().find_map(|tensor| tensor.external_file()).map(str::to_owned);
-        let (half, threads) = (OnceCell::new(), options.threads);
-        Self { path, bytes, optimized, half, threads, is_int8, external_weights, batch, calibration }
+        let half = OnceCell::new();
+        Self { path, bytes, optimized, half, options, is_int8, external_weights, batch, calibration }
     }
 
     /// The unmodified file, if an optimized graph is used.
@@ -63,13 +63,14 @@ impl<'a> ModelFile<'a> {
     /// Creates a session, for one fixed batch size if given.
     pub fn open(&self, backend: Backend, size: Option<usize>) -> Result<Session, LoadReason> {
         let runtime = runtime()?;
+        let threads = self.options.threads(backend);
         let builder = Session::builder(&runtime.environment)?;
-        let builder = builder.with_intra_threads(self.threads).map_err(ort::Error::from)?;
+        let builder = builder.with_intra_threads(threads).map_err(ort::Error::from)?;
         let mut builder = builder.with_inter_threads(1).map_err(ort::Error::from)?;
         if let (Some(name), Some(size)) = (&self.batch, size) {
             builder = builder.with_dimension_override(name, size as i64).map_err(ort::Error::from)?;
         }
-        if let Some(provider) = backend.dispatch(self.threads) {
+        if let Some(provider) = backend.dispatch(threads) {
             builder = builder.with_execution_providers([provider]).map_err(ort::Error::from)?;
         }
         if matches!(backend.provider, Provider::OpenVino | Provider::Cuda) {

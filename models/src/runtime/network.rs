@@ -38,14 +38,14 @@ impl Network {
         loading::load(path, options, |model, backend| Self::open_checked(model, backend, options.max_batch))
     }
 
-    /// Loads an entry of a store `count` times, once per thread. All copies use the same backend.
+    /// Loads an entry of a store once per session. All copies use the same backend.
     ///
     /// # Errors
     /// [`LoadError`] names the file and the problem, including a file that changed since the store read it.
-    pub fn load_several(entry: &Entry, options: &Options, count: usize) -> Result<Vec<Self>, LoadError> {
+    pub fn load_several(entry: &Entry, options: &Options) -> Result<Vec<Self>, LoadError> {
         let checked = |model: &ModelFile<'_>, backend| Self::open_checked(model, backend, options.max_batch);
         let others = |model: &ModelFile<'_>, backend| Self::open(model, backend, options.max_batch);
-        loading::load_several(entry, options, count, checked, others)
+        loading::load_several(entry, options, checked, others)
     }
 
     /// Loads with one backend and compares its outputs with the reference, which is the unmodified file on the CPU

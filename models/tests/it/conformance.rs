@@ -46,7 +46,7 @@ fn every_available_backend_matches_the_reference_on_every_shipped_network() {
         let expected = reference.infer(&volumes).unwrap();
         for (provider, precision) in PROVIDERS.into_iter().flat_map(|p| PRECISIONS.map(|precision| (p, precision))) {
             let backend = Backend { provider, precision, cuda_graph: false };
-            let few = Options { threads: 2, max_batch: 3, cuda_graphs: false, ..Options::default() };
+            let few = Options { threads: Some(2), max_batch: 3, cuda_graphs: false, ..Options::default() };
             let options = Options { provider: Some(provider), precision: Some(precision), ..few };
             let mut network = match Network::load(&path, &options) {
                 Ok(network) => network,

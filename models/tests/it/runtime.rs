@@ -23,7 +23,7 @@ fn save(model: &ModelProto) -> (TempDir, PathBuf) {
 
 fn load(model: &ModelProto) -> Network {
     let (_folder, path) = save(model);
-    Network::load(&path, &Options { threads: 2, ..Options::default() }).unwrap()
+    Network::load(&path, &Options { threads: Some(2), ..Options::default() }).unwrap()
 }
 
 fn volume(resolution: usize, seed: usize) -> Volume {
@@ -350,7 +350,7 @@ fn a_network_runs_on_the_requested_backend() {
     assert_eq!(reference.backend(), Backend::REFERENCE);
     let auto = Network::load(&path, &Options::auto(2)).unwrap().backend();
     let explicit =
-        Options { threads: 2, provider: Some(auto.provider), precision: Some(auto.precision), ..Options::default() };
+        Options { threads: Some(2), provider: Some(auto.provider), precision: Some(auto.precision), ..Options::default() };
     assert_eq!(
         Network::load(&path, &explicit).unwrap().backend(),
         auto,
@@ -376,7 +376,7 @@ fn openvino_outputs_match_the_reference() {
     let precisions = [(Precision::Fp32, 1e-4), (Precision::Bf16, 0.02)];
     for (precision, tolerance) in precisions {
         let provider = Some(Provider::OpenVino);
-        let options = Options { threads: 2, provider, precision: Some(precision), max_batch: 3, ..Options::default() };
+        let options = Options { threads: Some(2), provider, precision: Some(precision), max_batch: 3, ..Options::default() };
         let mut network = match Network::load(&path, &options) {
             Ok(network) => network,
             // Older processors have no bf16 instructions.

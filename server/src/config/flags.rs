@@ -53,11 +53,13 @@ pub(super) struct Flags {
     #[arg(long, env = "GRASPD_HTTP_HOST", value_name = "NAMES", value_delimiter = ',')]
     pub http_host: Vec<String>,
 
-    /// Sessions per model. Each session processes one batch at a time.
-    #[arg(long, env = "GRASPD_WORKERS", value_name = "N", default_value = "1", value_parser = count())]
-    pub workers: u16,
+    /// Sessions per model. Each session processes one batch at a time. Default: two with the provider openvino, one with
+    /// others.
+    #[arg(long, env = "GRASPD_WORKERS", value_name = "N", value_parser = count())]
+    pub workers: Option<u16>,
 
-    /// Threads per session. Default: the CPUs available to the process divided by --workers.
+    /// Threads per session. Default: the CPUs available to the process, with other providers than openvino divided by
+    /// --workers.
     #[arg(long, env = "GRASPD_THREADS", value_name = "N", value_parser = count())]
     pub threads: Option<u16>,
 

@@ -16,12 +16,11 @@ use crate::{Bench, run_load};
 const SCENES: usize = 400;
 
 impl Bench {
-    /// The throughput of a stream with several sessions, compared with as many concurrent calls as keep them busy.
+    /// The throughput of a stream, compared with as many concurrent calls as keep the sessions busy.
     pub async fn streams(&self, findings: &mut Findings) -> anyhow::Result<()> {
-        let workers = self.threads.to_string();
-        let server = self.serve("vgn", &["--workers", &workers, "--threads", "1"])?;
+        let server = self.serve("vgn", &[])?;
         let client = Client::connect(server.grpc().to_string()).await?;
-        let title = format!("vgn, one caller, {SCENES} scenes, {workers} sessions of one thread");
+        let title = format!("vgn, one caller, {SCENES} scenes");
         let mut table = Table::new(&title, &["answers/s"]);
         let (mut calls, mut stream) = (0.0_f64, 0.0_f64);
         // In turns, so that a slow minute affects both.

@@ -48,11 +48,22 @@ async fn openvino_runs_when_requested() {
     assert_eq!(client.detect(&volume(), Options::default()).await.unwrap().grasps.len(), 2);
 }
 
+#[test]
+#[cfg(all(target_os = "linux", target_arch = "x86_64"))]
+fn a_model_has_two_sessions_with_openvino_and_one_with_cpu_by_default() {
+    for (provider, sessions) in [("openvino", std::thread::available_parallelism().unwrap().get().min(2)), ("cpu", 1)] {
+        let server = Server::run(&[TestModel::new("blobs")], &["--provider", provider]);
+        let threads = std::fs::read_dir(format!("/proc/{}/task", server.id())).unwrap();
+        let names = threads.filter_map(|thread| std::fs::read_to_string(thread.unwrap().path().join("comm")).ok());
+        assert_eq!(names.filter(|name| name.starts_with("blobs ")).count(), sessions, "{provider}");
+    }
+}
+
 /// By default OpenVINO binds the threads of every session to the same CPUs while it runs.
 #[tokio::test]
 #[cfg(all(target_os = "linux", target_arch = "x86_64"))]
 async fn sessions_of_openvino_are_not_bound_to_the_same_cpu() {
-    let server = Server::run(&[TestModel::new("blobs")], &["--provider", "openvino", "--workers", "2"]);
+    let server = Server::run(&[TestModel::new("blobs")], &["--provider", "openvino"]);
     let client = server.client().await;
     let cpus = |status: &Path| {
         let status = std::fs::read_to_string(status).ok()?;

@@ -27,7 +27,7 @@ fn difference(path: &Path, execution: ExecutionOptions) -> f32 {
     let input = Tensor::from_slice(&values).reshape([2, 1, 40, 40, 40]);
     let torch = no_grad(|| executor.forward(&input)).unwrap();
 
-    let mut network = Network::load(path, &Options { threads: 2, ..Options::default() }).unwrap();
+    let mut network = Network::load(path, &Options { threads: Some(2), ..Options::default() }).unwrap();
     let onnx = network.infer(&volumes.each_ref()).unwrap();
     let mut worst = 0.0_f32;
     for index in 0..2 {
