@@ -2,6 +2,7 @@ mod details;
 mod no_measurement;
 
 use nalgebra::Isometry3;
+use rayon::prelude::*;
 
 use crate::measurement::{Measurement, Sample};
 use crate::surface::Field;
@@ -78,9 +79,9 @@ impl Fusion {
     pub fn integrate(&mut self, image: &DepthImage, camera_from_task: &Isometry3<f64>) -> usize {
         let (n, decay) = (self.resolution, self.decay);
         let measurement = Measurement::new(image, camera_from_task, self.voxel_size, self.truncation);
-        let mut measured = 0;
-        for (row, voxels) in self.voxels.chunks_exact_mut(n).enumerate() {
-            measurement.column([row / n, row % n, 0], n, |z, sample| match sample {
+        let integrate_column = |column: [usize; 2], voxels: &mut [Voxel]| {
+            let mut measured = 0;
+            measurement.column([column[0], column[1], 0], n, |z, sample| match sample {
                 Sample::Hidden => voxels[z].hide(),
                 Sample::Distance(distance) => {
                     let voxel = &mut voxels[z];
@@ -91,8 +92,12 @@ impl Fusion {
                     measured += 1;
                 }
             });
-        }
-        measured
+            measured
+        };
+        let integrate_layer = |(x, voxels): (usize, &mut [Voxel])| -> usize {
+            voxels.chunks_exact_mut(n).enumerate().map(|(y, voxels)| integrate_column([x, y], voxels)).sum()
+        };
+        self.voxels.par_chunks_exact_mut(n * n).enumerate().map(integrate_layer).sum()
     }
 
     /// Share of the voxels that a view has measured, also as free space, without those of `padding` on each side.

@@ -1,6 +1,7 @@
 use std::collections::HashMap;
 
 use nalgebra::{Point3, Vector3};
+use rayon::prelude::*;
 
 use crate::fusion::NEAR_SURFACE;
 use crate::{Details, Fusion, Volume};
@@ -24,7 +25,7 @@ pub struct SurfaceMesh {
 }
 
 /// A truncated signed distance field over a cube.
-pub(crate) trait Field {
+pub(crate) trait Field: Sync {
     /// Voxels along an edge.
     fn resolution(&self) -> usize;
 
@@ -39,12 +40,17 @@ pub(crate) trait Field {
 
     /// The zero crossings between neighbouring voxels.
     fn surface(&self) -> Vec<SurfacePoint> {
+        (0..self.resolution()).into_par_iter().flat_map_iter(|x| self.surface_from(x)).collect()
+    }
+
+    /// The zero crossings between the voxels with index `x` along x and the next ones along each axis.
+    fn surface_from(&self, x: usize) -> Vec<SurfacePoint> {
         let n = self.resolution();
         let stride = [n * n, n, 1];
         let mut points = Vec::new();
-        for index in 0..n.pow(3) {
+        for index in x * n * n..(x + 1) * n * n {
             let Some(here) = self.near_surface(index) else { continue };
-            let cell = [index / (n * n), index / n % n, index % n];
+            let cell = [x, index / n % n, index % n];
             // The normal needs neighbours on both sides, which voxels at the faces of the cube do not have.
             let inner = 1..n - 1;
             if !cell.iter().all(|c| inner.contains(c)) {

@@ -9,10 +9,10 @@ use grasp::{DecodeParams, Grasp, MAX_OPENING};
 use grasp_models::Options;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use rayon::prelude::*;
 
 use crate::camera::{DepthNoise, Views, observe};
 use crate::objects::ObjectSet;
+use crate::ordered;
 use crate::physics::World;
 use crate::planner::{BenchPlanner, Observation, PlannerSpec};
 use crate::scene::{SceneKind, generate, settle};
@@ -118,23 +118,23 @@ impl Benchmark {
         // Idle planners are reused, so that there are at most as many planners as threads.
         let idle = Mutex::new(Vec::new());
         let idle = || idle.lock().unwrap_or_else(PoisonError::into_inner);
-        (0..self.rounds)
-            .into_par_iter()
-            .filter_map(|number| {
-                if is_stopped.load(Ordering::Relaxed) {
-                    return None;
-                }
-                let waiting = idle().pop();
-                let mut planner = match waiting.map_or_else(|| planner.build(params, options), Ok) {
-                    Ok(planner) => planner,
-                    Err(error) => return Some(Err(error)),
-                };
-                let round = self.round(number, &mut planner, is_stopped, &watch);
-                idle().push(planner);
-                watch(Event::Round);
-                round.transpose()
-            })
-            .collect()
+        let run = |number| {
+            if is_stopped.load(Ordering::Relaxed) {
+                return Ok(None);
+            }
+            let waiting = idle().pop();
+            let mut planner = waiting.map_or_else(|| planner.build(params, options), Ok)?;
+            let round = self.round(number, &mut planner, is_stopped, &watch);
+            idle().push(planner);
+            watch(Event::Round);
+            round
+        };
+        let mut rounds = Vec::new();
+        ordered::for_each(0..self.rounds, run, |_, round: anyhow::Result<Option<Round>>| {
+            rounds.extend(round?);
+            anyhow::Ok(())
+        })?;
+        Ok(rounds)
     }
 
     /// The scene of a round, and the random generator for the rest of the round.

@@ -4,13 +4,15 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc;
+use std::sync::{Mutex, PoisonError, mpsc};
+use std::thread;
 
 /// Results per thread that are computed or wait for an earlier one.
 const AHEAD: u64 = 4;
 
-/// Computes `work` of each number on all threads and gives the results to `take`, in the order of the numbers and as soon
-/// as they are there, so that an interrupted run has taken nearly all of them.
+/// Computes `work` of each number on all CPUs and gives the results to `take`, in the order of the numbers and as soon as
+/// they are there, so that an interrupted run has taken nearly all of them. The threads are not those of rayon, where a
+/// planner that waits for a part of its work would compute a whole other number meanwhile.
 ///
 /// # Errors
 /// The first error of `take`. No further work is started then.
@@ -23,21 +25,31 @@ pub fn for_each<T: Send, E>(
     let is_stopped = AtomicBool::new(false);
     let (work, is_stopped) = (&work, &is_stopped);
     // As many as are started and not taken, so that no thread waits to send.
+    let (starter, to_do) = mpsc::sync_channel(window as usize);
     let (sender, results) = mpsc::sync_channel(window as usize);
-    rayon::in_place_scope_fifo(|scope| {
+    let to_do = &Mutex::new(to_do);
+    thread::scope(|scope| {
+        for _ in 0..rayon::current_num_threads() {
+            let sender = sender.clone();
+            scope.spawn(move || {
+                let next = || to_do.lock().unwrap_or_else(PoisonError::into_inner).recv();
+                while let Ok(number) = next() {
+                    if is_stopped.load(Ordering::Relaxed) {
+                        break;
+                    }
+                    // Fails after an error of `take`, when the result is not needed.
+                    let _ = sender.send((number, catch_unwind(AssertUnwindSafe(|| work(number)))));
+                }
+            });
+        }
+        // Ends the threads when it is dropped.
+        let starter = starter;
         let (mut started, mut next) = (numbers.start, numbers.start);
         let mut early = BTreeMap::new();
         while next < numbers.end {
             let end = numbers.end.min(next + window);
-            for number in started..end {
-                let sender = sender.clone();
-                scope.spawn_fifo(move |_| {
-                    if !is_stopped.load(Ordering::Relaxed) {
-                        // Fails after an error of `take`, when the result is not needed.
-                        let _ = sender.send((number, catch_unwind(AssertUnwindSafe(|| work(number)))));
-                    }
-                });
-            }
+            // The threads end, and so no longer receive, only after an error.
+            (started..end).for_each(|number| _ = starter.send(number));
             started = end;
             // The sender above keeps the channel open, and each started work sends one result.
             let Ok((number, result)) = results.recv() else { break };

@@ -3,6 +3,7 @@
 use std::borrow::Borrow;
 
 use nalgebra::Isometry3;
+use rayon::prelude::*;
 
 use super::{Fusion, Voxel};
 use crate::measurement::{Measurement, Sample};
@@ -34,8 +35,7 @@ impl Fusion {
             .collect();
         let uniform = self.uniform();
         let mut bytes = vec![0; fine.pow(3)];
-        let mut sums = vec![(0.0, 0.0); fine];
-        for (row, bytes) in bytes.chunks_exact_mut(fine).enumerate() {
+        let write_column = |sums: &mut Vec<(f32, f32)>, (row, bytes): (usize, &mut [u8])| {
             let (x, y) = (row / fine, row % fine);
             let uniform = &uniform[(x / 2 * n + y / 2) * n..][..n];
             let mut z = 0;
@@ -44,8 +44,8 @@ impl Fusion {
                 match run[0] {
                     Some(byte) => bytes[z..end].fill(byte),
                     None => {
-                        let sums = &mut sums[..end - z];
-                        sums.fill((0.0, 0.0));
+                        sums.clear();
+                        sums.resize(end - z, (0.0, 0.0));
                         for view in &views {
                             view.column([x, y, z], end - z, |index, sample| {
                                 if let Sample::Distance(distance) = sample {
@@ -60,7 +60,8 @@ impl Fusion {
                 }
                 z = end;
             }
-        }
+        };
+        bytes.par_chunks_exact_mut(fine).enumerate().for_each_init(Vec::new, write_column);
         bytes
     }
 

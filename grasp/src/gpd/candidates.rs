@@ -4,6 +4,7 @@ use std::ops::RangeInclusive;
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, Unit, UnitQuaternion, Vector3};
 use rand::Rng;
 use rand::seq::index;
+use rayon::prelude::*;
 
 use super::Cloud;
 use crate::{Hand, SurfacePoint};
@@ -71,12 +72,19 @@ pub fn candidates(cloud: &Cloud, params: &Params, rng: &mut impl Rng) -> Vec<Can
     by_sample(cloud, params, rng).flatten().collect()
 }
 
+/// Samples that are searched at the same time.
+const TOGETHER: usize = 32;
+
 /// Like [`candidates`], lazily, one item per sample, so that the caller can stop early. The search is slow for large
 /// clouds and hands.
 pub fn by_sample(cloud: &Cloud, params: &Params, rng: &mut impl Rng) -> impl Iterator<Item = Vec<Candidate>> {
     let points = cloud.points();
-    let samples = index::sample(rng, points.len(), params.samples.min(points.len()));
-    samples.into_iter().map(|sample| fit_at(cloud, params, &points[sample]))
+    let samples = index::sample(rng, points.len(), params.samples.min(points.len())).into_vec();
+    let starts = (0..samples.len()).step_by(TOGETHER);
+    starts.flat_map(move |start| {
+        let samples = &samples[start..samples.len().min(start + TOGETHER)];
+        samples.par_iter().map(|&sample| fit_at(cloud, params, &points[sample])).collect::<Vec<_>>()
+    })
 }
 
 /// The candidates of one sample.

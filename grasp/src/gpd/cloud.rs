@@ -1,6 +1,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::{Matrix3, Point3, Vector3};
+use rayon::prelude::*;
 
 use crate::SurfacePoint;
 
@@ -86,14 +87,13 @@ impl Cloud {
 
     /// The indices of all points, and their normals.
     fn normals(&self) -> Vec<(usize, Vector3<f64>)> {
-        let mut normals = Vec::with_capacity(self.points.len());
-        for (block, indices) in by_cell(&self.points, BLOCK) {
+        let of_block = |(block, indices): ([i64; 3], Vec<usize>)| {
             // The points of a block share most of their neighbours.
             let near = self.within(centre_of(&block, BLOCK), NORMALS_RADIUS + radius_of(BLOCK));
             let near: Vec<Point3<f64>> = near.map(|point| point.position).collect();
-            normals.extend(indices.into_iter().map(|index| (index, normal_at(&self.points[index], &near))));
-        }
-        normals
+            indices.into_iter().map(move |index| (index, normal_at(&self.points[index], &near)))
+        };
+        by_cell(&self.points, BLOCK).into_par_iter().flat_map_iter(of_block).collect()
     }
 }
 

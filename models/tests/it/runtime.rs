@@ -349,8 +349,12 @@ fn a_network_runs_on_the_requested_backend() {
     let reference = Network::load(&path, &Options::default()).unwrap();
     assert_eq!(reference.backend(), Backend::REFERENCE);
     let auto = Network::load(&path, &Options::auto(2)).unwrap().backend();
-    let explicit =
-        Options { threads: Some(2), provider: Some(auto.provider), precision: Some(auto.precision), ..Options::default() };
+    let explicit = Options {
+        threads: Some(2),
+        provider: Some(auto.provider),
+        precision: Some(auto.precision),
+        ..Options::default()
+    };
     assert_eq!(
         Network::load(&path, &explicit).unwrap().backend(),
         auto,
@@ -376,7 +380,8 @@ fn openvino_outputs_match_the_reference() {
     let precisions = [(Precision::Fp32, 1e-4), (Precision::Bf16, 0.02)];
     for (precision, tolerance) in precisions {
         let provider = Some(Provider::OpenVino);
-        let options = Options { threads: Some(2), provider, precision: Some(precision), max_batch: 3, ..Options::default() };
+        let options =
+            Options { threads: Some(2), provider, precision: Some(precision), max_batch: 3, ..Options::default() };
         let mut network = match Network::load(&path, &options) {
             Ok(network) => network,
             // Older processors have no bf16 instructions.
