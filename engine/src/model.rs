@@ -104,7 +104,7 @@ impl Model {
             model.service_time.start_with(time.with_context(failed)?);
         }
         let Backend { provider, precision, cuda_graph } = backend;
-        let (threads, duration) = (options.threads(backend), started.elapsed());
+        let (threads, duration) = (options.threads(), started.elapsed());
         info!(
             model = model.label,
             sha256 = model.spec.sha256(),

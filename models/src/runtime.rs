@@ -32,7 +32,7 @@ pub const OUTPUTS: [(&str, usize); 3] = [("quality", 1), ("rotation", 4), ("widt
 pub struct Options {
     /// Number of sessions of a model; `None` selects the number that is fastest with the provider.
     pub sessions: Option<usize>,
-    /// Number of threads of one inference; `None` selects the number that is fastest with the provider.
+    /// Number of threads of one inference; `None`: as many as there are CPUs.
     pub threads: Option<usize>,
     /// Execution provider; `None` selects the fastest available one whose outputs match the reference.
     pub provider: Option<Provider>,
@@ -68,19 +68,17 @@ impl Options {
     /// Number of sessions of a model on this backend.
     ///
     /// OpenVINO needs two to use all CPUs: while one waits for the slower of its threads, or for its next job, the other
-    /// one computes. With ONNX Runtime's own kernels the threads of an idle session would take CPU time from the others,
-    /// because they wait in a loop. A GPU computes one inference at a time.
+    /// one computes. With ONNX Runtime's own kernels a second session gains little, and a GPU computes one inference at a
+    /// time.
     #[must_use]
     pub fn sessions(&self, backend: Backend) -> usize {
         self.sessions.unwrap_or(if backend.provider == Provider::OpenVino { cpus().min(2) } else { 1 })
     }
 
-    /// Number of threads of one inference on this backend: all CPUs for each session of OpenVINO, whose sessions share one
-    /// pool of threads; with other providers a part of them.
+    /// Number of threads of one inference.
     #[must_use]
-    pub fn threads(&self, backend: Backend) -> usize {
-        let sessions = if backend.provider == Provider::OpenVino { 1 } else { self.sessions(backend) };
-        self.threads.unwrap_or((cpus() / sessions).max(1))
+    pub fn threads(&self) -> usize {
+        self.threads.unwrap_or_else(cpus)
     }
 }
 
@@ -100,16 +98,11 @@ mod tests {
 
     #[test]
     fn only_openvino_has_several_sessions_by_default_and_each_has_all_cpus() {
-        let on = |provider| Backend { provider, ..Backend::REFERENCE };
-        let of = |sessions, threads, provider| {
-            let options = Options { sessions, threads, ..Options::default() };
-            (options.sessions(on(provider)), options.threads(on(provider)))
-        };
-        assert_eq!(of(None, None, Provider::OpenVino), (cpus().min(2), cpus()));
-        assert_eq!(of(None, None, Provider::Cpu), (1, cpus()));
-        assert_eq!(of(None, None, Provider::Cuda), (1, cpus()));
-        assert_eq!(of(Some(3), None, Provider::OpenVino), (3, cpus()));
-        assert_eq!(of(Some(2), None, Provider::Cpu), (2, (cpus() / 2).max(1)));
-        assert_eq!(of(Some(2), Some(5), Provider::Cpu), (2, 5));
+        let all = Options { sessions: None, threads: None, ..Options::default() };
+        let sessions = |provider| all.sessions(Backend { provider, ..Backend::REFERENCE });
+        assert_eq!([Provider::OpenVino, Provider::Cpu, Provider::Cuda].map(sessions), [cpus().min(2), 1, 1]);
+        assert_eq!(all.threads(), cpus());
+        let given = Options { sessions: Some(3), threads: Some(5), ..all };
+        assert_eq!((given.sessions(Backend::REFERENCE), given.threads()), (3, 5));
     }
 }

@@ -58,8 +58,7 @@ pub(super) struct Flags {
     #[arg(long, env = "GRASPD_WORKERS", value_name = "N", value_parser = count())]
     pub workers: Option<u16>,
 
-    /// Threads per session. Default: the CPUs available to the process, with other providers than openvino divided by
-    /// --workers.
+    /// Threads per session. Default: the CPUs available to the process.
     #[arg(long, env = "GRASPD_THREADS", value_name = "N", value_parser = count())]
     pub threads: Option<u16>,
 
