@@ -9,7 +9,7 @@ use super::{Backend, LoadError, LoadReason, Options, Provider, RuntimeError, loa
 use crate::gpd::{INPUT, OUTPUT};
 use crate::{Calibration, Entry};
 
-/// Batch size. A larger one is not faster per image, and pads a small number of images more; it also bounds the memory.
+/// Batch size. A larger one is not faster per patch of the evaluator, and pads a few patches more. It bounds the memory.
 const BATCH: usize = 16;
 
 /// Largest allowed difference from the reference of the predicted probability of success, on average and at most.

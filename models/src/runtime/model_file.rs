@@ -67,7 +67,7 @@ impl<'a> ModelFile<'a> {
         let builder = Session::builder(&runtime.environment)?;
         let builder = builder.with_intra_threads(threads).map_err(ort::Error::from)?;
         let builder = builder.with_inter_threads(1).map_err(ort::Error::from)?;
-        // Idle threads would wait in a loop, and take CPU time from other sessions, and a fifth of that of the start.
+        // Idle threads would wait in a loop, which takes CPU time from other sessions and makes the start longer.
         let mut builder = builder.with_intra_op_spinning(false).map_err(ort::Error::from)?;
         if let (Some(name), Some(size)) = (&self.batch, size) {
             builder = builder.with_dimension_override(name, size as i64).map_err(ort::Error::from)?;
