@@ -1,7 +1,7 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use foldhash::fast::RandomState;
-use nalgebra::{Isometry3, Point3};
+use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
 
 use crate::{Grasp, Hand};
 
@@ -53,17 +53,22 @@ impl ObjectMap {
     pub fn object(&self, pose: &Isometry3<f64>, hand: &Hand) -> Option<u16> {
         /// Most steps between the points along an axis. It bounds the time for large hands; the Panda's has 11.
         const STEPS: f64 = 16.0;
-        // A matrix, because hundreds of points are rotated.
-        let map_from_hand = (self.map_from_frame * pose).to_homogeneous();
-        let range = |from: f64, to: f64| {
-            let steps = ((to - from) / CELL).ceil().clamp(1.0, STEPS);
-            (0..=steps as u32).map(move |step| from + (to - from) * f64::from(step) / steps)
-        };
+        let steps = |length: f64| (length / CELL).ceil().clamp(1.0, STEPS);
+        // In cells, because hundreds of points are looked up: where the first one is, and the steps along the axes.
+        let map_from_hand = self.map_from_frame * pose;
+        let first = Point3::new(-hand.height / 2.0, -hand.half_opening(), 0.0);
+        let extent = Vector3::new(hand.height, 2.0 * hand.half_opening(), hand.depth);
+        let count = extent.map(steps);
+        let axes =
+            map_from_hand.rotation.to_rotation_matrix() * Matrix3::from_diagonal(&extent.component_div(&count)) / CELL;
+        let first = (map_from_hand * first).coords / CELL;
         let mut votes = BTreeMap::new();
-        for x in range(-hand.height / 2.0, hand.height / 2.0) {
-            for y in range(-hand.half_opening(), hand.half_opening()) {
-                for z in range(0.0, hand.depth) {
-                    if let Some(label) = self.cells.get(&cell(&map_from_hand.transform_point(&Point3::new(x, y, z)))) {
+        for x in 0..=count.x as u32 {
+            for y in 0..=count.y as u32 {
+                let line = first + axes * Vector3::new(f64::from(x), f64::from(y), 0.0);
+                for z in 0..=count.z as u32 {
+                    let cell: [i32; 3] = (line + axes.column(2) * f64::from(z)).map(floor).into();
+                    if let Some(label) = self.cells.get(&cell) {
                         *votes.entry(*label).or_default() += 1;
                     }
                 }
@@ -96,8 +101,13 @@ impl ObjectMap {
 }
 
 fn cell(point: &Point3<f64>) -> [i32; 3] {
-    // Saturates far outside of every workspace.
-    point.coords.map(|c| (c / CELL).floor() as i32).into()
+    point.coords.map(|c| floor(c / CELL)).into()
+}
+
+/// The largest integer that is not larger; faster than a call of the C library. Saturates far outside of every workspace.
+fn floor(value: f64) -> i32 {
+    let truncated = value as i32;
+    truncated.saturating_sub(i32::from(f64::from(truncated) > value))
 }
 
 /// The label with the most votes, of several the largest.
@@ -108,8 +118,6 @@ fn most(votes: BTreeMap<u16, u32>) -> Option<u16> {
 #[cfg(test)]
 mod tests {
     use std::f64::consts::PI;
-
-    use nalgebra::Vector3;
 
     use super::*;
 

@@ -1,4 +1,5 @@
 use std::array;
+use std::ops::Range;
 
 use nalgebra::{Isometry3, Vector3};
 
@@ -29,42 +30,92 @@ const NZ: usize = 16;
 /// Samples of a slice.
 const SLICE: usize = NY * NZ;
 
+/// The first slices of the surroundings, of free space and of the heights follow those of the hand.
+const SURROUNDING: usize = 4 * NX;
+const FREE: usize = 5 * NX;
+const HEIGHT: usize = 6 * NX;
+
 /// Half of the distance between the samples of the details, metres.
 const HALF: f64 = 0.001_875;
 
 impl Patch {
     /// Slices, and samples along the closing axis and the approach.
-    pub const SHAPE: [usize; 3] = [6 * NX + 2, NY, NZ];
+    pub const SHAPE: [usize; 3] = [HEIGHT + 2, NY, NZ];
 
     /// Number of samples in all slices.
     pub const SIZE: usize = Self::SHAPE[0] * SLICE;
+
+    /// All slices.
+    pub const ALL: Range<usize> = 0..Self::SHAPE[0];
+
+    /// The slices of a coarse patch, the input of a coarse evaluator: four through the hand, two of the surroundings, four
+    /// of free space, and the heights.
+    pub const COARSE: [usize; 12] = [
+        4 * 2,
+        4 * 4,
+        4 * 5,
+        4 * 7,
+        SURROUNDING + 3,
+        SURROUNDING + 6,
+        FREE + 2,
+        FREE + 4,
+        FREE + 5,
+        FREE + 7,
+        HEIGHT,
+        HEIGHT + 1,
+    ];
+
+    /// Slices of a coarse patch, and samples along the closing axis and the approach.
+    pub const COARSE_SHAPE: [usize; 3] = [Self::COARSE.len(), NY, NZ];
 
     /// Writes the patch of a grasp at `pose`, which is in the frame of the volume's pose.
     ///
     /// # Panics
     /// If the length of `patch` is not [`SIZE`](Self::SIZE).
     pub fn write(volume: &Volume, pose: &Isometry3<f64>, patch: &mut [f32]) {
+        Self::write_slices(volume, pose, Self::ALL, patch);
+    }
+
+    /// Writes the coarse patch of a grasp at `pose`, which is in the frame of the volume's pose.
+    ///
+    /// # Panics
+    /// If the length of `patch` is not the product of [`COARSE_SHAPE`](Self::COARSE_SHAPE).
+    pub fn write_coarse(volume: &Volume, pose: &Isometry3<f64>, patch: &mut [f32]) {
+        Self::write_slices(volume, pose, Self::COARSE.into_iter(), patch);
+    }
+
+    /// Writes slices of the patch of a grasp at `pose` in details that fill a volume, mirrored along x and the closing axis
+    /// as `mirrored` says: training data.
+    ///
+    /// # Panics
+    /// If the length of `patch` is not that of the slices.
+    pub fn write_mirrored(
+        details: &Details,
+        pose: &Isometry3<f64>,
+        mirrored: [bool; 2],
+        slices: impl ExactSizeIterator<Item = usize>,
+        patch: &mut [f32],
+    ) {
+        let cube = (*details.pose(), details.resolution() as f64 * details.voxel_size());
+        Self::write_details(details, cube, pose, mirrored, slices, patch);
+    }
+
+    fn write_slices(
+        volume: &Volume,
+        pose: &Isometry3<f64>,
+        slices: impl ExactSizeIterator<Item = usize>,
+        patch: &mut [f32],
+    ) {
         let cube = (*volume.pose(), volume.resolution() as f64 * volume.voxel_size());
         if let Some(details) = volume.details() {
-            return Self::write_details(details, cube, pose, [false; 2], patch);
+            return Self::write_details(details, cube, pose, [false; 2], slices, patch);
         }
         let observed = volume.observed();
         let (resolution, values) = (observed.resolution(), observed.values());
         let near = Field { resolution, values, value: |value| value };
         let free = Field { resolution, values, value: |_| 0.0 };
-        let axes = Axes::new(&(observed.pose().inverse() * pose), observed.voxel_size(), [false; 2]);
-        Self::write_fields(&near, &free, &axes, patch);
-        write_heights(cube, pose, [false; 2], patch);
-    }
-
-    /// Writes the patch of a grasp at `pose` in details that fill a volume, mirrored along x and the closing axis as
-    /// `mirrored` says: training data.
-    ///
-    /// # Panics
-    /// If the length of `patch` is not [`SIZE`](Self::SIZE).
-    pub fn write_mirrored(details: &Details, pose: &Isometry3<f64>, mirrored: [bool; 2], patch: &mut [f32]) {
-        let cube = (*details.pose(), details.resolution() as f64 * details.voxel_size());
-        Self::write_details(details, cube, pose, mirrored, patch);
+        let axes = [(*observed.pose(), observed.voxel_size()), cube].map(|frame| Axes::new(frame, pose, [false; 2]));
+        write_fields(&near, &free, &axes, slices, patch);
     }
 
     fn write_details(
@@ -72,56 +123,48 @@ impl Patch {
         cube: (Isometry3<f64>, f64),
         pose: &Isometry3<f64>,
         mirrored: [bool; 2],
+        slices: impl ExactSizeIterator<Item = usize>,
         patch: &mut [f32],
     ) {
         let (resolution, values) = (details.resolution(), details.bytes());
         let near = |byte: u8| if byte == Details::FREE { 0.0 } else { f32::from(byte) * (1.0 / 255.0) };
         let free = |byte: u8| if byte == Details::FREE { 1.0 } else { 0.0 };
         let (near, free) = (Field { resolution, values, value: near }, Field { resolution, values, value: free });
-        let axes = Axes::new(&(details.pose().inverse() * pose), details.voxel_size(), mirrored);
-        Self::write_fields(&near, &free, &axes, patch);
-        write_heights(cube, pose, mirrored, patch);
-    }
-
-    /// Writes all slices but the heights. `free` is 1 in free space.
-    fn write_fields<T: Copy + Default, N: Fn(T) -> f32, F: Fn(T) -> f32>(
-        field: &Field<T, N>,
-        free: &Field<T, F>,
-        axes: &Axes,
-        patch: &mut [f32],
-    ) {
-        assert_eq!(patch.len(), Self::SIZE, "a patch has {} samples", Self::SIZE);
-        let (hand, rest) = patch.split_at_mut(4 * NX * SLICE);
-        let (surroundings, rest) = rest.split_at_mut(NX * SLICE);
-        for (index, slice) in hand.chunks_exact_mut(SLICE).enumerate() {
-            let shift = |bit: usize| if index & bit == 0 { -HALF } else { HALF };
-            HAND.slice(index / 4, [shift(2), shift(1)], axes, |line, start, step| {
-                field.interpolate(start, step, &mut slice[line..line + NZ]);
-            });
-        }
-        for (index, slice) in surroundings.chunks_exact_mut(SLICE).enumerate() {
-            SURROUNDINGS.slice(index, [0.0; 2], axes, |line, start, step| {
-                field.interpolate(start, step, &mut slice[line..line + NZ]);
-            });
-        }
-        for (index, slice) in rest[..NX * SLICE].chunks_exact_mut(SLICE).enumerate() {
-            HAND.slice(index, [0.0; 2], axes, |line, start, step| {
-                free.interpolate(start, step, &mut slice[line..line + NZ]);
-            });
-        }
+        let axes = [(*details.pose(), details.voxel_size()), cube].map(|frame| Axes::new(frame, pose, mirrored));
+        write_fields(&near, &free, &axes, slices, patch);
     }
 }
 
-/// Writes the heights of the samples in a cube with this pose and edge, metres.
-fn write_heights((cube, edge): (Isometry3<f64>, f64), pose: &Isometry3<f64>, mirrored: [bool; 2], patch: &mut [f32]) {
-    let axes = Axes::new(&(cube.inverse() * pose), edge, mirrored);
-    let slices = patch[Patch::SIZE - 2 * SLICE..].chunks_exact_mut(SLICE);
-    for (index, slice) in [0, NX - 1].into_iter().zip(slices) {
-        HAND.slice(index, [0.0; 2], &axes, |line, start, step| {
-            for (k, height) in slice[line..line + NZ].iter_mut().enumerate() {
-                *height = (start.z + step.z * k as f32).clamp(0.0, 1.0);
+/// Writes `slices` of a patch. `free` is 1 in free space. The axes are those of the fields and of the cube whose edge is
+/// the unit of the heights.
+fn write_fields<T: Copy + Default, N: Fn(T) -> f32, F: Fn(T) -> f32>(
+    near: &Field<T, N>,
+    free: &Field<T, F>,
+    [axes, of_cube]: &[Axes; 2],
+    slices: impl ExactSizeIterator<Item = usize>,
+    patch: &mut [f32],
+) {
+    assert_eq!(patch.len(), slices.len() * SLICE, "a slice has {SLICE} samples");
+    for (slice, samples) in slices.zip(patch.chunks_exact_mut(SLICE)) {
+        match slice {
+            0..SURROUNDING => {
+                let shift = |bit: usize| if slice & bit == 0 { -HALF } else { HALF };
+                HAND.slice(slice / 4, [shift(2), shift(1)], axes, |line, start, step| {
+                    near.interpolate(start, step, &mut samples[line..line + NZ]);
+                });
             }
-        });
+            SURROUNDING..FREE => SURROUNDINGS.slice(slice - SURROUNDING, [0.0; 2], axes, |line, start, step| {
+                near.interpolate(start, step, &mut samples[line..line + NZ]);
+            }),
+            FREE..HEIGHT => HAND.slice(slice - FREE, [0.0; 2], axes, |line, start, step| {
+                free.interpolate(start, step, &mut samples[line..line + NZ]);
+            }),
+            _ => HAND.slice((slice - HEIGHT) * (NX - 1), [0.0; 2], of_cube, |line, start, step| {
+                for (k, height) in samples[line..line + NZ].iter_mut().enumerate() {
+                    *height = (start.z + step.z * k as f32).clamp(0.0, 1.0);
+                }
+            }),
+        }
     }
 }
 
@@ -166,8 +209,9 @@ struct Axes {
 }
 
 impl Axes {
-    /// The axes of a grasp at `pose` in the frame of the field. `unit` is the field's unit, metres.
-    fn new(pose: &Isometry3<f64>, unit: f64, mirrored: [bool; 2]) -> Self {
+    /// The axes of a grasp at `pose` in a frame whose unit is in metres.
+    fn new((frame, unit): (Isometry3<f64>, f64), pose: &Isometry3<f64>, mirrored: [bool; 2]) -> Self {
+        let pose = frame.inverse() * pose;
         let [x, y] = mirrored.map(|is_mirrored| if is_mirrored { -1.0 / unit } else { 1.0 / unit });
         let axis = |axis: Vector3<f64>, length: f64| pose.rotation * axis * length;
         Self {
@@ -241,11 +285,6 @@ mod tests {
 
     const N: usize = 40;
 
-    /// The slices of the surroundings, of free space and of the heights follow those of the hand.
-    const SURROUNDING: usize = 4 * NX;
-    const FREE: usize = 5 * NX;
-    const HEIGHT: usize = 6 * NX;
-
     fn corner() -> Isometry3<f64> {
         Isometry3::translation(1.0, 2.0, 3.0)
     }
@@ -315,12 +354,25 @@ mod tests {
     }
 
     #[test]
+    fn a_coarse_patch_has_slices_of_the_patch() {
+        let pose = corner() * Isometry3::new(Vector3::new(0.12, 0.17, 0.15), Vector3::new(2.8, 0.3, 0.9));
+        for volume in [ramp(), ramp().with_details(details())] {
+            let patch = patch(&volume, &pose);
+            let mut coarse = vec![f32::NAN; Patch::COARSE_SHAPE.iter().product()];
+            Patch::write_coarse(&volume, &pose, &mut coarse);
+            for (slice, samples) in Patch::COARSE.into_iter().zip(coarse.chunks_exact(SLICE)) {
+                assert_eq!(samples, &patch[slice * SLICE..][..SLICE], "{slice}");
+            }
+        }
+    }
+
+    #[test]
     fn a_mirrored_patch_has_reversed_samples() {
         let (details, pose) =
             (details(), corner() * Isometry3::new(Vector3::new(0.12, 0.17, 0.15), Vector3::new(2.8, 0.3, 0.9)));
         let [plain, mirrored] = [[false, false], [true, true]].map(|mirrored| {
             let mut patch = vec![f32::NAN; Patch::SIZE];
-            Patch::write_mirrored(&details, &pose, mirrored, &mut patch);
+            Patch::write_mirrored(&details, &pose, mirrored, Patch::ALL, &mut patch);
             patch
         });
         for (slice, reversed) in

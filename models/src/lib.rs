@@ -5,6 +5,7 @@
 //! the poses of a network's grasps. A [`Classifier`] runs both.
 
 mod calibration;
+mod coarse;
 mod evaluator;
 pub mod gpd;
 mod graph;
@@ -24,7 +25,8 @@ mod upsampling;
 mod vgn;
 
 pub use calibration::Calibration;
-pub use evaluator::evaluator;
+pub use coarse::{coarse_evaluator_of, with_coarse_evaluator, without_coarse_evaluator};
+pub use evaluator::{coarse_evaluator, evaluator};
 pub use half_weights::{with_full_weights, with_half_weights};
 pub use metadata::Metadata;
 pub use metadata_error::MetadataError;
@@ -33,8 +35,8 @@ pub use output_heads::{Orientation, with_published_heads};
 pub use quantize::{ActivationRange, QuantizeError, quantized_activations, with_int8};
 pub use rotation_average::{RotationAverageError, averaged_over_rotations};
 pub use runtime::{
-    Backend, BackendError, Choice, Classifier, INPUT, LoadError, LoadReason, NameError, Network, OUTPUTS, Options,
-    Output, Precision, Provider, RuntimeError, RuntimeInfo, batch_sizes, init,
+    Backend, BackendError, Choice, Classifier, ClassifierKind, INPUT, LoadError, LoadReason, NameError, Network,
+    OUTPUTS, Options, Output, Precision, Provider, RuntimeError, RuntimeInfo, batch_sizes, init,
 };
 pub use store::{Entry, EntryError, MAX_MODEL_BYTES, Scan, Store, StoreError, own_models, read_regular_file};
 pub use upsampling::{upsampled_convolutions, upsampled_taps};

@@ -16,7 +16,7 @@ use std::thread::available_parallelism;
 
 pub use backend::{Backend, BackendError, Choice, NameError, Precision, Provider};
 pub use batch_session::batch_sizes;
-pub use classifier::Classifier;
+pub use classifier::{Classifier, ClassifierKind};
 pub use error::{LoadError, LoadReason, RuntimeError};
 pub use library::{RuntimeInfo, init};
 pub use network::{Network, Output};

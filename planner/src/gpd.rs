@@ -2,7 +2,7 @@ use std::path::Path;
 
 use grasp::gpd::{Image, scored};
 use grasp::{DecodeParams, Decoded};
-use grasp_models::{Classifier, LoadError, Options};
+use grasp_models::{Classifier, ClassifierKind, LoadError, Options};
 use grasp_perception::Scene;
 
 use crate::hand_fit::HandFit;
@@ -28,7 +28,7 @@ impl Gpd {
     /// # Errors
     /// [`LoadError`] if the file is not a valid classifier.
     pub fn load(path: &Path, options: &Options) -> Result<Self, LoadError> {
-        Ok(Self::new(Classifier::load(path, &Image::SHAPE, options)?))
+        Ok(Self::new(Classifier::load(path, ClassifierKind::Gpd, options)?))
     }
 
     /// The default parameters: the threshold 0.5 keeps candidates that are more likely to succeed than to fail, as in

@@ -2,9 +2,8 @@ use std::cmp::Ordering;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use grasp::gpd::Image;
-use grasp::{DecodeParams, Patch};
-use grasp_models::{Backend, Classifier, Entry, LoadError, Metadata, Network, Options, Precision};
+use grasp::DecodeParams;
+use grasp_models::{Backend, Classifier, ClassifierKind, Entry, LoadError, Metadata, Network, Options, Precision};
 use grasp_perception::{InputGrid, NetworkGrid};
 
 use crate::{Evaluator, Gpd, NetworkPlanner, Planner, Shaf};
@@ -156,14 +155,13 @@ impl ModelSpec {
                 let networks = Network::load_several(network, options)?;
                 let backend = networks.first().map_or(Backend::REFERENCE, Network::backend);
                 let of_evaluators = Options { sessions: Some(networks.len()), ..of_classifiers };
-                let evaluators = Classifier::load_several(evaluator, &Patch::SHAPE, &of_evaluators)?;
-                let planner = |(network, evaluator)| {
-                    Loaded::Network(Box::new(NetworkPlanner::new(network, Some(Evaluator::new(evaluator)))))
-                };
+                let evaluators = Evaluator::load_several(evaluator, &of_evaluators)?;
+                let planner =
+                    |(network, evaluator)| Loaded::Network(Box::new(NetworkPlanner::new(network, Some(evaluator))));
                 (networks.into_iter().zip(evaluators).map(planner).collect(), backend)
             }
             Self::Gpd(entry) => {
-                let classifiers = Classifier::load_several(entry, &Image::SHAPE, &of_classifiers)?;
+                let classifiers = Classifier::load_several(entry, ClassifierKind::Gpd, &of_classifiers)?;
                 let backend = classifiers.first().map_or(Backend::REFERENCE, Classifier::backend);
                 let planner = |classifier| single(Box::new(Gpd::new(classifier)));
                 (classifiers.into_iter().map(planner).collect(), backend)

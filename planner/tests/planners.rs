@@ -7,6 +7,7 @@ use grasp::{DecodeParams, Decoded, Fusion, Hand, RESOLUTION, SurfacePoint, WORKS
 use grasp_models::onnx::ModelProto;
 use grasp_models::{
     ActivationRange, Backend, Network, Options, Precision, Store, quantized_activations, with_full_weights, with_int8,
+    without_coarse_evaluator,
 };
 use grasp_perception::{Scene, seen_from};
 use grasp_planner::{Evaluator, Gpd, HighestProposal, ModelSpec, NetworkPlanner, PlanError, PlanParams, Planner, Shaf};
@@ -181,6 +182,23 @@ fn fingers_shorter_than_the_first_bite_of_gpd_find_grasps() {
 fn without_points_the_surface_of_the_volume_is_used() {
     let scene = Scene { points: None, ..scene(Isometry3::identity()) };
     assert!(!plan(&mut Shaf, &scene, Shaf::decode_params()).grasps.is_empty());
+}
+
+#[test]
+fn an_evaluator_works_without_a_coarse_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let alone = folder.path().join("alone.onnx");
+    let both = zoo("evaluators/vgn-refined.onnx");
+    without_coarse_evaluator(&ModelProto::read(&both).unwrap()).write(&alone).unwrap();
+    let scene = scene(Isometry3::identity());
+    let [with, without] = [both, alone].map(|file| {
+        let network = Network::load(&zoo("vgn-packed.onnx"), &Options::default()).unwrap();
+        let decode = Evaluator::decode_params(network.metadata());
+        let evaluator = Evaluator::load(&file, &Options::default()).unwrap();
+        plan(&mut NetworkPlanner::new(network, Some(evaluator)), &scene, decode).grasps[0].quality
+    });
+    // A coarse evaluator leaves poses out, and of the best grasps few.
+    assert!((with - without).abs() < 0.1, "{with} and {without}");
 }
 
 /// A pen, 12 mm wide and high: the network proposes nothing there, and the fingers have 10 mm above the table.

@@ -1,50 +1,94 @@
 use std::path::Path;
 
+use grasp::Patch;
+use grasp::gpd::Image;
 use ort::session::Session;
 use ort::value::{Outlet, Tensor, TensorElementType};
+use prost::Message;
 use rayon::prelude::*;
 
 use super::model_file::ModelFile;
 use super::{Backend, LoadError, LoadReason, Options, Provider, RuntimeError, loading, run_error};
 use crate::gpd::{INPUT, OUTPUT};
-use crate::{Calibration, Entry};
-
-/// Batch size. A larger one is not faster per patch of the evaluator, and pads a few patches more. It bounds the memory.
-const BATCH: usize = 16;
+use crate::onnx::ModelProto;
+use crate::{Calibration, Entry, coarse_evaluator_of, without_coarse_evaluator};
 
 /// Largest allowed difference from the reference of the predicted probability of success, on average and at most.
 const MEAN_DIFFERENCE: f32 = 0.02;
 const LARGEST_DIFFERENCE: f32 = 0.2;
 
-/// A loaded classifier of grasp candidates: of images, as GPD's, or of patches of a volume, as the evaluator.
+/// What a classifier scores.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ClassifierKind {
+    /// Images of grasp candidates: GPD's classifier.
+    Gpd,
+    /// Patches of a volume: an evaluator.
+    Evaluator,
+    /// Coarse patches: the coarse evaluator in the file of an evaluator.
+    CoarseEvaluator,
+}
+
+impl ClassifierKind {
+    /// Shape of an image.
+    #[must_use]
+    pub fn shape(self) -> &'static [usize] {
+        match self {
+            Self::Gpd => &Image::SHAPE,
+            Self::Evaluator => &Patch::SHAPE,
+            Self::CoarseEvaluator => &Patch::COARSE_SHAPE,
+        }
+    }
+
+    /// Batch size, which bounds the memory. A larger one is not faster per patch of the evaluator, and pads a few patches
+    /// more.
+    fn batch(self) -> usize {
+        match self {
+            Self::Gpd | Self::Evaluator => 16,
+            Self::CoarseEvaluator => 32,
+        }
+    }
+
+    /// The part of a file with the classifier.
+    fn of_file(self, bytes: Vec<u8>) -> Result<Vec<u8>, LoadReason> {
+        let Ok(model) = ModelProto::from_bytes(&bytes) else { return Ok(bytes) };
+        let coarse = coarse_evaluator_of(&model);
+        match self {
+            Self::CoarseEvaluator => Ok(coarse.ok_or(LoadReason::NoCoarseEvaluator)?.encode_to_vec()),
+            _ if coarse.is_some() => Ok(without_coarse_evaluator(&model).encode_to_vec()),
+            _ => Ok(bytes),
+        }
+    }
+}
+
+/// A loaded classifier of grasp candidates.
 pub struct Classifier {
     session: Session,
     backend: Backend,
-    /// Shape of an image.
-    shape: &'static [usize],
+    kind: ClassifierKind,
     /// Name in error messages.
     name: String,
     calibration: Calibration,
 }
 
 impl Classifier {
-    /// Loads a file. Checks that its input and output are those of a classifier of images of `shape`, and that its
-    /// scores on this backend match those of ONNX Runtime's CPU kernels in f32.
+    /// Loads a file. Checks that its input and output are those of a classifier of this kind, and that its scores on this
+    /// backend match those of ONNX Runtime's CPU kernels in f32.
     ///
     /// # Errors
-    /// [`LoadError`] names the file and the problem.
-    pub fn load(path: &Path, shape: &'static [usize], options: &Options) -> Result<Self, LoadError> {
-        loading::load(path, &Self::options(options), |model, backend| Self::open_checked(model, backend, shape))
+    /// [`LoadError`] names the file and the problem: [`LoadReason::NoCoarseEvaluator`] if there is none.
+    pub fn load(path: &Path, kind: ClassifierKind, options: &Options) -> Result<Self, LoadError> {
+        let checked = |model: &ModelFile<'_>, backend| Self::open_checked(model, backend, kind);
+        loading::load(path, &Self::options(options), |bytes| kind.of_file(bytes), checked)
     }
 
     /// Loads an entry of a store once per session. All copies use the same backend.
     ///
     /// # Errors
     /// [`LoadError`] names the file and the problem, including a file that changed since the store read it.
-    pub fn load_several(entry: &Entry, shape: &'static [usize], options: &Options) -> Result<Vec<Self>, LoadError> {
-        let checked = |model: &ModelFile<'_>, backend| Self::open_checked(model, backend, shape);
-        let others = |model: &ModelFile<'_>, backend| Self::open(model, backend, shape);
-        loading::load_several(entry, &Self::options(options), checked, others)
+    pub fn load_several(entry: &Entry, kind: ClassifierKind, options: &Options) -> Result<Vec<Self>, LoadError> {
+        let checked = |model: &ModelFile<'_>, backend| Self::open_checked(model, backend, kind);
+        let others = |model: &ModelFile<'_>, backend| Self::open(model, backend, kind);
+        loading::load_several(entry, &Self::options(options), |bytes| kind.of_file(bytes), checked, others)
     }
 
     /// Without CUDA graphs, because batches have any size.
@@ -53,12 +97,12 @@ impl Classifier {
     }
 
     /// Loads with one backend and compares its scores with the reference, ONNX Runtime's CPU kernels.
-    fn open_checked(model: &ModelFile, backend: Backend, shape: &'static [usize]) -> Result<Self, LoadReason> {
-        let mut classifier = Self::open(model, backend, shape)?;
+    fn open_checked(model: &ModelFile, backend: Backend, kind: ClassifierKind) -> Result<Self, LoadReason> {
+        let mut classifier = Self::open(model, backend, kind)?;
         if backend.provider != Provider::Cpu {
-            let mut reference = Self::open(model, Backend::REFERENCE, shape)?;
+            let mut reference = Self::open(model, Backend::REFERENCE, kind)?;
             let [got, expected] =
-                [&mut classifier, &mut reference].map(|classifier| classifier.score(BATCH + 1, write_sample));
+                [&mut classifier, &mut reference].map(|classifier| classifier.score(kind.batch() + 1, write_sample));
             if let Some(what) = difference(&got?, &expected?) {
                 return Err(LoadReason::DiffersFromReference { backend, what });
             }
@@ -67,21 +111,23 @@ impl Classifier {
     }
 
     /// Loads the model and runs it once, so that buffers are allocated before the first request.
-    fn open(model: &ModelFile, backend: Backend, shape: &'static [usize]) -> Result<Self, LoadReason> {
-        let session = model.open(backend, is_fixed(backend).then_some(BATCH))?;
+    fn open(model: &ModelFile, backend: Backend, kind: ClassifierKind) -> Result<Self, LoadReason> {
+        let session = model.open(backend, is_fixed(backend).then_some(kind.batch()))?;
+        let (shape, batch) = (kind.shape(), kind.batch());
         let wrong = |what| LoadReason::Classifier { what, shape };
-        check(session.inputs(), INPUT, &shape.iter().map(|&size| size..=size).collect::<Vec<_>>()).map_err(wrong)?;
-        check(session.outputs(), OUTPUT, &[2..=usize::MAX]).map_err(wrong)?;
+        check(session.inputs(), INPUT, batch, &shape.iter().map(|&size| size..=size).collect::<Vec<_>>())
+            .map_err(wrong)?;
+        check(session.outputs(), OUTPUT, batch, &[2..=usize::MAX]).map_err(wrong)?;
         let calibration = model.calibration.clone()?;
         let name = model.path.display().to_string();
-        let mut classifier = Self { session, backend, shape, name, calibration };
-        classifier.run(BATCH, vec![0.0; BATCH * classifier.size()])?;
+        let mut classifier = Self { session, backend, kind, name, calibration };
+        classifier.run(batch, vec![0.0; batch * classifier.size()])?;
         Ok(classifier)
     }
 
     /// Values of an image.
     fn size(&self) -> usize {
-        self.shape.iter().product()
+        self.kind.shape().iter().product()
     }
 
     /// The backend in use.
@@ -102,8 +148,8 @@ impl Classifier {
         let mut scores = Vec::with_capacity(count);
         while scores.len() < count {
             let first = scores.len();
-            let images = BATCH.min(count - first);
-            let batch = if is_fixed(self.backend) { BATCH } else { images };
+            let images = self.kind.batch().min(count - first);
+            let batch = if is_fixed(self.backend) { self.kind.batch() } else { images };
             let mut pixels = vec![0.0; batch * self.size()];
             let parts = pixels[..images * self.size()].par_chunks_exact_mut(self.size()).enumerate();
             parts.for_each(|(index, image)| write(first + index, image));
@@ -119,7 +165,7 @@ impl Classifier {
 
     /// The logits of a batch of concatenated images.
     fn run(&mut self, batch: usize, pixels: Vec<f32>) -> ort::Result<Vec<f32>> {
-        let shape: Vec<usize> = [&[batch], self.shape].concat();
+        let shape: Vec<usize> = [&[batch], self.kind.shape()].concat();
         let outputs = self.session.run(ort::inputs![INPUT => Tensor::from_array((shape, pixels))?])?;
         Ok(outputs[OUTPUT].try_extract_tensor::<f32>()?.1.to_vec())
     }
@@ -161,7 +207,7 @@ fn difference(got: &[f32], expected: &[f32]) -> Option<String> {
 }
 
 /// Checks that `name` is f32 of shape `[batch, dims…]`. The error describes the difference.
-fn check(outlets: &[Outlet], name: &str, dims: &[std::ops::RangeInclusive<usize>]) -> Result<(), String> {
+fn check(outlets: &[Outlet], name: &str, batch: usize, dims: &[std::ops::RangeInclusive<usize>]) -> Result<(), String> {
     if let [other] = outlets
         && other.name() != name
     {
@@ -172,7 +218,7 @@ fn check(outlets: &[Outlet], name: &str, dims: &[std::ops::RangeInclusive<usize>
     // The batch is a free dimension, or fixed by the provider.
     let fits = |shape: &[i64]| {
         shape.len() == dims.len() + 1
-            && (shape[0] < 0 || shape[0] == BATCH as i64)
+            && (shape[0] < 0 || shape[0] == batch as i64)
             && shape[1..].iter().zip(dims).all(|(&dim, sizes)| dim < 0 || sizes.contains(&(dim as usize)))
     };
     let is_float = dtype.tensor_type() == Some(TensorElementType::Float32);

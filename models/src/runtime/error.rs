@@ -82,6 +82,11 @@ pub enum LoadReason {
         /// Current SHA-256.
         found: String,
     },
+    /// The file of an evaluator has no coarse evaluator.
+    #[error(
+        "there is no coarse evaluator in the file; add one with `grasp-train classify --network coarse-evaluator --teacher`"
+    )]
+    NoCoarseEvaluator,
     /// ONNX Runtime rejects the model.
     #[error("ONNX Runtime rejects the model: {0}; if the file is truncated, download or export it again")]
     Model(String),

@@ -11,16 +11,18 @@ use super::model_file::{ModelFile, without_weight_inputs};
 use super::{LoadError, LoadReason, Options, RuntimeError};
 use crate::Entry;
 
-/// Loads a file. `open_checked` loads the model with one backend and compares its outputs with the reference.
+/// Loads a file. `content` returns the part of its bytes that is loaded. `open_checked` loads the model with one backend
+/// and compares its outputs with the reference.
 pub(super) fn load<T>(
     path: &Path,
     options: &Options,
+    content: impl Fn(Vec<u8>) -> Result<Vec<u8>, LoadReason>,
     open_checked: impl Fn(&ModelFile, Backend) -> Result<T, LoadReason>,
 ) -> Result<T, LoadError> {
     let load = || {
         // Fails early if ONNX Runtime cannot be loaded.
         runtime()?;
-        let bytes = without_weight_inputs(fs::read(path)?)?;
+        let bytes = without_weight_inputs(content(fs::read(path)?)?)?;
         let (model, _) = fastest(&ModelFile::new(path, &bytes, options), options, open_checked)?;
         Ok(model)
     };
@@ -31,12 +33,13 @@ pub(super) fn load<T>(
 pub(super) fn load_several<T>(
     entry: &Entry,
     options: &Options,
+    content: impl Fn(Vec<u8>) -> Result<Vec<u8>, LoadReason>,
     open_checked: impl Fn(&ModelFile, Backend) -> Result<T, LoadReason>,
     open: impl Fn(&ModelFile, Backend) -> Result<T, LoadReason>,
 ) -> Result<Vec<T>, LoadError> {
     let load = || {
         runtime()?;
-        let bytes = without_weight_inputs(entry.bytes()?)?;
+        let bytes = without_weight_inputs(content(entry.bytes()?)?)?;
         let model = ModelFile::new(&entry.path, &bytes, options);
         let (first, backend) = fastest(&model, options, open_checked)?;
         let others = (1..options.sessions(backend)).map(|_| open(&model, backend));

@@ -35,7 +35,7 @@ impl Network {
     /// # Errors
     /// [`LoadError`] names the file and the problem.
     pub fn load(path: &Path, options: &Options) -> Result<Self, LoadError> {
-        loading::load(path, options, |model, backend| Self::open_checked(model, backend, options.max_batch))
+        loading::load(path, options, Ok, |model, backend| Self::open_checked(model, backend, options.max_batch))
     }
 
     /// Loads an entry of a store once per session. All copies use the same backend.
@@ -45,7 +45,7 @@ impl Network {
     pub fn load_several(entry: &Entry, options: &Options) -> Result<Vec<Self>, LoadError> {
         let checked = |model: &ModelFile<'_>, backend| Self::open_checked(model, backend, options.max_batch);
         let others = |model: &ModelFile<'_>, backend| Self::open(model, backend, options.max_batch);
-        loading::load_several(entry, options, checked, others)
+        loading::load_several(entry, options, Ok, checked, others)
     }
 
     /// Loads with one backend and compares its outputs with the reference, which is the unmodified file on the CPU

@@ -9,7 +9,7 @@ use std::fs;
 use std::path::Path;
 
 use grasp::{Patch, Volume};
-use grasp_models::{Classifier, Options, Precision, Provider};
+use grasp_models::{Classifier, ClassifierKind, Options, Precision, Provider};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion};
 
 use crate::scenes;
@@ -41,7 +41,7 @@ fn scores(evaluator: &mut Classifier, volume: &Volume) -> Vec<f32> {
 #[test]
 fn scores_of_the_shipped_evaluators_match_their_snapshots() {
     for path in scenes::shipped("evaluators") {
-        let mut evaluator = Classifier::load(&path, &Patch::SHAPE, &Options::default()).unwrap();
+        let mut evaluator = Classifier::load(&path, ClassifierKind::Evaluator, &Options::default()).unwrap();
         let mut text = String::new();
         for (scene, volume) in scenes::all() {
             let scores: Vec<String> =
@@ -70,15 +70,34 @@ fn parse(line: &str) -> (&str, Vec<f32>) {
 }
 
 #[test]
+fn coarse_evaluators_agree_with_their_evaluators() {
+    let probability = |score: f32| 1.0 / (1.0 + (-score).exp());
+    for path in scenes::shipped("evaluators") {
+        let [mut fine, mut coarse] = [ClassifierKind::Evaluator, ClassifierKind::CoarseEvaluator]
+            .map(|kind| Classifier::load(&path, kind, &Options::default()).unwrap());
+        let poses = poses();
+        let mut differences = Vec::new();
+        for (_, volume) in scenes::all() {
+            let write = |index: usize, patch: &mut [f32]| Patch::write_coarse(&volume, &poses[index], patch);
+            let of_coarse = coarse.score(poses.len(), write).unwrap();
+            let both = scores(&mut fine, &volume).into_iter().zip(of_coarse);
+            differences.extend(both.map(|(fine, coarse)| (probability(fine) - probability(coarse)).abs()));
+        }
+        let mean = differences.iter().sum::<f32>() / differences.len() as f32;
+        assert!(mean < 0.1, "{}: the probabilities differ by {mean} on average", path.display());
+    }
+}
+
+#[test]
 fn every_available_backend_scores_as_the_reference() {
     let probability = |score: f32| 1.0 / (1.0 + (-score).exp());
     for path in scenes::shipped("evaluators") {
-        let mut reference = Classifier::load(&path, &Patch::SHAPE, &Options::default()).unwrap();
+        let mut reference = Classifier::load(&path, ClassifierKind::Evaluator, &Options::default()).unwrap();
         for (provider, precision, limit) in
             [(Provider::OpenVino, Precision::Fp32, 1e-3), (Provider::OpenVino, Precision::Bf16, BF16)]
         {
             let options = Options { provider: Some(provider), precision: Some(precision), ..Options::auto(2) };
-            let mut evaluator = match Classifier::load(&path, &Patch::SHAPE, &options) {
+            let mut evaluator = match Classifier::load(&path, ClassifierKind::Evaluator, &options) {
                 Ok(evaluator) => evaluator,
                 Err(error) if error.to_string().contains("available: ") => {
                     println!("{provider} {precision}: not available");

@@ -7,8 +7,8 @@ use grasp::gpd::{Candidate, Cloud, Image};
 use grasp::{SurfacePoint, Volume};
 use grasp_models::onnx::{Dimension, ModelProto, StringStringEntryProto, ValueInfoProto};
 use grasp_models::{
-    Architecture, Backend, Classifier, Network, Options, Orientation, Precision, Provider, RotationAverageError,
-    RuntimeError, averaged_over_rotations, build, gpd, init, with_published_heads,
+    Architecture, Backend, Classifier, ClassifierKind, Network, Options, Orientation, Precision, Provider,
+    RotationAverageError, RuntimeError, averaged_over_rotations, build, gpd, init, with_published_heads,
 };
 use nalgebra::{Isometry3, Point3, Quaternion, UnitQuaternion, Vector3};
 use tempfile::TempDir;
@@ -307,7 +307,7 @@ fn images(count: u64) -> Vec<Image> {
 #[test]
 fn a_classifier_scores_images_independently() {
     let (_folder, path) = save(&gpd::gpd(0));
-    let mut classifier = Classifier::load(&path, &Image::SHAPE, &Options::default()).unwrap();
+    let mut classifier = Classifier::load(&path, ClassifierKind::Gpd, &Options::default()).unwrap();
     let images = images(40);
     let together = classifier.score(images.len(), |index, values| images[index].write(values)).unwrap();
     assert_eq!(together.len(), images.len());
@@ -334,7 +334,7 @@ fn weights_may_be_listed_among_the_inputs() {
 #[test]
 fn a_network_is_not_loaded_as_a_classifier_nor_a_classifier_as_a_network() {
     let (_folder, path) = save(&build("vgn", 0).unwrap());
-    let error = Classifier::load(&path, &Image::SHAPE, &Options::default()).err().unwrap().to_string();
+    let error = Classifier::load(&path, ClassifierKind::Gpd, &Options::default()).err().unwrap().to_string();
     assert!(error.contains("network.onnx: found `tsdf` instead of `images`; a classifier has the input"), "{error}");
     let (_folder, path) = save(&gpd::gpd(0));
     let error = Network::load(&path, &Options::default()).err().unwrap().to_string();

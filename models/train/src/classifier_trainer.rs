@@ -25,6 +25,12 @@ pub trait Examples {
     /// Number of classes.
     fn classes(&self) -> usize;
 
+    /// The probabilities of the classes of an example that a classifier is trained to predict.
+    fn target(&self, index: usize) -> Vec<f32> {
+        let class = self.class(index);
+        (0..self.classes()).map(|other| if other == class { 1.0 } else { 0.0 }).collect()
+    }
+
     /// The scene of an example. Its examples are either all for training or all for validation. Scenes of several files
     /// with one name are not distinguished: with the same seed they are the same scene.
     fn scene(&self, index: usize) -> String;
@@ -147,8 +153,8 @@ impl<'a> ClassifierTrainer<'a> {
         let mut sums = MetricSums::default();
         for indices in self.training.chunks(self.settings.batch) {
             let mirrored = [self.rng.random(), self.rng.random()];
-            let (images, classes) = self.batch(indices, mirrored);
-            let loss = sums.add(&self.executor, &self.class_weights, &images, &classes)?;
+            let (images, targets) = self.batch(indices, mirrored);
+            let loss = sums.add(&self.executor, &self.class_weights, &images, &targets)?;
             loss.backward();
             let learning_rate = self.learning_rate();
             self.adam.step(self.executor.parameters(), learning_rate);
@@ -157,10 +163,11 @@ impl<'a> ClassifierTrainer<'a> {
         Ok(sums.metrics())
     }
 
-    /// The images and classes, i64 `[n]`, of examples.
+    /// The images and targets, f32 `[n, classes]`, of examples.
     fn batch(&self, indices: &[i64], mirrored: [bool; 2]) -> (Tensor, Tensor) {
-        let classes: Vec<i64> = indices.iter().map(|&index| self.dataset.class(index as usize) as i64).collect();
-        (self.dataset.images(indices, mirrored), Tensor::from_slice(&classes))
+        let targets: Vec<f32> = indices.iter().flat_map(|&index| self.dataset.target(index as usize)).collect();
+        let targets = Tensor::from_slice(&targets).reshape([indices.len() as i64, -1]);
+        (self.dataset.images(indices, mirrored), targets)
     }
 
     /// The learning rate of the next step.
@@ -177,8 +184,8 @@ impl<'a> ClassifierTrainer<'a> {
     pub fn validate(&self) -> Result<Option<ClassifierMetrics>, ExecuteError> {
         let mut sums = MetricSums::default();
         for indices in self.validation.chunks(self.settings.batch) {
-            let (images, classes) = self.batch(indices, [false; 2]);
-            let _ = no_grad(|| sums.add(&self.executor, &self.class_weights, &images, &classes))?;
+            let (images, targets) = self.batch(indices, [false; 2]);
+            let _ = no_grad(|| sums.add(&self.executor, &self.class_weights, &images, &targets))?;
         }
         Ok((!self.validation.is_empty()).then(|| sums.metrics()))
     }
@@ -206,16 +213,18 @@ impl MetricSums {
         executor: &Executor,
         class_weights: &Tensor,
         images: &Tensor,
-        classes: &Tensor,
+        targets: &Tensor,
     ) -> Result<Tensor, ExecuteError> {
-        let (images, classes) = (images.to_device(executor.device()), classes.to_device(executor.device()));
+        let (images, targets) = (images.to_device(executor.device()), targets.to_device(executor.device()));
         let scores = executor.output(&images, OUTPUT)?;
-        let loss = scores.cross_entropy_loss(&classes, Some(class_weights), tch::Reduction::Mean, -100, 0.0);
-        let batch_weight = class_weights.index_select(0, &classes).sum(Kind::Double).double_value(&[]);
+        let weights = &targets * class_weights;
+        let total = weights.sum(Kind::Float);
+        let loss = -(scores.log_softmax(1, Kind::Float) * &weights).sum(Kind::Float) / &total;
+        let batch_weight = total.double_value(&[]);
         self.loss += loss.double_value(&[]) * batch_weight;
         self.weight += batch_weight;
         let predicts_success = scores.softmax(1, Kind::Float).select(1, 0).lt(0.5);
-        let is_success = classes.gt(0);
+        let is_success = targets.select(1, 0).lt(0.5);
         for [predicted, actual] in [[0, 0], [0, 1], [1, 0], [1, 1]] {
             let both = predicts_success.eq(predicted).logical_and(&is_success.eq(actual));
             self.confusion[predicted as usize][actual as usize] += both.sum(Kind::Double).double_value(&[]);

@@ -7,12 +7,13 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, ensure};
 use clap::{Args, ValueEnum};
 use grasp::gpd::Image;
-use grasp_data::DataError;
-use grasp_models::evaluator;
 use grasp_models::gpd::{describe, gpd};
 use grasp_models::onnx::ModelProto;
+use grasp_models::{
+    Classifier, ClassifierKind, Options, coarse_evaluator, evaluator, with_coarse_evaluator, without_coarse_evaluator,
+};
 use grasp_train::{
-    CandidateDataset, ClassifierMetrics, ClassifierSettings, ClassifierTrainer, Examples, ProposalDataset,
+    CandidateDataset, ClassifierMetrics, ClassifierSettings, ClassifierTrainer, Examples, ProposalDataset, ScoredPoses,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
@@ -29,10 +30,13 @@ pub(crate) struct Classify {
     /// Name of the network whose grasps the evaluator scores.
     #[arg(long, required_if_eq("network", "evaluator"))]
     proposals_of: Option<String>,
+    /// The evaluator whose predictions a coarse evaluator is trained on. The output has both.
+    #[arg(long, required_if_eq("network", "coarse-evaluator"))]
+    teacher: Option<PathBuf>,
     /// Start from the weights of this classifier instead of random ones.
     #[arg(long)]
     from: Option<PathBuf>,
-    /// Files of `grasp-sim candidates`, or for the evaluator folders of `grasp-sim proposals`; several are mixed.
+    /// Files of `grasp-sim candidates`, or for evaluators folders of `grasp-sim proposals`; several are mixed.
     #[arg(long, required = true, num_args = 1..)]
     data: Vec<PathBuf>,
     /// Output file of the classifier.
@@ -59,7 +63,7 @@ pub(crate) struct Classify {
     /// Compute convolutions and matrix products in bf16.
     #[arg(long)]
     bf16: bool,
-    /// Version of the classifier in its metadata.
+    /// Version of the classifier in its metadata. A coarse evaluator keeps that of its evaluator.
     #[arg(long, default_value = "1")]
     model_version: String,
     /// Device: cpu, cuda, cuda:N, or auto: the first GPU, or the CPU if there is none.
@@ -77,6 +81,8 @@ enum Kind {
     Gpd,
     /// The evaluator of the poses of a network's grasps.
     Evaluator,
+    /// A faster one, which chooses the poses that the evaluator scores.
+    CoarseEvaluator,
 }
 
 impl Kind {
@@ -84,6 +90,7 @@ impl Kind {
         match self {
             Self::Gpd => "gpd",
             Self::Evaluator => "evaluator",
+            Self::CoarseEvaluator => "coarse-evaluator",
         }
     }
 
@@ -91,14 +98,8 @@ impl Kind {
         match self {
             Self::Gpd => gpd(seed),
             Self::Evaluator => evaluator(seed),
+            Self::CoarseEvaluator => coarse_evaluator(seed),
         }
-    }
-
-    fn read(self, data: &[PathBuf]) -> Result<Box<dyn Examples>, DataError> {
-        Ok(match self {
-            Self::Gpd => Box::new(CandidateDataset::read(data, &Image::SHAPE)?),
-            Self::Evaluator => Box::new(ProposalDataset::read(data)?),
-        })
     }
 }
 
@@ -120,12 +121,18 @@ impl Classify {
         ensure!(self.lr > 0.0, "--lr is {}, must be greater than 0", self.lr);
         ensure!(
             self.network == Kind::Evaluator || self.proposals_of.is_none(),
-            "--proposals-of is of evaluators, and gpd is not one"
+            "--proposals-of is of evaluators, and {} is not one",
+            self.network.name()
+        );
+        ensure!(
+            self.network == Kind::CoarseEvaluator || self.teacher.is_none(),
+            "--teacher is of coarse evaluators, and {} is not one",
+            self.network.name()
         );
         if let Some(folder) = self.out.parent() {
             fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
         }
-        let examples = self.network.read(&self.data)?;
+        let examples = self.examples()?;
         let examples = examples.as_ref();
         let settings = ClassifierSettings {
             epochs: self.epochs,
@@ -172,11 +179,26 @@ impl Classify {
         Ok(())
     }
 
+    fn examples(&self) -> Result<Box<dyn Examples>> {
+        Ok(match (self.network, &self.teacher) {
+            (Kind::Gpd, _) => Box::new(CandidateDataset::read(&self.data, &Image::SHAPE)?),
+            (Kind::CoarseEvaluator, Some(teacher)) => {
+                let mut poses = ScoredPoses::read(&self.data, self.seed)?;
+                eprintln!("{} scores {} poses", name(teacher), poses.len());
+                // The fastest backend computes what the reference computes.
+                let options = Options { threads: self.threads.map(Into::into), provider: None, ..Options::default() };
+                poses.score(&mut Classifier::load(teacher, ClassifierKind::Evaluator, &options)?)?;
+                Box::new(poses)
+            }
+            _ => Box::new(ProposalDataset::read(&self.data)?),
+        })
+    }
+
     /// The classifier before the first step.
     fn initial_classifier(&self) -> Result<ModelProto> {
         let random = self.network.build(self.seed);
         let Some(path) = &self.from else { return Ok(random) };
-        let model = ModelProto::read(path)?;
+        let model = without_coarse_evaluator(&ModelProto::read(path)?);
         let nodes = |model: &ModelProto| model.graph.as_ref().map(|graph| graph.node.clone());
         ensure!(
             nodes(&model) == nodes(&random),
@@ -201,7 +223,6 @@ impl Classify {
         examples: &dyn Examples,
         record: &ClassifierEpochRecord,
     ) -> Result<()> {
-        let name = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let mut provenance = BTreeMap::new();
         let mut note = |key: &str, value: String| provenance.insert(key.to_owned(), value);
         note("architecture", self.network.name().to_owned());
@@ -214,8 +235,10 @@ impl Classify {
         note("weight_decay", self.weight_decay.to_string());
         note("bf16", self.bf16.to_string());
         note("seed", self.seed.to_string());
-        if let Some(from) = &self.from {
-            note("from", name(from));
+        for (key, path) in [("from", &self.from), ("teacher", &self.teacher)] {
+            if let Some(path) = path {
+                note(key, name(path));
+            }
         }
         note("date", OffsetDateTime::now_utc().date().to_string());
         note("trainer", format!("grasp-train {}", env!("CARGO_PKG_VERSION")));
@@ -223,8 +246,15 @@ impl Classify {
             note("validation", serde_json::to_string(&validation)?);
         }
         let mut model = trainer.model();
-        let network = self.proposals_of.as_deref();
-        describe(&mut model, &name(&self.out), &self.model_version, network, &provenance);
+        describe(&mut model, &name(&self.out), &self.model_version, self.proposals_of.as_deref(), &provenance);
+        if let Some(teacher) = &self.teacher {
+            model = with_coarse_evaluator(&ModelProto::read(teacher)?, &model);
+        }
         Ok(model.write(&self.out)?)
     }
+}
+
+/// The name of a model or data file.
+fn name(path: &Path) -> String {
+    path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }

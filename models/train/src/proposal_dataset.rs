@@ -60,6 +60,38 @@ impl ProposalDataset {
         }
         Ok(all)
     }
+
+    /// The tried grasps: the index of the details, and the pose in their frame.
+    pub(crate) fn tried(&self) -> impl Iterator<Item = (usize, Isometry3<f64>)> {
+        self.proposals.iter().map(|proposal| (proposal.details, proposal.pose))
+    }
+
+    /// The details with an index.
+    pub(crate) fn details(&self, index: usize) -> &Details {
+        &self.details[index]
+    }
+
+    /// The name of the scene of the details with an index.
+    pub(crate) fn scene_of(&self, details: usize) -> &str {
+        &self.scenes[details]
+    }
+
+    /// Slices of the patches of hands at poses in details, mirrored along x and the closing axis as `mirrored` says.
+    pub(crate) fn patches(
+        &self,
+        poses: impl ExactSizeIterator<Item = (usize, Isometry3<f64>)>,
+        mirrored: [bool; 2],
+        slices: impl ExactSizeIterator<Item = usize> + Clone,
+    ) -> Tensor {
+        let [_, rows, columns] = Patch::SHAPE;
+        let shape = [poses.len(), slices.len(), rows, columns];
+        let size = slices.len() * rows * columns;
+        let mut patches = vec![0.0; shape.iter().product()];
+        for ((details, pose), patch) in poses.zip(patches.chunks_exact_mut(size)) {
+            Patch::write_mirrored(&self.details[details], &pose, mirrored, slices.clone(), patch);
+        }
+        Tensor::from_slice(&patches).reshape(shape.map(|size| size as i64))
+    }
 }
 
 impl Examples for ProposalDataset {
@@ -80,13 +112,10 @@ impl Examples for ProposalDataset {
     }
 
     fn images(&self, indices: &[i64], mirrored: [bool; 2]) -> Tensor {
-        let mut patches = vec![0.0; indices.len() * Patch::SIZE];
-        for (&index, patch) in indices.iter().zip(patches.chunks_exact_mut(Patch::SIZE)) {
+        let poses = indices.iter().map(|&index| {
             let Proposal { details, pose, .. } = &self.proposals[index as usize];
-            Patch::write_mirrored(&self.details[*details], pose, mirrored, patch);
-        }
-        let shape: Vec<i64> =
-            [&[indices.len()], &Patch::SHAPE[..]].concat().into_iter().map(|size| size as i64).collect();
-        Tensor::from_slice(&patches).reshape(shape)
+            (*details, *pose)
+        });
+        self.patches(poses, mirrored, Patch::ALL)
     }
 }

@@ -92,7 +92,7 @@ async fn a_large_workspace_has_the_grasps_of_all_objects() {
             assert!(!positions().any(same), "{model}: two cubes give the same grasp");
         }
     }
-    let cubes = server.metric("graspd_batch_size_sum{model=\"vgn-refined 8\"}");
+    let cubes = server.metric("graspd_batch_size_sum{model=\"vgn-refined 9\"}");
     assert!((4.0..15.0).contains(&cubes), "{cubes} of 15 cubes have an object");
 
     // A single cube has the grasps of the box in it.

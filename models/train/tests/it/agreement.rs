@@ -5,7 +5,7 @@ use std::path::Path;
 use grasp::gpd::{CHANNELS, Candidate, Cloud, IMAGE_SIZE, Image};
 use grasp::{Maps, SurfacePoint, Volume};
 use grasp_models::onnx::ModelProto;
-use grasp_models::{Architecture, Classifier, Network, Options, Orientation, gpd};
+use grasp_models::{Architecture, Classifier, ClassifierKind, Network, Options, Orientation, gpd};
 use grasp_train::{ExecutionOptions, Executor};
 use nalgebra::{Isometry3, Point3, Vector3};
 use rand::{RngExt, SeedableRng};
@@ -81,7 +81,7 @@ fn the_classifier_agrees_with_onnx_runtime() {
     let input = Tensor::from_slice(&pixels).reshape([3, CHANNELS as i64, IMAGE_SIZE as i64, IMAGE_SIZE as i64]);
     let torch = no_grad(|| executor.output(&input, gpd::OUTPUT)).unwrap();
     let torch = Vec::<f32>::try_from(torch.select(1, 1) - torch.select(1, 0)).unwrap();
-    let mut onnx = Classifier::load(&path, &Image::SHAPE, &Options::default()).unwrap();
+    let mut onnx = Classifier::load(&path, ClassifierKind::Gpd, &Options::default()).unwrap();
     let onnx = onnx.score(images.len(), |index, values| images[index].write(values)).unwrap();
     assert_ne!(onnx[0], onnx[1], "the images differ");
     for (torch, onnx) in torch.iter().zip(onnx) {

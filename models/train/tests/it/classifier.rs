@@ -10,7 +10,7 @@ use grasp::{DecodeParams, Grasp, Patch, SurfacePoint, Volume};
 use grasp_data::{Candidates, Provenance, Setup, Trial, packed};
 use grasp_models::gpd::gpd;
 use grasp_models::onnx::ModelProto;
-use grasp_models::{Classifier, Metadata, Options};
+use grasp_models::{Classifier, ClassifierKind, Metadata, Options};
 use grasp_sim::benchmark::Benchmark;
 use grasp_sim::camera::{DepthNoise, Views};
 use grasp_sim::label::SceneConfig;
@@ -160,7 +160,7 @@ fn an_evaluator_separates_full_from_empty_volumes() {
     let path = folder.path().join("evaluator.onnx");
     let metadata = Metadata::from_model(&ModelProto::read(&path).unwrap(), &path).unwrap();
     assert_eq!((&*metadata.name, metadata.network.as_deref()), ("evaluator", Some("vgn-packed")));
-    let mut evaluator = Classifier::load(&path, &Patch::SHAPE, &Options::default()).unwrap();
+    let mut evaluator = Classifier::load(&path, ClassifierKind::Evaluator, &Options::default()).unwrap();
     let volumes = [filled(0.75), filled(0.25)];
     let scores = evaluator.score(2, |index, patch| Patch::write(&volumes[index], &grasp(0.5).pose, patch)).unwrap();
     assert!(scores[0] > 0.0 && scores[1] < 0.0, "{scores:?}");
@@ -173,12 +173,33 @@ fn an_evaluator_separates_full_from_empty_volumes() {
     let from = further.metadata_props.iter().find(|property| property.key() == "graspd.provenance.from").unwrap();
     assert_eq!(from.value(), "evaluator");
     let mut further =
-        Classifier::load(&folder.path().join("further.onnx"), &Patch::SHAPE, &Options::default()).unwrap();
+        Classifier::load(&folder.path().join("further.onnx"), ClassifierKind::Evaluator, &Options::default()).unwrap();
     let again = further.score(2, |index, patch| Patch::write(&volumes[index], &grasp(0.5).pose, patch)).unwrap();
     assert!(scores.iter().zip(&again).all(|(a, b)| (a - b).abs() < 1e-3), "{scores:?}, {again:?}");
 
+    let arguments = "--network coarse-evaluator --teacher evaluator.onnx --data proposals --out both.onnx --epochs 20 \
+                     --batch 16 --lr 1e-2";
+    let output = classify(folder.path(), arguments);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let path = folder.path().join("both.onnx");
+    let both = ModelProto::read(&path).unwrap();
+    let metadata = Metadata::from_model(&both, &path).unwrap();
+    assert_eq!((&*metadata.name, &*metadata.provenance["coarse.teacher"]), ("evaluator", "evaluator"));
+    let mut unchanged = Classifier::load(&path, ClassifierKind::Evaluator, &Options::default()).unwrap();
+    let same = unchanged.score(2, |index, patch| Patch::write(&volumes[index], &grasp(0.5).pose, patch)).unwrap();
+    assert_eq!(same, scores);
+    let mut coarse = Classifier::load(&path, ClassifierKind::CoarseEvaluator, &Options::default()).unwrap();
+    let of_coarse =
+        coarse.score(2, |index, patch| Patch::write_coarse(&volumes[index], &grasp(0.5).pose, patch)).unwrap();
+    assert!(of_coarse[0] > 0.0 && of_coarse[1] < 0.0, "{of_coarse:?}");
+    let alone = folder.path().join("evaluator.onnx");
+    let error = Classifier::load(&alone, ClassifierKind::CoarseEvaluator, &Options::default()).err().unwrap();
+    assert!(error.to_string().contains("grasp-train classify --network coarse-evaluator"), "{error}");
+
     candidate_file(folder.path(), 8);
     for (arguments, expected) in [
+        ("--network coarse-evaluator --data proposals --out x.onnx", "--teacher"),
+        ("--data walls.npz --teacher evaluator.onnx --out x.onnx", "--teacher is of coarse evaluators, and gpd"),
         ("--data walls.npz --from evaluator.onnx --out x.onnx", "the graph is not that of gpd"),
         ("--network evaluator --data proposals --out x.onnx", "--proposals-of"),
         ("--network evaluator --proposals-of vgn --data walls.npz --out x.onnx", "walls.npz: "),
