@@ -1,5 +1,4 @@
 use std::array;
-use std::ops::Range;
 
 use nalgebra::{Isometry3, Vector3};
 
@@ -46,7 +45,15 @@ impl Patch {
     pub const SIZE: usize = Self::SHAPE[0] * SLICE;
 
     /// All slices.
-    pub const ALL: Range<usize> = 0..Self::SHAPE[0];
+    pub const ALL: [usize; Self::SHAPE[0]] = {
+        let mut slices = [0; Self::SHAPE[0]];
+        let mut index = 0;
+        while index < slices.len() {
+            slices[index] = index;
+            index += 1;
+        }
+        slices
+    };
 
     /// The slices of a coarse patch, the input of a coarse evaluator: four through the hand, two of the surroundings, four
     /// of free space, and the heights.
@@ -73,7 +80,7 @@ impl Patch {
     /// # Panics
     /// If the length of `patch` is not [`SIZE`](Self::SIZE).
     pub fn write(volume: &Volume, pose: &Isometry3<f64>, patch: &mut [f32]) {
-        Self::write_slices(volume, pose, Self::ALL, patch);
+        Self::write_slices(volume, pose, &Self::ALL, patch);
     }
 
     /// Writes the coarse patch of a grasp at `pose`, which is in the frame of the volume's pose.
@@ -81,7 +88,7 @@ impl Patch {
     /// # Panics
     /// If the length of `patch` is not the product of [`COARSE_SHAPE`](Self::COARSE_SHAPE).
     pub fn write_coarse(volume: &Volume, pose: &Isometry3<f64>, patch: &mut [f32]) {
-        Self::write_slices(volume, pose, Self::COARSE.into_iter(), patch);
+        Self::write_slices(volume, pose, &Self::COARSE, patch);
     }
 
     /// Writes slices of the patch of a grasp at `pose` in details that fill a volume, mirrored along x and the closing axis
@@ -93,19 +100,14 @@ impl Patch {
         details: &Details,
         pose: &Isometry3<f64>,
         mirrored: [bool; 2],
-        slices: impl ExactSizeIterator<Item = usize>,
+        slices: &[usize],
         patch: &mut [f32],
     ) {
         let cube = (*details.pose(), details.resolution() as f64 * details.voxel_size());
         Self::write_details(details, cube, pose, mirrored, slices, patch);
     }
 
-    fn write_slices(
-        volume: &Volume,
-        pose: &Isometry3<f64>,
-        slices: impl ExactSizeIterator<Item = usize>,
-        patch: &mut [f32],
-    ) {
+    fn write_slices(volume: &Volume, pose: &Isometry3<f64>, slices: &[usize], patch: &mut [f32]) {
         let cube = (*volume.pose(), volume.resolution() as f64 * volume.voxel_size());
         if let Some(details) = volume.details() {
             return Self::write_details(details, cube, pose, [false; 2], slices, patch);
@@ -123,7 +125,7 @@ impl Patch {
         cube: (Isometry3<f64>, f64),
         pose: &Isometry3<f64>,
         mirrored: [bool; 2],
-        slices: impl ExactSizeIterator<Item = usize>,
+        slices: &[usize],
         patch: &mut [f32],
     ) {
         let (resolution, values) = (details.resolution(), details.bytes());
@@ -141,11 +143,11 @@ fn write_fields<T: Copy + Default, N: Fn(T) -> f32, F: Fn(T) -> f32>(
     near: &Field<T, N>,
     free: &Field<T, F>,
     [axes, of_cube]: &[Axes; 2],
-    slices: impl ExactSizeIterator<Item = usize>,
+    slices: &[usize],
     patch: &mut [f32],
 ) {
     assert_eq!(patch.len(), slices.len() * SLICE, "a slice has {SLICE} samples");
-    for (slice, samples) in slices.zip(patch.chunks_exact_mut(SLICE)) {
+    for (&slice, samples) in slices.iter().zip(patch.chunks_exact_mut(SLICE)) {
         match slice {
             0..SURROUNDING => {
                 let shift = |bit: usize| if slice & bit == 0 { -HALF } else { HALF };
@@ -372,7 +374,7 @@ mod tests {
             (details(), corner() * Isometry3::new(Vector3::new(0.12, 0.17, 0.15), Vector3::new(2.8, 0.3, 0.9)));
         let [plain, mirrored] = [[false, false], [true, true]].map(|mirrored| {
             let mut patch = vec![f32::NAN; Patch::SIZE];
-            Patch::write_mirrored(&details, &pose, mirrored, Patch::ALL, &mut patch);
+            Patch::write_mirrored(&details, &pose, mirrored, &Patch::ALL, &mut patch);
             patch
         });
         for (slice, reversed) in

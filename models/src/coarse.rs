@@ -2,6 +2,7 @@
 //! names begin with `coarse.`, those of its provenance with `graspd.provenance.coarse.`.
 
 use crate::metadata::PROVENANCE;
+use crate::metadata_error::PREFIX as OURS;
 use crate::onnx::{GraphProto, ModelProto, StringStringEntryProto};
 
 const PREFIX: &str = "coarse.";
@@ -18,8 +19,8 @@ pub fn with_coarse_evaluator(evaluator: &ModelProto, coarse: &ModelProto) -> Mod
     graph.input.extend(added.input);
     graph.output.extend(added.output);
     for property in &coarse.metadata_props {
-        if let Some(key) = property.key().strip_prefix(PROVENANCE) {
-            let key = Some(format!("{PROVENANCE}{PREFIX}{key}"));
+        if let Some(key) = provenance(property.key()) {
+            let key = Some(format!("{OURS}{PROVENANCE}{PREFIX}{key}"));
             model.metadata_props.push(StringStringEntryProto { key, ..property.clone() });
         }
     }
@@ -30,9 +31,14 @@ pub fn with_coarse_evaluator(evaluator: &ModelProto, coarse: &ModelProto) -> Mod
 #[must_use]
 pub fn without_coarse_evaluator(model: &ModelProto) -> ModelProto {
     let mut model = part(model, false);
-    let is_of_coarse = |key: &str| key.strip_prefix(PROVENANCE).is_some_and(|key| key.starts_with(PREFIX));
+    let is_of_coarse = |key: &str| provenance(key).is_some_and(|key| key.starts_with(PREFIX));
     model.metadata_props.retain(|property| !is_of_coarse(property.key()));
     model
+}
+
+/// What a metadata key says of the provenance.
+fn provenance(key: &str) -> Option<&str> {
+    key.strip_prefix(OURS)?.strip_prefix(PROVENANCE)
 }
 
 /// The coarse evaluator alone, if there is one.
@@ -84,6 +90,8 @@ mod tests {
         assert_eq!(without_coarse_evaluator(&both), fine);
         let graph =
             |model: ModelProto| model.graph.map(|graph| (graph.node, graph.initializer, graph.input, graph.output));
+        let seed = both.metadata_props.iter().find(|property| property.key() == "graspd.provenance.coarse.seed");
+        assert_eq!(seed.map(StringStringEntryProto::value), Some("2"));
         assert_eq!(coarse_evaluator_of(&both).and_then(graph), graph(coarse));
     }
 }

@@ -81,14 +81,14 @@ impl ProposalDataset {
         &self,
         poses: impl ExactSizeIterator<Item = (usize, Isometry3<f64>)>,
         mirrored: [bool; 2],
-        slices: impl ExactSizeIterator<Item = usize> + Clone,
+        slices: &[usize],
     ) -> Tensor {
         let [_, rows, columns] = Patch::SHAPE;
         let shape = [poses.len(), slices.len(), rows, columns];
         let size = slices.len() * rows * columns;
         let mut patches = vec![0.0; shape.iter().product()];
         for ((details, pose), patch) in poses.zip(patches.chunks_exact_mut(size)) {
-            Patch::write_mirrored(&self.details[details], &pose, mirrored, slices.clone(), patch);
+            Patch::write_mirrored(&self.details[details], &pose, mirrored, slices, patch);
         }
         Tensor::from_slice(&patches).reshape(shape.map(|size| size as i64))
     }
@@ -116,6 +116,6 @@ impl Examples for ProposalDataset {
             let Proposal { details, pose, .. } = &self.proposals[index as usize];
             (*details, *pose)
         });
-        self.patches(poses, mirrored, Patch::ALL)
+        self.patches(poses, mirrored, &Patch::ALL)
     }
 }

@@ -54,7 +54,7 @@ impl ScoredPoses {
     pub fn score(&mut self, evaluator: &mut Classifier) -> Result<(), RuntimeError> {
         let scores = evaluator.score(self.poses.len(), |index, patch| {
             let (details, pose) = &self.poses[index];
-            Patch::write_mirrored(self.tried.details(*details), pose, [false; 2], Patch::ALL, patch);
+            Patch::write_mirrored(self.tried.details(*details), pose, [false; 2], &Patch::ALL, patch);
         })?;
         self.probabilities = scores.into_iter().map(|score| 1.0 / (1.0 + (-score).exp())).collect();
         Ok(())
@@ -94,6 +94,6 @@ impl Examples for ScoredPoses {
 
     fn images(&self, indices: &[i64], mirrored: [bool; 2]) -> Tensor {
         let poses = indices.iter().map(|&index| self.poses[index as usize]);
-        self.tried.patches(poses, mirrored, Patch::COARSE.into_iter())
+        self.tried.patches(poses, mirrored, &Patch::COARSE)
     }
 }

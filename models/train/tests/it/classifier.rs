@@ -178,7 +178,7 @@ fn an_evaluator_separates_full_from_empty_volumes() {
     assert!(scores.iter().zip(&again).all(|(a, b)| (a - b).abs() < 1e-3), "{scores:?}, {again:?}");
 
     let arguments = "--network coarse-evaluator --teacher evaluator.onnx --data proposals --out both.onnx --epochs 20 \
-                     --batch 16 --lr 1e-2";
+                     --batch 16 --lr 2e-3";
     let output = classify(folder.path(), arguments);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let path = folder.path().join("both.onnx");
