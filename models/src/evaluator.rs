@@ -31,7 +31,7 @@ pub fn evaluator(seed: u64) -> ModelProto {
     Shape { name: "evaluator", input, convolutions, pooled: [true; 2], dense: 192, classes: 3 }.build(seed)
 }
 
-/// Creates a coarse evaluator with random weights, which needs a tenth of the arithmetic of an [`evaluator`]. The classes
+/// Creates a coarse evaluator with random weights, which needs an eighth of the multiplications of an [`evaluator`]. The classes
 /// are failure and success.
 #[must_use]
 pub fn coarse_evaluator(seed: u64) -> ModelProto {

@@ -46,7 +46,7 @@ const MOVES: usize = 2;
 ///
 /// A network scores voxels. The evaluator scores poses, so it also finds a better pose near a network's grasp.
 ///
-/// A coarse evaluator, which needs a tenth of the time, chooses the poses that are worth an evaluation. Without one all are
+/// A coarse evaluator, which needs a quarter of the time, chooses the poses that are worth an evaluation. Without one all are
 /// evaluated.
 pub struct Evaluator {
     classifier: Classifier,

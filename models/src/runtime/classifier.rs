@@ -50,13 +50,17 @@ impl ClassifierKind {
 
     /// The part of a file with the classifier.
     fn of_file(self, bytes: Vec<u8>) -> Result<Vec<u8>, LoadReason> {
+        if self == Self::Gpd {
+            return Ok(bytes);
+        }
+        // ONNX Runtime reports a better error of an invalid file.
         let Ok(model) = ModelProto::from_bytes(&bytes) else { return Ok(bytes) };
         let coarse = coarse_evaluator_of(&model);
-        match self {
-            Self::CoarseEvaluator => Ok(coarse.ok_or(LoadReason::NoCoarseEvaluator)?.encode_to_vec()),
-            _ if coarse.is_some() => Ok(without_coarse_evaluator(&model).encode_to_vec()),
-            _ => Ok(bytes),
-        }
+        Ok(match (self, coarse) {
+            (Self::CoarseEvaluator, coarse) => coarse.ok_or(LoadReason::NoCoarseEvaluator)?.encode_to_vec(),
+            (_, Some(_)) => without_coarse_evaluator(&model).encode_to_vec(),
+            (_, None) => bytes,
+        })
     }
 }
 

@@ -183,12 +183,12 @@ impl Classify {
         Ok(match (self.network, &self.teacher) {
             (Kind::Gpd, _) => Box::new(CandidateDataset::read(&self.data, &Image::SHAPE)?),
             (Kind::CoarseEvaluator, Some(teacher)) => {
-                let mut poses = ScoredPoses::read(&self.data, self.seed)?;
-                eprintln!("{} scores {} poses", name(teacher), poses.len());
+                let tried = ProposalDataset::read(&self.data)?;
+                eprintln!("{} scores poses at and around {} grasps", name(teacher), tried.len());
                 // The fastest backend computes what the reference computes.
                 let options = Options { threads: self.threads.map(Into::into), provider: None, ..Options::default() };
-                poses.score(&mut Classifier::load(teacher, ClassifierKind::Evaluator, &options)?)?;
-                Box::new(poses)
+                let mut evaluator = Classifier::load(teacher, ClassifierKind::Evaluator, &options)?;
+                Box::new(ScoredPoses::new(tried, &mut evaluator, self.seed)?)
             }
             _ => Box::new(ProposalDataset::read(&self.data)?),
         })

@@ -1,8 +1,6 @@
 use std::f64::consts::PI;
-use std::path::PathBuf;
 
 use grasp::{FINGER_DEPTH, Patch};
-use grasp_data::DataError;
 use grasp_models::{Classifier, RuntimeError};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::{RngExt, SeedableRng};
@@ -32,32 +30,23 @@ pub struct ScoredPoses {
 }
 
 impl ScoredPoses {
-    /// Reads data sets of `grasp-sim proposals`; several are mixed.
+    /// Scores the tried grasps and random moves of each by an evaluator.
     ///
     /// # Errors
-    /// [`DataError`] names the folder that cannot be used.
-    pub fn read(folders: &[PathBuf], seed: u64) -> Result<Self, DataError> {
-        let tried = ProposalDataset::read(folders)?;
+    /// [`RuntimeError`] if the evaluator fails.
+    pub fn new(tried: ProposalDataset, evaluator: &mut Classifier, seed: u64) -> Result<Self, RuntimeError> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let around = |(details, pose)| {
             let moved: [_; MOVED] = std::array::from_fn(|_| (details, pose * random_move(&mut rng)));
             [(details, pose)].into_iter().chain(moved)
         };
-        let poses = tried.tried().flat_map(around).collect();
-        Ok(Self { tried, poses, probabilities: Vec::new() })
-    }
-
-    /// Scores all poses. They have no probability before.
-    ///
-    /// # Errors
-    /// [`RuntimeError`] if the evaluator fails.
-    pub fn score(&mut self, evaluator: &mut Classifier) -> Result<(), RuntimeError> {
-        let scores = evaluator.score(self.poses.len(), |index, patch| {
-            let (details, pose) = &self.poses[index];
-            Patch::write_mirrored(self.tried.details(*details), pose, [false; 2], &Patch::ALL, patch);
+        let poses: Vec<_> = tried.tried().flat_map(around).collect();
+        let scores = evaluator.score(poses.len(), |index, patch| {
+            let (details, pose) = &poses[index];
+            Patch::write_mirrored(tried.details(*details), pose, [false; 2], &Patch::ALL, patch);
         })?;
-        self.probabilities = scores.into_iter().map(|score| 1.0 / (1.0 + (-score).exp())).collect();
-        Ok(())
+        let probabilities = scores.into_iter().map(|score| 1.0 / (1.0 + (-score).exp())).collect();
+        Ok(Self { tried, poses, probabilities })
     }
 }
 
