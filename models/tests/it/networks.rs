@@ -4,8 +4,8 @@ use std::process::Command;
 
 use grasp_models::onnx::{ModelProto, TensorProto};
 use grasp_models::{
-    ActivationRange, Architecture, BuildError, Orientation, averaged_over_rotations, build, gpd, quantized_activations,
-    with_full_weights, with_half_weights, with_int8,
+    ActivationRange, Architecture, BuildError, Orientation, averaged_over_rotations, build, coarse_evaluator,
+    evaluator, gpd, quantized_activations, with_coarse_evaluator, with_full_weights, with_half_weights, with_int8,
 };
 use prost::Message;
 
@@ -129,7 +129,15 @@ fn the_onnx_checker_accepts_every_network() {
     let int8 = with_int8(&vgn, &ranges).unwrap();
     let axes = Architecture::Vgn.build_with(40, Orientation::Axes, 0).unwrap();
     let averaged = averaged_over_rotations(&axes).unwrap();
-    let others = [("gpd", gpd::gpd(0)), ("half", half), ("int8", int8), ("axes", axes), ("averaged", averaged)];
+    let evaluators = with_coarse_evaluator(&evaluator(0), &coarse_evaluator(0));
+    let others = [
+        ("gpd", gpd::gpd(0)),
+        ("evaluators", evaluators),
+        ("half", half),
+        ("int8", int8),
+        ("axes", axes),
+        ("averaged", averaged),
+    ];
     for (name, model) in networks.into_iter().chain(others) {
         let path = folder.path().join(format!("{name}.onnx"));
         model.write(&path).unwrap();
